@@ -1,0 +1,1 @@
+"""The paper: model, gait, baseline controller, virtual guide, haptics. Knows no CAN."""

@@ -1,0 +1,1 @@
+"""The `atalante` command line and everything it shows."""
