@@ -1,9 +1,9 @@
 """The empty exoskeleton, from one set of parameters: the URDF that PyBullet, Pinocchio and the viewer all load.
 
 `ExoskeletonParameters -> links (left leg, right leg its mirror image) -> URDF text -> Pinocchio model`. A patient's
-segments are to be fused between the second step and the third: a link keeps its inertia as a value. Frames follow REP-103:
-x forward, y left, z up; a link's frame is its joint's frame, and all are parallel at the zero pose but the feet, which
-toe out.
+segments are to be fused between the second step and the third: a link keeps its inertia as a value. Frames follow
+REP-103: x forward, y left, z up; a link's frame is its joint's frame, and all are parallel at the zero pose but the
+feet, which toe out.
 """
 
 from __future__ import annotations
