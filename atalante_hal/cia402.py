@@ -1,7 +1,7 @@
 """CiA 402 power drive state machine, as a pure function shared by the HAL (which commands it) and the emulated drive.
 
-Names and transitions after IEC 61800-7-201 (CiA 402-2). Mode of operation is cyclic synchronous torque. Quick stop option code is 6:
-the drive stays in QUICK STOP ACTIVE and holds position, which is this robot's latched local hold.
+Names and transitions after IEC 61800-7-201 (CiA 402-2); mode of operation is cyclic synchronous torque. Quick stop option
+code is 6: the drive stays in QUICK STOP ACTIVE and holds position, which is this robot's latched local hold.
 """
 
 from __future__ import annotations
@@ -82,5 +82,5 @@ TOWARDS_OPERATION: dict[int, Controlword] = {
 
 
 def controlword_towards_operation(state: int) -> Controlword:
-    """Next command on the way to OPERATION ENABLED; states without one (a fault reaction, booting) get DISABLE_VOLTAGE."""
+    """Next command on the way to OPERATION ENABLED; a state without one (booting, fault reaction) gets DISABLE_VOLTAGE."""
     return TOWARDS_OPERATION.get(state, Controlword.DISABLE_VOLTAGE)

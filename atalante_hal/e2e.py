@@ -1,0 +1,63 @@
+"""AUTOSAR E2E Profile 5: a CRC over payload and Data ID, and an alive counter, in every frame.
+
+The CRC is CRC-16/CCITT-FALSE (polynomial 0x1021, start 0xFFFF) over the payload behind the CRC field, then the Data ID low byte
+first: a frame that is damaged, cut, or sent under another identifier does not pass. The counter tells lost, repeated and
+replayed frames (AUTOSAR PRS_E2EProtocol, Profile 5).
+"""
+
+from __future__ import annotations
+
+from binascii import crc_hqx
+from enum import IntEnum
+
+CRC_START = 0xFFFF
+#: Offsets in the payload.
+CRC_BYTES = 2
+COUNTER_BYTE = 2
+#: Largest step of the counter that still counts as fresh data: up to four frames in a row may be lost.
+MAX_DELTA = 5
+
+
+class Check(IntEnum):
+    """Result of checking one message in one cycle; `fresh` says whether its data may be used as new."""
+
+    OK = 0
+    SOME_LOST = 1  # fresh, but 1 to 4 frames before it are missing
+    NO_DATA = 2  # nothing came
+    REPEATED = 3  # counter has not moved
+    WRONG_SEQUENCE = 4  # counter jumped: replayed, or more than 4 lost
+    CRC = 5  # damaged, or another message's data
+    LENGTH = 6  # length or frame format is not the DBC's
+    RANGE = 7  # a signal is outside its range or carries its invalid code
+
+    @property
+    def fresh(self) -> bool:
+        """The data is new and may be used."""
+        return self <= Check.SOME_LOST
+
+
+def data_id_bytes(data_id: int) -> bytes:
+    """Data ID as it enters the CRC: low byte first."""
+    return data_id.to_bytes(2, "little")
+
+
+def crc(protected: bytes | memoryview, data_id: bytes) -> int:
+    """CRC of a frame.
+
+    Args:
+        protected: the payload from behind the CRC field to its end.
+        data_id: of `data_id_bytes`.
+    """
+    return crc_hqx(data_id, crc_hqx(protected, CRC_START))
+
+
+def check_counter(last: int | None, received: int) -> Check:
+    """Judge an alive counter against the last one accepted; None: nothing was received before."""
+    if last is None:
+        return Check.OK
+    delta = (received - last) & 0xFF
+    if delta == 1:
+        return Check.OK
+    if delta == 0:
+        return Check.REPEATED
+    return Check.SOME_LOST if delta <= MAX_DELTA else Check.WRONG_SEQUENCE

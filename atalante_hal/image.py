@@ -1,0 +1,232 @@
+"""Process image: the last good copy of every message, and whether it may be trusted.
+
+`ReceiveImage` takes the frames of a cycle as the bus delivered them and commits a message only if identifier, length,
+CRC, counter and range hold; otherwise its values stay, its age grows and its check says why. `TransmitImage` is the
+mirror: values in, protected frames out.
+"""
+
+from __future__ import annotations
+
+from binascii import crc_hqx
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_dbc import Message
+from atalante_hal.codec import Codec, Vector
+from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES, CRC_START, Check, check_counter, crc, data_id_bytes
+from atalante_hal.frame import FRAME_BYTES, WORDS, Frames, as_words, new_frames
+
+_HEADER_BYTES = 8
+#: Age of a message that never came.
+NEVER = 1 << 30
+
+
+class ReceiveImage:
+    """The messages of one rate, received: values, and per row check and age.
+
+    `values` is shape (codec.size,) in DBC units and keeps the last good values; `check` and `age` are per row.
+    """
+
+    def __init__(self, messages: Sequence[Message], values: Vector | None = None) -> None:
+        self.codec = Codec(messages)
+        count = len(self.codec.messages)
+        self.values = np.full(self.codec.size, np.nan) if values is None else values
+        #: `Check` of the cycle, shape (rows,).
+        self.check: npt.NDArray[np.uint8] = np.full(count, Check.NO_DATA, np.uint8)
+        #: Cycles since the row was committed, shape (rows,).
+        self.age: npt.NDArray[np.int64] = np.full(count, NEVER, np.int64)
+        self.crc_errors = 0
+        self.frames = self.codec.template()
+        self._words = self.frames.view(np.uint64)
+        self._bytes = self.frames.view(np.uint8)
+        self._headers = as_words(self.frames)[:, 0].tolist()
+        self._row_of_header = {header: row for row, header in enumerate(self._headers)}
+        self.frame_ids = {message.frame_id: row for row, message in enumerate(self.codec.messages)}
+        self._data_ids = [data_id_bytes(m.data_id) for m in self.codec.messages]
+        self._lengths = [m.length for m in self.codec.messages]
+        self._counter: list[int | None] = [None] * count
+        self._expected_headers = as_words(self.frames)[:, 0].tobytes()
+        self._expected_counters: npt.NDArray[np.uint8] | None = None
+        self._all_ok = True  # check and age already say "all fresh"
+        self._scratch: _Scratch | None = None
+        self._ordered = _Scratch(new_frames(count), self._lengths, self._data_ids)
+
+    def new_cycle(self) -> None:
+        """A cycle has begun: until something arrives, every row is one cycle older and has no data."""
+        self._all_ok = False
+        self.age += 1
+        self.check.fill(Check.NO_DATA)
+
+    def accept(self, frames: Frames, count: int) -> Sequence[int]:
+        """One whole cycle: judge and commit `frames[:count]`, in whatever order they came.
+
+        Args:
+            frames: receive buffer, the same array every cycle.
+
+        Returns:
+            Places in `frames` of the frames that are no message of this image.
+        """
+        rows = len(self._headers)
+        if count >= rows:
+            if self.accept_exact(self._scratch_of(frames)):
+                return range(rows, count)
+            found = [self._row_of_header.get(header, -1) for header in as_words(frames)[:count, 0].tolist()]
+            if len(found) - found.count(-1) == rows and len(set(found) - {-1}) == rows:
+                # Everything is there once, in another order: several buses, or arbitration.
+                self._ordered.words[:] = as_words(frames)[np.argsort(found, kind="stable")[count - rows :]].reshape(-1)
+                if self.accept_exact(self._ordered):
+                    return [place for place, row in enumerate(found) if row < 0]
+        self.new_cycle()
+        return self.accept_each(frames, count)
+
+    def _scratch_of(self, frames: Frames) -> _Scratch:
+        if self._scratch is None or self._scratch.frames is not frames:
+            self._scratch = _Scratch(frames, self._lengths, self._data_ids)
+        return self._scratch
+
+    def accept_exact(self, scratch: _Scratch) -> bool:
+        """Fast path: the rows are exactly the expected messages, in order, intact and in sequence.
+
+        Replaces `new_cycle` and `accept_each` for a perfect cycle; otherwise returns False and changes nothing.
+        """
+        expected = self._expected_counters
+        if expected is None or scratch.headers.tobytes() != self._expected_headers:
+            return False
+        counters = scratch.counters.tobytes()
+        if counters != expected.tobytes():
+            return False
+        if [crc_hqx(i, crc_hqx(p, CRC_START)) for p, i in scratch.protected] != scratch.crcs.tolist():
+            return False
+        if not self.codec.extract(scratch.words):
+            return False
+        self.codec.scale(self.values)
+        self._bytes[:] = scratch.bytes
+        expected += 1
+        if not self._all_ok:
+            self.age.fill(0)
+            self.check.fill(Check.OK)
+            self._all_ok = True
+        return True
+
+    def accept_each(self, frames: Frames, count: int) -> list[int]:
+        """Slow path: judge frames one by one in order of arrival, commit the good ones and decode. Call `new_cycle` before.
+
+        Returns:
+            Places in `frames[:count]` of the frames that are no message of this image.
+        """
+        self._synchronise_counters()
+        foreign: list[int] = []
+        before, age_before = self._words.copy(), self.age.copy()
+        words = as_words(frames)
+        committed = False
+        for place, header in enumerate(words[:count, 0].tolist()):
+            row = self._row_of_header.get(header)
+            if row is None:
+                row = self.frame_ids.get(header & 0xFFFFFFFF)
+                if row is None:
+                    foreign.append(place)
+                elif not Check(self.check[row]).fresh:
+                    self.check[row] = Check.LENGTH
+                continue
+            payload = words[place].tobytes()[_HEADER_BYTES : _HEADER_BYTES + self._lengths[row]]
+            result = self._judge(row, payload)
+            if result.fresh:
+                self._words[row * WORDS : (row + 1) * WORDS] = words[place]
+                self.age[row] = 0
+                committed = True
+            if result.fresh or not Check(self.check[row]).fresh:
+                self.check[row] = result
+        if committed and not self.codec.extract(self._words):
+            for row in self.codec.rows_outside():
+                self.check[row], self.age[row] = Check.RANGE, age_before[row]
+                self._words[row * WORDS : (row + 1) * WORDS] = before[row * WORDS : (row + 1) * WORDS]
+            self.codec.extract(self._words)
+        if committed:
+            self.codec.scale(self.values)
+        self._expect_next()
+        return foreign
+
+    def _judge(self, row: int, payload: bytes) -> Check:
+        if crc(payload[CRC_BYTES:], self._data_ids[row]) != int.from_bytes(payload[:CRC_BYTES], "little"):
+            self.crc_errors += 1
+            return Check.CRC
+        counter = payload[COUNTER_BYTE]
+        result = check_counter(self._counter[row], counter)
+        self._counter[row] = counter
+        return result
+
+    def _synchronise_counters(self) -> None:
+        """Take over what the fast path counted."""
+        if self._expected_counters is not None:
+            self._counter = [(c - 1) & 0xFF for c in self._expected_counters.tolist()]
+            self._expected_counters = None
+
+    def _expect_next(self) -> None:
+        counters = [c for c in self._counter if c is not None]
+        if len(counters) == len(self._counter):
+            self._expected_counters = np.array([(c + 1) & 0xFF for c in counters], np.uint8)
+
+
+class _Scratch:
+    """Views of the first rows of a receive buffer, made once: what the fast path reads every cycle."""
+
+    def __init__(self, frames: Frames, lengths: Sequence[int], data_ids: Sequence[bytes]) -> None:
+        rows = len(lengths)
+        self.frames = frames
+        head = frames[:rows]
+        self.words = head.view(np.uint64)
+        self.bytes = head.view(np.uint8)
+        self.headers = as_words(head)[:, 0]
+        octets = self.bytes.reshape(rows, FRAME_BYTES)
+        self.counters = octets[:, _HEADER_BYTES + COUNTER_BYTE]
+        self.crcs = head.view(np.uint16).reshape(rows, FRAME_BYTES // 2)[:, _HEADER_BYTES // 2]
+        self.protected = [
+            (memoryview(octets[row])[_HEADER_BYTES + CRC_BYTES : _HEADER_BYTES + length], data_id)
+            for row, (length, data_id) in enumerate(zip(lengths, data_ids, strict=True))
+        ]
+
+
+class TransmitImage:
+    """Messages to send: write `values`, call `seal`, send `frames`."""
+
+    def __init__(self, messages: Sequence[Message]) -> None:
+        self.codec = Codec(messages)
+        self.values = np.zeros(self.codec.size)
+        self.frames = self.codec.template()
+        self._bytes = self.frames.view(np.uint8).reshape(-1, FRAME_BYTES)
+        rows = range(len(self.codec.messages))
+        # The counter of a row is the low byte of a number that grows by one a frame, so that all rows advance in one addition.
+        self._counters = np.full(len(rows), 255, np.uint8)
+        self._counter_bytes = self._bytes[:, _HEADER_BYTES + COUNTER_BYTE]
+        self._crcs = self.frames.view(np.uint16).reshape(-1, FRAME_BYTES // 2)[:, _HEADER_BYTES // 2]
+        self._protected = [
+            (
+                memoryview(self._bytes[row])[_HEADER_BYTES + CRC_BYTES : _HEADER_BYTES + message.length],
+                data_id_bytes(message.data_id),
+            )
+            for row, message in enumerate(self.codec.messages)
+        ]
+        self._singles = [self.frames[row : row + 1] for row in rows]
+
+    def seal(self) -> Frames:
+        """Encode the values and protect every row: one counter step and the CRC. Returns the frames to send, shape (rows,).
+
+        Raises:
+            ValueError: NaN for a signal without an invalid code.
+        """
+        self.codec.encode(self.values, self.frames)
+        self._counters += 1
+        self._counter_bytes[:] = self._counters
+        self._crcs[:] = [crc_hqx(i, crc_hqx(p, CRC_START)) for p, i in self._protected]
+        return self.frames
+
+    def seal_row(self, row: int) -> Frames:
+        """As `seal` for one row alone, the counters of the others stay. Shape (1,)."""
+        self.codec.encode(self.values, self.frames)
+        self._counters[row] += 1
+        self._counter_bytes[:] = self._counters
+        protected, data_id = self._protected[row]
+        self._crcs[row] = crc(protected, data_id)
+        return self._singles[row]

@@ -1,0 +1,6 @@
+"""The network as data: `atalante.dbc`, the one source of truth for everything on the wire, and its strict loader."""
+
+from atalante_dbc.loader import DBC_FILE, DbcError, load
+from atalante_dbc.network import Message, Network, Node, Signal, wire_time
+
+__all__ = ["DBC_FILE", "DbcError", "Message", "Network", "Node", "Signal", "load", "wire_time"]

@@ -1,0 +1,264 @@
+"""Reads a DBC through cantools and refuses what a receiver could misread, naming the line.
+
+cantools accepts duplicate identifiers and names, factor 0 and signals without a receiver; none may reach a robot.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cantools
+from cantools.database.can import Database
+from cantools.database.can import Message as RawMessage
+from cantools.database.can import Signal as RawSignal
+from cantools.database.errors import Error as CantoolsError
+
+from atalante_dbc.network import Message, Network, Node, Signal
+
+DBC_FILE = Path(__file__).with_name("atalante.dbc")
+
+#: Payload lengths CAN FD can carry (ISO 11898-1).
+_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+#: E2E Profile 5 header every frame starts with: name -> (start bit, bits).
+_HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
+_FD_FORMATS = ("StandardCAN_FD", "ExtendedCAN_FD")
+_BO = re.compile(r"BO_\s+(\d+)\s+(\w+)\s*:\s*(\d+)\s+(\w+)")
+_SG = re.compile(r"SG_\s+(\w+)\s*(\w*)\s*:")
+
+
+class DbcError(ValueError):
+    """The DBC cannot be trusted; one line of the message a problem, each with its line in the file."""
+
+
+def load(path: Path | None = None) -> Network:
+    """The network of a DBC file, checked.
+
+    Raises:
+        DbcError: the file cannot be parsed, or breaks a rule (see `_problems`); names each line.
+    """
+    path = path or DBC_FILE
+    try:
+        raw = path.read_bytes()
+        text = raw.decode("cp1252")
+        database = cantools.database.load_string(text, database_format="dbc", strict=False)
+    except (OSError, ValueError, CantoolsError) as error:
+        raise DbcError(f"{path}: {error}") from error
+    assert isinstance(database, Database)
+    lines = _Lines(text)
+    problems = sorted(set(_problems(database, lines)))
+    if problems:
+        raise DbcError("\n".join(f"{path}:{line}: {what}" for line, what in problems))
+    return Network(
+        nodes=tuple(
+            Node(n.name, str(_attribute(n, "NodeKind")), int(_attribute(n, "NodeNumber"))) for n in database.nodes
+        ),
+        messages=tuple(_message(m) for m in database.messages),
+        buses=tuple(_definitions(database)["Bus"].choices),
+        nominal_bitrate=int(_global(database, "NominalBitrate")),
+        data_bitrate=int(_global(database, "DataBitrate")),
+        hash32=zlib.crc32(raw),
+    )
+
+
+class _Lines:
+    """Where messages and signals are written, since cantools forgets it and drops duplicates."""
+
+    def __init__(self, text: str) -> None:
+        self.messages: list[tuple[int, int, str]] = []  # (line, frame id, name), as often as written
+        self.signals: list[tuple[int, str, str, str]] = []  # (line, message, signal, multiplexer mark)
+        for number, line in enumerate(text.splitlines(), start=1):
+            if match := _BO.match(line):
+                self.messages.append((number, int(match[1]), match[2]))
+            elif (match := _SG.match(line.lstrip())) and self.messages:
+                self.signals.append((number, self.messages[-1][2], match[1], match[2]))
+        self._signal = {(message, name): number for number, message, name, _ in self.signals}
+        self._message = {name: number for number, _, name in self.messages}
+
+    def message(self, message: RawMessage) -> int:
+        return self._message[message.name]
+
+    def signal(self, message: RawMessage, signal: RawSignal) -> int:
+        return self._signal[message.name, signal.name]
+
+
+def _problems(database: Database, lines: _Lines) -> Iterator[tuple[int, str]]:
+    """Every broken rule as (line, sentence)."""
+    yield from _duplicates(lines)
+    for attribute in ("Bus", "GenMsgSendType", "GenMsgCycleTime", "GenMsgDelayTime", "TimeoutTime", "E2EDataId"):
+        if attribute not in _definitions(database):
+            yield 1, f"the message attribute {attribute} is not defined (BA_DEF_ BO_)"
+            return
+    data_ids: dict[int, str] = {}
+    nodes = {node.name for node in database.nodes}
+    for message in database.messages:
+        line = lines.message(message)
+        yield from ((line, f"{message.name} {what}") for what in _message_problems(message, nodes))
+        data_id = int(_attribute(message, "E2EDataId"))
+        if other := data_ids.get(data_id):
+            yield line, f"{message.name} has the E2EDataId {data_id} of {other}; give each message its own"
+        data_ids[data_id] = message.name
+        for signal in message.signals:
+            where = lines.signal(message, signal)
+            name = f"{message.name}.{signal.name}"
+            yield from ((where, f"{name} {what}") for what in _signal_problems(message, signal, nodes))
+        yield from _overlaps(message, lines)
+
+
+def _duplicates(lines: _Lines) -> Iterator[tuple[int, str]]:
+    ids: dict[int, int] = {}
+    names: dict[str, int] = {}
+    for line, frame_id, name in lines.messages:
+        if frame_id in ids:
+            yield line, f"{name} repeats the frame id {frame_id:#x} of line {ids[frame_id]}"
+        if name in names:
+            yield line, f"the message name {name} is already used in line {names[name]}"
+        ids.setdefault(frame_id, line)
+        names.setdefault(name, line)
+    signals: dict[tuple[str, str], int] = {}
+    for line, message, signal, multiplexer in lines.signals:
+        if (message, signal) in signals:
+            yield line, f"{message} already has a signal {signal} in line {signals[message, signal]}"
+        signals.setdefault((message, signal), line)
+        if multiplexer:
+            yield line, f"{message}.{signal} is multiplexed; this network has one layout a message"
+
+
+def _message_problems(message: RawMessage, nodes: set[str]) -> Iterator[str]:
+    if message.length not in _LENGTHS:
+        yield f"is {message.length} bytes long; CAN FD carries {', '.join(map(str, _LENGTHS))}"
+    if _attribute(message, "VFrameFormat") not in _FD_FORMATS:
+        yield "is not a CAN FD frame; set VFrameFormat to StandardCAN_FD"
+    if not set(message.senders) <= nodes or len(message.senders) != 1:
+        yield f"needs one sender out of BU_, not {', '.join(message.senders) or 'none'}"
+    for name, (start, length) in _HEADER.items():
+        found = next((s for s in message.signals if s.name == name), None)
+        if found is None or (found.start, found.length, found.is_signed) != (start, length, False):
+            yield f"needs the unsigned signal {name} : {start}|{length}@1+ of the E2E header"
+    cyclic = _attribute(message, "GenMsgSendType") == "cyclic"
+    if cyclic and not int(_attribute(message, "GenMsgCycleTime")):
+        yield "is cyclic and needs a GenMsgCycleTime"
+    if cyclic and int(_attribute(message, "TimeoutTime")) <= int(_attribute(message, "GenMsgCycleTime")):
+        yield "is cyclic and needs a TimeoutTime above its cycle time"
+    if not cyclic and not int(_attribute(message, "GenMsgDelayTime")):
+        yield "is an event and needs a GenMsgDelayTime, which bounds its bus load"
+    if not int(_attribute(message, "E2EDataId")):
+        yield "needs an E2EDataId"
+
+
+def _signal_problems(message: RawMessage, signal: RawSignal, nodes: set[str]) -> Iterator[str]:
+    if signal.byte_order != "little_endian":
+        yield "is big endian; this network is little endian (@1)"
+        return
+    if signal.is_float:
+        yield "is a float; this network carries scaled integers"
+    end = signal.start + signal.length
+    if end > 8 * message.length:
+        yield f"ends at bit {end}, the message at bit {8 * message.length}"
+    if signal.start // 64 != (end - 1) // 64:
+        yield f"crosses the 64-bit word boundary at bit {(end - 1) // 64 * 64}"
+    if not signal.unit:
+        yield 'has no unit; write "1" for a number without one'
+    if not signal.receivers or not set(signal.receivers) <= nodes:
+        yield f"needs receivers out of BU_, not {', '.join(signal.receivers) or 'none'}"
+    if signal.scale == 0:
+        yield "has factor 0"
+        return
+    yield from _range_problems(signal)
+
+
+def _range_problems(signal: RawSignal) -> Iterator[str]:
+    if signal.minimum is None or signal.maximum is None or not signal.minimum < signal.maximum:
+        yield f"needs a range [min|max] with min < max, not [{signal.minimum}|{signal.maximum}]"
+        return
+    low, high = (
+        (-(1 << signal.length - 1), (1 << signal.length - 1) - 1) if signal.is_signed else (0, (1 << signal.length) - 1)
+    )
+    raw = sorted(((signal.minimum - signal.offset) / signal.scale, (signal.maximum - signal.offset) / signal.scale))
+    if raw[0] < low - 1e-6 or raw[1] > high + 1e-6:
+        yield f"has the range [{signal.minimum}|{signal.maximum}]; {signal.length} bits of {signal.scale} cannot hold it"
+    invalid = _invalid_raw(signal)
+    if invalid is not None:
+        value = invalid - (1 << signal.length) if signal.is_signed and invalid >> signal.length - 1 else invalid
+        if not 0 <= invalid < 1 << signal.length:
+            yield f"has the InvalidRaw {invalid:#x}, which does not fit {signal.length} bits"
+        elif raw[0] - 0.5 <= value <= raw[1] + 0.5:
+            yield f"has the InvalidRaw {invalid:#x} inside its valid range"
+
+
+def _overlaps(message: RawMessage, lines: _Lines) -> Iterator[tuple[int, str]]:
+    """Bits claimed twice; the later signal of the file is named."""
+    owner: dict[int, RawSignal] = {}
+    for signal in sorted(message.signals, key=lambda s: lines.signal(message, s)):
+        if signal.byte_order != "little_endian":
+            continue
+        bits = range(signal.start, signal.start + signal.length)
+        if other := next((owner[bit] for bit in bits if bit in owner), None):
+            yield lines.signal(message, signal), f"{message.name}.{signal.name} overlaps {other.name}"
+        owner.update(dict.fromkeys(bits, signal))
+
+
+def _message(message: RawMessage) -> Message:
+    return Message(
+        name=message.name,
+        frame_id=message.frame_id,
+        length=message.length,
+        sender=message.senders[0],
+        signals=tuple(_signal(s) for s in message.signals),
+        bus=str(_attribute(message, "Bus")),
+        send_type=str(_attribute(message, "GenMsgSendType")),
+        cycle_ms=int(_attribute(message, "GenMsgCycleTime")),
+        timeout_ms=int(_attribute(message, "TimeoutTime")),
+        inhibit_ms=int(_attribute(message, "GenMsgDelayTime")),
+        data_id=int(_attribute(message, "E2EDataId")),
+        comment=message.comment or "",
+    )
+
+
+def _signal(signal: RawSignal) -> Signal:
+    assert signal.minimum is not None
+    assert signal.maximum is not None
+    return Signal(
+        name=signal.name,
+        start=signal.start,
+        length=signal.length,
+        signed=signal.is_signed,
+        factor=float(signal.scale),
+        offset=float(signal.offset),
+        minimum=float(signal.minimum),
+        maximum=float(signal.maximum),
+        unit=signal.unit or "",
+        invalid_raw=_invalid_raw(signal),
+        choices={int(k): str(v) for k, v in (signal.choices or {}).items()},
+        receivers=tuple(signal.receivers),
+    )
+
+
+def _invalid_raw(signal: RawSignal) -> int | None:
+    text = str(_attribute(signal, "InvalidRaw"))
+    return int(text, 0) if text else None
+
+
+def _attribute(item: Any, name: str) -> int | str:
+    """Attribute of a node, message or signal, its default when not set; enumerations by name."""
+    attributes = item.dbc.attributes if item.dbc is not None else {}
+    if name in attributes:
+        definition, value = attributes[name].definition, attributes[name].value
+    else:
+        definition = item.dbc.attribute_definitions.get(name) if item.dbc is not None else None
+        value = definition.default_value if definition is not None else ""
+    if definition is not None and definition.choices and isinstance(value, int):
+        return str(definition.choices[value])
+    return value  # type: ignore[no-any-return]
+
+
+def _definitions(database: Database) -> dict[str, Any]:
+    return database.dbc.attribute_definitions if database.dbc is not None else {}
+
+
+def _global(database: Database, name: str) -> Any:
+    attributes = database.dbc.attributes if database.dbc is not None else {}
+    return attributes[name].value if name in attributes else _definitions(database)[name].default_value
