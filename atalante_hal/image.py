@@ -49,14 +49,15 @@ class ReceiveImage:
         self._counter: list[int | None] = [None] * count
         self._expected_headers = as_words(self.frames)[:, 0].tobytes()
         self._expected_counters: npt.NDArray[np.uint8] | None = None
-        self._all_ok = True  # check and age already say "all fresh"
+        #: The last cycle was perfect: every row was committed exactly as expected.
+        self.all_fresh = False
         self._scratch: _Scratch | None = None
         self._ordered = _Scratch(new_frames(count), self._lengths, self._data_ids)
 
-    def new_cycle(self) -> None:
-        """A cycle has begun: until something arrives, every row is one cycle older and has no data."""
-        self._all_ok = False
-        self.age += 1
+    def new_cycle(self, elapsed: int = 1) -> None:
+        """`elapsed` cycles have begun: until something arrives, every row is that much older and has no data."""
+        self.all_fresh = False
+        self.age += elapsed
         self.check.fill(Check.NO_DATA)
 
     def accept(self, frames: Frames, count: int) -> Sequence[int]:
@@ -104,10 +105,10 @@ class ReceiveImage:
         self.codec.scale(self.values)
         self._bytes[:] = scratch.bytes
         expected += 1
-        if not self._all_ok:
+        if not self.all_fresh:
             self.age.fill(0)
             self.check.fill(Check.OK)
-            self._all_ok = True
+            self.all_fresh = True
         return True
 
     def accept_each(self, frames: Frames, count: int) -> list[int]:

@@ -44,14 +44,15 @@ def load(path: Path | None = None) -> Network:
     try:
         raw = path.read_bytes()
         text = raw.decode("cp1252")
+        lines = _Lines(text)
+        _refuse(path, _duplicates(lines))  # before cantools, which drops them or stumbles over what follows
         database = cantools.database.load_string(text, database_format="dbc", strict=False)
+    except DbcError:
+        raise
     except (OSError, ValueError, CantoolsError) as error:
         raise DbcError(f"{path}: {error}") from error
     assert isinstance(database, Database)
-    lines = _Lines(text)
-    problems = sorted(set(_problems(database, lines)))
-    if problems:
-        raise DbcError("\n".join(f"{path}:{line}: {what}" for line, what in problems))
+    _refuse(path, _problems(database, lines))
     return Network(
         nodes=tuple(
             Node(n.name, str(_attribute(n, "NodeKind")), int(_attribute(n, "NodeNumber"))) for n in database.nodes
@@ -62,6 +63,11 @@ def load(path: Path | None = None) -> Network:
         data_bitrate=int(_global(database, "DataBitrate")),
         hash32=zlib.crc32(raw),
     )
+
+
+def _refuse(path: Path, found: Iterator[tuple[int, str]]) -> None:
+    if problems := sorted(set(found)):
+        raise DbcError("\n".join(f"{path}:{line}: {what}" for line, what in problems))
 
 
 class _Lines:
@@ -87,7 +93,6 @@ class _Lines:
 
 def _problems(database: Database, lines: _Lines) -> Iterator[tuple[int, str]]:
     """Every broken rule as (line, sentence)."""
-    yield from _duplicates(lines)
     for attribute in ("Bus", "GenMsgSendType", "GenMsgCycleTime", "GenMsgDelayTime", "TimeoutTime", "E2EDataId"):
         if attribute not in _definitions(database):
             yield 1, f"the message attribute {attribute} is not defined (BA_DEF_ BO_)"
