@@ -70,15 +70,17 @@ class ReceiveImage:
             Places in `frames` of the frames that are no message of this image.
         """
         rows = len(self._headers)
+        if count == rows and self.accept_exact(self._scratch_of(frames)):
+            return ()
         if count >= rows:
-            if self.accept_exact(self._scratch_of(frames)):
-                return range(rows, count)
-            found = [self._row_of_header.get(header, -1) for header in as_words(frames)[:count, 0].tolist()]
-            if len(found) - found.count(-1) == rows and len(set(found) - {-1}) == rows:
-                # Everything is there once, in another order: several buses, or arbitration.
+            row_of = self.frame_ids
+            found = [row_of.get(can_id, -1) for can_id in frames["can_id"][:count].tolist()]
+            foreign = [place for place, row in enumerate(found) if row < 0]
+            if len(foreign) == count - rows and len(set(found) - {-1}) == rows:
+                # Everything is there once, among others or in another order: several buses, or arbitration.
                 self._ordered.words[:] = as_words(frames)[np.argsort(found, kind="stable")[count - rows :]].reshape(-1)
                 if self.accept_exact(self._ordered):
-                    return [place for place, row in enumerate(found) if row < 0]
+                    return foreign
         self.new_cycle()
         return self.accept_each(frames, count)
 
@@ -226,7 +228,7 @@ class TransmitImage:
     def seal_row(self, row: int) -> Frames:
         """As `seal` for one row alone, the counters of the others stay. Shape (1,)."""
         self.codec.encode(self.values, self.frames)
-        self._counters[row] += 1
+        self._counters[row : row + 1] += 1
         self._counter_bytes[:] = self._counters
         protected, data_id = self._protected[row]
         self._crcs[row] = crc(protected, data_id)

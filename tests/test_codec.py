@@ -1,0 +1,156 @@
+"""The array codec against cantools, which is not in the loop and therefore an independent witness."""
+
+from __future__ import annotations
+
+import cantools
+import numpy as np
+import pytest
+
+from atalante_dbc import DBC_FILE, load
+from atalante_hal.codec import Codec, group_of
+from atalante_hal.robot import JOINTS
+
+NETWORK = load()
+MESSAGES = NETWORK.messages
+ORACLE = cantools.database.load_file(str(DBC_FILE))
+IMAGES = 10_000
+
+
+def limits(codec: Codec) -> tuple[np.ndarray, np.ndarray]:
+    return np.array([s.minimum for _, s in codec.signals]), np.array([s.maximum for _, s in codec.signals])
+
+
+def test_decode_agrees_with_cantools_on_random_images():
+    codec = Codec(MESSAGES)
+    frames = codec.template()
+    lengths = [m.length for m in MESSAGES]
+    rng = np.random.default_rng(1)
+    decoders = [ORACLE.get_message_by_name(m.name) for m in MESSAGES]
+    out = np.empty(codec.size)
+    place = [(codec.rows[m.name], s.name) for m, s in codec.signals]
+    worst = 0.0
+    for _ in range(IMAGES):
+        frames["data"] = rng.integers(0, 256, (len(MESSAGES), 64), dtype=np.uint8)
+        codec.decode(frames, out)
+        decoded = [
+            d.decode(row[:n].tobytes(), decode_choices=False)
+            for d, row, n in zip(decoders, frames["data"], lengths, strict=True)
+        ]
+        expected = np.array([decoded[row][name] for row, name in place])
+        worst = max(worst, float(np.max(np.abs(out - expected) / np.maximum(np.abs(expected), 1e-6))))
+    assert worst <= 1e-9
+
+
+def test_encode_agrees_with_cantools_bit_for_bit_on_random_images():
+    codec = Codec(MESSAGES)
+    low, high = limits(codec)
+    rng = np.random.default_rng(2)
+    encoders = [(ORACLE.get_message_by_name(m.name), m) for m in MESSAGES]
+    names = [[(s.name, codec.index(m.name, s.name)) for s in m.signals] for m in MESSAGES]
+    frames = codec.template()
+    for _ in range(IMAGES):
+        values = rng.uniform(low, high)
+        codec.encode(values, frames)
+        numbers = values.tolist()
+        for (encoder, message), signals, row in zip(encoders, names, frames["data"], strict=True):
+            expected = encoder.encode({name: numbers[i] for name, i in signals}, strict=False)
+            assert row[: message.length].tobytes() == expected
+
+
+def test_values_survive_a_round_trip_to_the_bit():
+    codec = Codec(MESSAGES)
+    frames, out, again = codec.template(), np.empty(codec.size), np.empty(codec.size)
+    values = np.random.default_rng(3).uniform(*limits(codec))
+    codec.encode(values, frames)
+    assert codec.decode(frames, out)
+    codec.encode(out, frames)
+    codec.decode(frames, again)
+    assert np.array_equal(out, again)
+    resolution = np.array([s.factor for _, s in codec.signals])
+    assert np.all(np.abs(out - values) <= 0.5 * resolution * (1 + 1e-6))
+
+
+def test_values_outside_their_range_are_sent_as_the_nearest_valid_one():
+    codec = Codec(MESSAGES)
+    low, high = limits(codec)
+    frames, out = codec.template(), np.empty(codec.size)
+    for values, expected in ((low - 1e6, low), (high + 1e6, high), (np.full(codec.size, np.inf), high)):
+        codec.encode(values, frames)
+        assert codec.decode(frames, out)
+        assert np.allclose(out, expected, rtol=1e-12)
+
+
+def test_nan_is_sent_as_the_invalid_code_and_found_on_receipt():
+    for message in MESSAGES:
+        codec = Codec([message])
+        for signal in message.signals:
+            values = np.array([s.minimum for _, s in codec.signals])
+            values[codec.index(message.name, signal.name)] = np.nan
+            frames = codec.template()
+            if signal.invalid_raw is None:
+                with pytest.raises(ValueError, match=rf"{message.name}\.{signal.name}"):
+                    codec.encode(values, frames)
+                continue
+            codec.encode(values, frames)
+            raw = int.from_bytes(frames["data"][0].tobytes(), "little") >> signal.start & (1 << signal.length) - 1
+            assert raw == signal.invalid_raw
+            assert not codec.decode(frames, np.empty(codec.size))
+            assert codec.rows_outside() == [0]
+
+
+def test_every_raw_code_just_outside_its_range_is_found():
+    for message in MESSAGES:
+        codec = Codec([message])
+        for signal in message.signals:
+            low, high = (round((v - signal.offset) / signal.factor) for v in (signal.minimum, signal.maximum))
+            for raw in (low - 1, high + 1):
+                floor = -(1 << signal.length - 1) if signal.signed else 0
+                if not floor <= raw < floor + (1 << signal.length):
+                    continue
+                values = np.array([s.minimum for _, s in codec.signals])
+                frames = codec.template()
+                codec.encode(values, frames)
+                payload = int.from_bytes(frames["data"][0].tobytes(), "little")
+                mask = (1 << signal.length) - 1
+                payload = payload & ~(mask << signal.start) | (raw & mask) << signal.start
+                frames["data"][0] = np.frombuffer(payload.to_bytes(64, "little"), np.uint8)
+                assert not codec.decode(frames, np.empty(codec.size)), (message.name, signal.name, raw)
+
+
+def test_bits_no_signal_owns_are_sent_as_zero():
+    codec = Codec(MESSAGES)
+    frames = codec.template()
+    frames["data"] = 0xFF
+    owned = np.zeros((len(MESSAGES), 512), bool)
+    for message, signal in codec.signals:
+        owned[codec.rows[message.name], signal.start : signal.start + signal.length] = True
+    frames["data"] = np.packbits(~owned, axis=1, bitorder="little") * 0  # a fresh image
+    codec.encode(limits(codec)[1], frames)
+    bits = np.unpackbits(frames["data"], axis=1, bitorder="little").astype(bool)
+    assert not bits[~owned].any()
+
+
+def test_a_quantity_of_many_rows_is_one_slice_in_joint_order():
+    states = [m for m in NETWORK.received_by("HAL") if m.cycle_ms == 1]
+    codec = Codec(states)
+    positions = codec.signals[codec.slice("Position")]
+    assert [m.sender.lower() for m, _ in positions] == [joint.lower() for joint in JOINTS]
+    torque = Codec(NETWORK.sent_by("HAL")).slice("TargetTorque")
+    assert torque.stop - torque.start == 12
+    force = codec.signals[codec.slice("Force")]
+    assert [s.name for _, s in force[:4]] == ["FL_ForceX", "FL_ForceY", "FL_ForceZ", "FR_ForceX"]
+    assert force[12][0].sender == "FOOT_RIGHT"
+
+
+def test_group_names():
+    assert [group_of(n) for n in ("FH_TargetTorque", "QuaternionW", "FL_ForceX", "Velocity")] == [
+        "TargetTorque", "Quaternion", "Force", "Velocity",
+    ]  # fmt: skip
+
+
+def test_unknown_names_are_answered_with_the_valid_ones():
+    codec = Codec(MESSAGES)
+    with pytest.raises(KeyError, match="SYNC_LEFT_LEG"):
+        codec.index("LEFT_KNEE", "Position")
+    with pytest.raises(KeyError, match="TargetTorque"):
+        codec.slice("Angle")

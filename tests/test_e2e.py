@@ -1,0 +1,136 @@
+"""E2E Profile 5 against the AUTOSAR reference package, and its promise against damage."""
+
+from __future__ import annotations
+
+import e2e as oracle
+import numpy as np
+import pytest
+
+from atalante_dbc import load
+from atalante_hal.e2e import MAX_DELTA, Check, check_counter, crc, data_id_bytes
+from atalante_hal.image import ReceiveImage, TransmitImage
+
+NETWORK = load()
+CYCLIC = [m for m in NETWORK.received_by("HAL") if m.cycle_ms == 1]
+SENT = [m for m in NETWORK.sent_by("HAL") if m.cycle_ms == 1]
+
+
+@pytest.mark.parametrize("message", NETWORK.messages, ids=lambda m: m.name)
+def test_crc_and_counter_bytes_equal_the_reference(message):
+    rng = np.random.default_rng(message.frame_id)
+    for counter in (0, 1, 127, 254, 255):
+        payload = bytearray(rng.bytes(message.length))
+        payload[2] = (counter - 1) & 0xFF
+        ours = bytearray(payload)
+        ours[2] = counter
+        ours[:2] = crc(bytes(ours[2:]), data_id_bytes(message.data_id)).to_bytes(2, "little")
+        oracle.p05.e2e_p05_protect(payload, message.data_id, increment_counter=True)
+        assert ours == payload
+        assert oracle.p05.e2e_p05_check(bytes(ours), message.data_id)
+
+
+@pytest.mark.parametrize("messages", [CYCLIC, SENT], ids=["to the HAL", "from the HAL"])
+def test_a_whole_sealed_cycle_equals_the_reference(messages):
+    image = TransmitImage(messages)
+    rng = np.random.default_rng(4)
+    low = np.array([s.minimum for _, s in image.codec.signals])
+    high = np.array([s.maximum for _, s in image.codec.signals])
+    for cycle in range(300):
+        image.values[:] = rng.uniform(low, high)
+        frames = image.seal()
+        for message, frame in zip(messages, frames, strict=True):
+            payload = frame["data"][: message.length].tobytes()
+            assert payload[2] == cycle & 0xFF
+            assert oracle.p05.e2e_p05_check(payload, message.data_id)
+
+
+def test_every_step_of_the_counter_is_judged():
+    for last in (0, 1, 200, 255):
+        for delta in range(256):
+            judged = check_counter(last, (last + delta) & 0xFF)
+            expected = (
+                Check.REPEATED if delta == 0
+                else Check.OK if delta == 1
+                else Check.SOME_LOST if delta <= MAX_DELTA
+                else Check.WRONG_SEQUENCE
+            )  # fmt: skip
+            assert judged is expected
+    assert check_counter(None, 77) is Check.OK
+    assert [c for c in Check if c.fresh] == [Check.OK, Check.SOME_LOST]
+
+
+def _received(messages):
+    """A transmit and a receive image that have already talked."""
+    tx, rx = TransmitImage(messages), ReceiveImage(messages)
+    buffer = tx.seal().copy()
+    assert list(rx.accept(buffer, len(buffer))) == []
+    return tx, rx, buffer
+
+
+def test_frames_with_one_two_or_an_odd_number_of_flipped_bits_are_refused():
+    """100,000 of them, among all messages the HAL receives."""
+    tx, _, _ = _received(CYCLIC)
+    good = tx.seal().copy()
+    rng = np.random.default_rng(5)
+    refused = 0
+    for i in range(100_000):
+        row = i % len(CYCLIC)
+        message = CYCLIC[row]
+        flips = (1, 2, 2 * int(rng.integers(1, 4 * message.length)) + 1)[i % 3]
+        payload = int.from_bytes(good["data"][row, : message.length].tobytes(), "little")
+        for bit in rng.choice(8 * message.length, size=flips, replace=False).tolist():
+            payload ^= 1 << bit
+        damaged = payload.to_bytes(message.length, "little")
+        refused += crc(damaged[2:], data_id_bytes(message.data_id)) != int.from_bytes(damaged[:2], "little")
+    assert refused == 100_000
+
+
+@pytest.mark.parametrize("row", range(len(CYCLIC)), ids=[m.name for m in CYCLIC])
+def test_damaged_replayed_swapped_shortened_and_lengthened_frames_leave_the_values_alone(row):
+    for kind, expected in (
+        ("damaged", Check.CRC), ("replayed", Check.WRONG_SEQUENCE), ("repeated", Check.REPEATED),
+        ("swapped", Check.CRC), ("shortened", Check.LENGTH), ("lengthened", Check.LENGTH), ("classic", Check.LENGTH),
+    ):  # fmt: skip
+        tx, rx, buffer = _received(CYCLIC)
+        oldest = buffer.copy()
+        for _ in range(20):
+            buffer[:] = tx.seal()
+            rx.accept(buffer, len(buffer))
+        newest = buffer.copy()
+        values, age = rx.values.copy(), rx.age[row]
+        tx.values[:] = np.array([s.maximum for _, s in tx.codec.signals])
+        buffer[:] = tx.seal()
+        if kind == "damaged":
+            buffer["data"][row, 5] ^= 0x10
+        elif kind == "replayed":
+            buffer[row] = oldest[row]
+        elif kind == "repeated":
+            buffer[row] = newest[row]
+        elif kind == "swapped":
+            other = next(
+                r for r, m in enumerate(CYCLIC) if (r != row and m.length >= CYCLIC[row].length) or r == len(CYCLIC) - 1
+            )
+            buffer["data"][row] = buffer["data"][other]
+        elif kind == "shortened":
+            buffer["len"][row] -= 4
+        elif kind == "lengthened":
+            buffer["len"][row] += 4
+        elif kind == "classic":
+            buffer["flags"][row] = 0
+        rx.accept(buffer, len(buffer))
+        mine = rx.codec.row_of == row
+        assert rx.check[row] == expected, kind
+        assert np.array_equal(rx.values[mine], values[mine]), kind
+        assert rx.age[row] == age + 1
+        others = np.delete(np.arange(len(CYCLIC)), row)
+        assert (rx.check[others] == Check.OK).all()
+        assert (rx.age[others] == 0).all()
+
+
+def test_a_frame_under_another_messages_identifier_is_refused_for_every_pair_of_ids():
+    for sender in NETWORK.messages:
+        payload = bytes(range(3, 3 + sender.length - 2))
+        value = crc(payload, data_id_bytes(sender.data_id))
+        for receiver in NETWORK.messages:
+            accepted = crc(payload, data_id_bytes(receiver.data_id)) == value
+            assert accepted == (receiver is sender)
