@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +29,7 @@ class Limiter:
         self._step = robot.torque_rate_max * period
         self._low = np.empty_like(self._step)
         self._high = np.empty_like(self._step)
-        self._zeros = np.zeros_like(self._step)
+        self._finite = np.empty(self._step.shape, np.bool_)
         #: What was sent last; the rate limit counts from here. Shape (12,) [Nm].
         self.last = np.zeros_like(self._step)
 
@@ -40,8 +39,7 @@ class Limiter:
         Args:
             torque: shape (12,) [Nm], not changed.
         """
-        # 0 * x is NaN exactly when x is not finite.
-        if math.isnan(torque.dot(self._zeros)):
+        if np.isfinite(torque, out=self._finite).tobytes() != _ALL_TRUE:
             return _NOT_FINITE
         np.subtract(self.last, self._step, out=self._low)
         np.add(self.last, self._step, out=self._high)
@@ -58,6 +56,7 @@ class Limiter:
         np.minimum(self.last, self._torque_max, out=self.last)
 
 
+_ALL_TRUE = b"\1" * 12
 _NOT_FINITE = Limited(finite=False, clamped=False)
 _AS_ASKED = Limited(finite=True, clamped=False)
 _CLAMPED = Limited(finite=True, clamped=True)

@@ -1,0 +1,68 @@
+"""The drive state machine, exhaustively: every state, every possible controlword byte."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from atalante_hal.cia402 import Controlword, DriveState, controlword_towards_operation, next_state
+
+S, C = DriveState, Controlword
+
+#: Transition numbers of IEC 61800-7-201 that a command takes (0, 1, 13, 14 are the drive's own).
+STANDARD = {
+    2: (S.SWITCH_ON_DISABLED, C.SHUTDOWN, S.READY_TO_SWITCH_ON),
+    3: (S.READY_TO_SWITCH_ON, C.SWITCH_ON, S.SWITCHED_ON),
+    4: (S.SWITCHED_ON, C.ENABLE_OPERATION, S.OPERATION_ENABLED),
+    5: (S.OPERATION_ENABLED, C.SWITCH_ON, S.SWITCHED_ON),
+    6: (S.SWITCHED_ON, C.SHUTDOWN, S.READY_TO_SWITCH_ON),
+    7: (S.READY_TO_SWITCH_ON, C.DISABLE_VOLTAGE, S.SWITCH_ON_DISABLED),
+    8: (S.OPERATION_ENABLED, C.SHUTDOWN, S.READY_TO_SWITCH_ON),
+    9: (S.OPERATION_ENABLED, C.DISABLE_VOLTAGE, S.SWITCH_ON_DISABLED),
+    10: (S.SWITCHED_ON, C.DISABLE_VOLTAGE, S.SWITCH_ON_DISABLED),
+    11: (S.OPERATION_ENABLED, C.QUICK_STOP, S.QUICK_STOP_ACTIVE),
+    12: (S.QUICK_STOP_ACTIVE, C.DISABLE_VOLTAGE, S.SWITCH_ON_DISABLED),
+    15: (S.FAULT, C.FAULT_RESET, S.SWITCH_ON_DISABLED),
+    16: (S.QUICK_STOP_ACTIVE, C.ENABLE_OPERATION, S.OPERATION_ENABLED),
+}
+#: 7 and 10 by quick stop as well.
+BY_QUICK_STOP = {S.READY_TO_SWITCH_ON: S.SWITCH_ON_DISABLED, S.SWITCHED_ON: S.SWITCH_ON_DISABLED}
+
+
+@pytest.mark.parametrize("number", STANDARD)
+def test_transition_of_the_standard(number: int):
+    before, command, after = STANDARD[number]
+    assert next_state(before, command) is after
+
+
+def test_nothing_else_moves_a_drive():
+    moves = {(before, command): after for before, command, after in STANDARD.values()}
+    moves |= {(before, C.QUICK_STOP): after for before, after in BY_QUICK_STOP.items()}
+    for state, byte in itertools.product(S, range(256)):
+        assert next_state(state, byte) is moves.get((state, byte), state)
+
+
+def test_a_latched_hold_is_not_left_by_enable_operation_alone():
+    for byte in range(256):
+        after = next_state(S.QUICK_STOP_ACTIVE, byte, latched=True)
+        assert after is (S.SWITCH_ON_DISABLED if byte == C.DISABLE_VOLTAGE else S.QUICK_STOP_ACTIVE)
+
+
+def test_latching_changes_no_other_state():
+    for state, byte in itertools.product(set(S) - {S.QUICK_STOP_ACTIVE}, range(256)):
+        assert next_state(state, byte, latched=True) is next_state(state, byte)
+
+
+def test_the_way_up_reaches_operation_from_every_state_that_has_one():
+    for start in set(S) - {S.NOT_READY_TO_SWITCH_ON, S.FAULT_REACTION_ACTIVE}:
+        state = start
+        for _ in range(5):
+            state = next_state(state, controlword_towards_operation(state))
+        assert state is S.OPERATION_ENABLED
+    for state in (S.NOT_READY_TO_SWITCH_ON, S.FAULT_REACTION_ACTIVE):
+        assert controlword_towards_operation(state) is C.DISABLE_VOLTAGE
+
+
+def test_state_values_are_the_statusword_under_its_mask():
+    assert all(state & 0x6F == state for state in S)

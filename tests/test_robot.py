@@ -1,0 +1,79 @@
+"""The robot file: mirrored, read-only, and strict about what it says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from atalante_hal.robot import JOINTS, MIRROR_SIGN, MOTORS, ROBOT_FILE, RobotError, load_robot
+
+TEXT = ROBOT_FILE.read_text()
+
+
+def test_twelve_joints_and_eight_motors():
+    assert len(JOINTS) == 12
+    assert JOINTS[2] == "left_SH"
+    assert JOINTS[9] == "right_SK"
+    assert len(MOTORS) == len(set(MOTORS)) == 8
+
+
+def test_the_right_leg_mirrors_the_left():
+    robot = load_robot()
+    sign = np.array(MIRROR_SIGN)
+    low, high = robot.position_min, robot.position_max
+    mirrored = np.sort(np.stack([sign * low[:6], sign * high[:6]]), axis=0)
+    assert np.array_equal(mirrored[0], low[6:])
+    assert np.array_equal(mirrored[1], high[6:])
+    for name in ("velocity_max", "torque_max", "torque_rate_max", "gear", "hold_kp", "hold_kd"):
+        column = getattr(robot, name)
+        assert np.array_equal(column[:6], column[6:])
+        assert (column > 0).all()
+        assert not column.flags.writeable
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key"),
+    [
+        ("velocity_max = 4.0", "speed_max = 4.0", "speed_max"),
+        ("velocity_max = 4.0", "", "velocity_max"),
+        ("velocity_max = 4.0", "velocity_max = -4.0", "velocity_max"),
+        ("velocity_max = 4.0", "velocity_max = nan", "velocity_max"),
+        ("velocity_max = 4.0", "velocity_max = inf", "velocity_max"),
+        ("velocity_max = 4.0", 'velocity_max = "4 rad/s"', "velocity_max"),
+        ("velocity_max = 4.0", "velocity_max = true", "velocity_max"),
+        ("position = [-0.175, 0.297]", "position = [0.297, -0.175]", "position"),
+        ("position = [-0.175, 0.297]", "position = [0.297]", "position"),
+        ("polarity = 1", "polarity = 0", "polarity"),
+        ("[joints.FH]", "[joints.XX]", "FH"),
+        ("[joints.FH]", "[patient]\nmass = 70\n[joints.FH]", "patient"),
+        ("[joints.FH]", "[joints.FH", "robot.toml"),
+    ],
+)
+def test_a_wrong_file_is_refused_with_the_key(old: str, new: str, key: str, tmp_path: Path):
+    assert old in TEXT
+    path = tmp_path / "robot.toml"
+    path.write_text(TEXT.replace(old, new, 1))
+    with pytest.raises(RobotError, match=key):
+        load_robot(path)
+
+
+@given(st.floats(max_value=0.0) | st.sampled_from([float("nan"), float("inf"), float("-inf")]))
+def test_no_limit_can_be_negative_zero_or_not_finite(value: float):
+    path = ROBOT_FILE.with_name("robot.toml")
+    text = TEXT.replace("torque_max = 350.0", f"torque_max = {value!r}", 1)
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "robot.toml"
+        path.write_text(text)
+        with pytest.raises(RobotError, match=r"joints\.FH\.torque_max"):
+            load_robot(path)
+
+
+def test_a_missing_file_is_named(tmp_path: Path):
+    with pytest.raises(RobotError, match="nowhere"):
+        load_robot(tmp_path / "nowhere.toml")
