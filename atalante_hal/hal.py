@@ -525,4 +525,7 @@ _FIELD_NAMES = {
 def _field_name(message: Message, group: str) -> str:
     if group == "Temperature" and not any(s.name == "DriveState" for s in message.signals):
         return "sensor_temperature"
-    return _FIELD_NAMES.get(group) or re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", group).lower()
+    if group in _FIELD_NAMES:
+        return _FIELD_NAMES[group]
+    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", group).lower()
+    return f"pendant_{name}" if message.name == "PENDANT_STATE" and group not in ("Crc", "Counter") else name
