@@ -30,8 +30,8 @@ def group_of(signal: str) -> str:
 class Codec:
     """Compiled plan for a fixed list of messages; row i of the frames is messages[i].
 
-    Decoded values are ordered signed signals first, then by quantity, then by row: the positions of twelve joint states are
-    one contiguous slice.
+    Decoded values are ordered signed signals first, then by quantity, then by frame id, whatever the rows' order: the
+    positions of twelve joint states are one contiguous slice in joint order.
     """
 
     def __init__(self, messages: Sequence[Message]) -> None:
@@ -45,7 +45,7 @@ class Codec:
                 )
         groups = dict.fromkeys((not s.signed, group_of(s.name)) for _, _, s in entries)
         order = {key: place for place, key in enumerate(sorted(groups, key=lambda key: key[0]))}
-        entries.sort(key=lambda e: (order[not e[2].signed, group_of(e[2].name)], e[0], e[2].start))
+        entries.sort(key=lambda e: (order[not e[2].signed, group_of(e[2].name)], e[1].frame_id, e[2].start))
         #: (message, signal) in the order of the decoded values.
         self.signals: tuple[tuple[Message, Signal], ...] = tuple((m, s) for _, m, s in entries)
         self.size = len(entries)
@@ -106,7 +106,7 @@ class Codec:
             raise KeyError(f"no signal {message}.{signal}; messages are {', '.join(self.rows)}") from None
 
     def slice(self, group: str) -> slice:
-        """Where the values of a quantity are, of all rows, row by row; see `group_of`.
+        """Where the values of a quantity are, of all messages by frame id; see `group_of`.
 
         Raises:
             KeyError: no such quantity, or it is signed in one message and unsigned in another.

@@ -109,7 +109,8 @@ class Hal:
 
     def _build_images(self, controller_fields: Sequence[tuple[str, int]]) -> None:
         received = self.network.received_by("HAL")
-        fast = [m for m in received if m.cycle_ms == 1]
+        # In the order the buses deliver it, see `ReceiveImage.accept`.
+        fast = [m for bus in self.network.buses for m in received if m.bus == bus and m.cycle_ms == 1]
         slow = [m for m in received if m.cycle_ms != 1]
         shape = ReceiveImage(fast)  # for its plan; the values must lie inside the record
         self.layout = Layout(_record_fields(shape, controller_fields))
@@ -122,6 +123,8 @@ class Hal:
         self._scratch = new_frames(_RECEIVE_BUDGET)
         self._timeouts = np.array([m.timeout_ms for m in fast])
         self._needed = np.array([m.sender != "PENDANT" for m in fast])
+        #: Message of each entry of `State.valid` and `State.age`.
+        self.messages = tuple(m.name for m in fast)
         self._joint_rows = [row for row, m in enumerate(fast) if self.network.node(m.sender).kind == "drive"]
         self._sent_messages = [
             m for m in self.network.sent_by("HAL") if m.cycle_ms == 1 and not m.name.startswith("SYNC_")

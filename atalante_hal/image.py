@@ -70,10 +70,12 @@ class ReceiveImage:
             Places in `frames` of the frames that are no message of this image.
         """
         rows = len(self._headers)
-        if count == rows and self.accept_exact(self._scratch_of(frames)):
-            return ()
+        row_of = self.frame_ids
+        if (count == rows or (count > rows and row_of.keys().isdisjoint(frames["can_id"][rows:count].tolist()))) and (
+            self.accept_exact(self._scratch_of(frames))
+        ):
+            return range(rows, count)
         if count >= rows:
-            row_of = self.frame_ids
             found = [row_of.get(can_id, -1) for can_id in frames["can_id"][:count].tolist()]
             foreign = [place for place, row in enumerate(found) if row < 0]
             if len(foreign) == count - rows and len(set(found) - {-1}) == rows:

@@ -6,6 +6,10 @@ import json
 from collections.abc import Iterable, Iterator
 
 
+#: Controller fields carry this prefix in the record.
+CONTROLLER = "controller."
+
+
 class Layout:
     """Ordered fields of a vector, each a slice.
 
