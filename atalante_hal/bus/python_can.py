@@ -1,0 +1,152 @@
+"""Any interface python-can knows, as a bus: adapters without SocketCAN, and `virtual` in tests.
+
+About 6 us a frame: fine to reach an adapter, no match for `socketcan.SocketCanBus` where the kernel has the interface.
+"""
+
+from __future__ import annotations
+
+import errno
+import struct
+import time
+from typing import Any
+
+import can
+import numpy as np
+
+from atalante_hal.bus import BusAbsent, BusDown, BusFull, Stamps
+from atalante_hal.bus.batch import Batches, is_legal
+from atalante_hal.frame import (
+    FLAG_BRS,
+    FLAG_ESI,
+    FLAG_FDF,
+    FRAME_BYTES,
+    ID_ERROR,
+    ID_EXTENDED,
+    ID_REMOTE,
+    Frames,
+)
+
+#: One `FRAME`: identifier, length, flags, payload.
+RECORD = struct.Struct("<IBB2x64s")
+ID_NUMBER = 0x1FFF_FFFF
+LINK_LOST = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF)
+
+
+class PythonCanBus:
+    """A python-can bus of the given interface and channel; `options` go to python-can as they are.
+
+    `dropped` counts messages that no CAN controller can have received (python-can builds a 13-byte FD message without
+    a word); what the adapter itself loses it does not say. Raises `BusAbsent` if python-can cannot open it or opens it
+    for classic CAN only.
+    """
+
+    def __init__(self, interface: str, channel: str, capacity: int = 256, **options: Any) -> None:
+        self.name = f"{interface}:{channel}"
+        self.dropped = 0
+        self.stamps: Stamps = np.zeros(capacity, np.int64)
+        self._capacity = capacity
+        self._batches = Batches()
+        self._closed = False
+        self._bus = _open(interface, channel, options)
+
+    def send(self, frames: Frames) -> None:
+        """Send each frame as a message; raises `BusFull`, `BusDown`, `ValueError`. Shape (n,)."""
+        self._require_open()
+        memory, _ = self._batches.to_send(frames)
+        for sent, (can_id, length, flags, data) in enumerate(RECORD.iter_unpack(memory)):
+            try:
+                self._bus.send(message_of(can_id, length, flags, data), timeout=0.0)
+            except can.CanOperationError as error:
+                if error.error_code in LINK_LOST:
+                    raise BusDown(f"{self.name} is down: {error}") from error
+                raise BusFull(f"{self.name} took {sent} of {len(frames)} frames: {error}", sent) from error
+
+    def receive(self, frames: Frames, timeout: float = 0.0) -> int:
+        """Fill `frames[:n]` with the messages that have arrived; raises `BusDown`. Shape (m,), n <= m."""
+        self._require_open()
+        memory = self._batches.to_fill(frames)
+        room = min(len(frames), self._capacity)
+        count = 0
+        while count < room:
+            try:
+                message = self._bus.recv(0.0 if count else timeout)
+            except can.CanError as error:
+                raise BusDown(f"{self.name} cannot receive: {error}") from error
+            if message is None:
+                break
+            if pack(message, memory, count * FRAME_BYTES):
+                self.stamps[count] = round(message.timestamp * 1e9) if message.timestamp else time.time_ns()
+                count += 1
+            else:
+                self.dropped += 1
+        return count
+
+    def close(self) -> None:
+        """Shut python-can's bus down."""
+        if not self._closed:
+            self._closed = True
+            self._bus.shutdown()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise BusDown(f"{self.name} is closed")
+
+
+def message_of(can_id: int, length: int, flags: int, data: bytes) -> can.Message:
+    """The python-can message of one legal frame."""
+    remote = bool(can_id & ID_REMOTE)
+    return can.Message(
+        arbitration_id=can_id & ID_NUMBER,
+        is_extended_id=bool(can_id & ID_EXTENDED),
+        is_remote_frame=remote,
+        is_error_frame=bool(can_id & ID_ERROR),
+        is_fd=bool(flags & FLAG_FDF),
+        bitrate_switch=bool(flags & FLAG_BRS),
+        error_state_indicator=bool(flags & FLAG_ESI),
+        dlc=length,
+        data=None if remote else bytearray(data[:length]),
+    )
+
+
+def pack(message: can.Message, memory: memoryview, offset: int) -> bool:
+    """Write a message as one `FRAME` at a byte offset; False, and nothing written, if it is no legal frame."""
+    can_id = message.arbitration_id
+    if message.is_extended_id and not message.is_error_frame:
+        can_id |= ID_EXTENDED
+    remote = message.is_remote_frame and not message.is_fd  # the .asc reader calls an empty FD frame remote
+    if remote:
+        can_id |= ID_REMOTE
+    if message.is_error_frame:
+        can_id |= ID_ERROR
+    flags = 0
+    if message.is_fd:
+        flags = FLAG_FDF
+        if message.bitrate_switch:
+            flags |= FLAG_BRS
+        if message.error_state_indicator:
+            flags |= FLAG_ESI
+    if not is_legal(can_id, message.dlc, flags) or (message.dlc != len(message.data) and not remote):
+        return False
+    RECORD.pack_into(memory, offset, can_id, message.dlc, flags, bytes(message.data))
+    return True
+
+
+def _open(interface: str, channel: str, options: dict[str, Any]) -> can.BusABC:
+    if interface not in can.VALID_INTERFACES:
+        known = ", ".join(sorted(can.VALID_INTERFACES))
+        raise BusAbsent(f"there is no CAN interface {interface!r}; use one of {known}")
+    if interface == "virtual":
+        options = {"protocol": can.CanProtocol.CAN_FD} | options
+    try:
+        bus = can.Bus(interface=interface, channel=channel, fd=True, **options)
+    except (can.CanError, OSError, ValueError, TypeError, ImportError, NameError) as error:  # kvaser: NameError
+        raise BusAbsent(
+            f"python-can cannot open {interface}:{channel} for CAN FD: {error}; check the channel name and the driver, "
+            "and run `atalante doctor`"
+        ) from error
+    if bus.protocol is can.CanProtocol.CAN_20:
+        bus.shutdown()
+        raise BusAbsent(
+            f"{interface}:{channel} carries classic CAN only and the robot speaks CAN FD: use another interface"
+        )
+    return bus

@@ -1,0 +1,552 @@
+"""Behaviour every bus has, run against each transport; and what only one of them has.
+
+`FrameReceiver` is what receiving means, `FrameSender` what sending means; a transport subclasses them with its two ends
+and nothing else. The SocketCAN subclass is in tests/vcan, which needs a kernel that has it.
+"""
+
+from __future__ import annotations
+
+import gzip
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import ClassVar
+
+import can
+import numpy as np
+import pytest
+
+from atalante_hal.bus import Bus, BusAbsent, BusDown, BusError, BusFull, open_bus
+from atalante_hal.bus.batch import is_legal
+from atalante_hal.bus.channel_map import ChannelMapError, open_channels, parse_channel_map
+from atalante_hal.bus.pair import lockstep_pair
+from atalante_hal.bus.python_can import PythonCanBus, message_of
+from atalante_hal.bus.replay import LogUnreadable, ReplayBus
+from atalante_hal.frame import (
+    FD_LENGTHS,
+    FLAG_BRS,
+    FLAG_ESI,
+    FLAG_FDF,
+    ID_ERROR,
+    ID_EXTENDED,
+    ID_REMOTE,
+    Frames,
+    new_frames,
+)
+
+BUSES = ("left_leg", "right_leg", "left_sense", "right_sense")
+
+
+def random_frames(count: int, seed: int = 0, lengths: tuple[int, ...] = FD_LENGTHS) -> Frames:
+    """CAN FD frames with random identifiers, lengths and payloads; bytes beyond the length are 0."""
+    rng = np.random.default_rng(seed)
+    frames = new_frames(count)
+    frames["can_id"] = rng.integers(0, 0x800, count)
+    frames["len"] = rng.choice(lengths, count)
+    frames["flags"] = FLAG_FDF | FLAG_BRS
+    frames["data"] = rng.integers(0, 256, (count, 64))
+    frames["data"][np.arange(64) >= frames["len"][:, None]] = 0
+    return frames
+
+
+def other_frames() -> Frames:
+    """The kinds of frame the robot's network does not use and a bus must carry: classic, extended, remote, ESI."""
+    frames = new_frames(5)
+    frames["can_id"] = [0x123, 0x7FF, 0x12345678 | ID_EXTENDED, 0x42 | ID_REMOTE, 0x1FFFFFFF | ID_EXTENDED]
+    frames["len"] = [8, 0, 5, 0, 64]
+    frames["flags"] = [0, 0, 0, 0, FLAG_FDF | FLAG_ESI]
+    frames["data"][0, :8] = np.arange(8)
+    frames["data"][2, :5] = 0xA5
+    frames["data"][4] = np.arange(64)
+    return frames
+
+
+def receive_all(bus: Bus, count: int, timeout: float = 5.0) -> Frames:
+    """Exactly `count` frames, in as many `receive()` as it takes."""
+    received = new_frames(count)
+    have = 0
+    while have < count:
+        part = new_frames(count - have)
+        got = bus.receive(part, timeout)
+        assert got, f"only {have} of {count} frames arrived"
+        received[have : have + got] = part[:got]
+        have += got
+    return received
+
+
+class FrameReceiver:
+    """What every bus does with frames that are there to be received; subclasses supply `deliver`."""
+
+    def deliver(self, frames: Frames) -> Bus:
+        """A bus on which exactly these frames have arrived."""
+        raise NotImplementedError
+
+    def test_frames_arrive_bit_for_bit_in_order(self) -> None:
+        sent = random_frames(40, seed=1)
+        assert receive_all(self.deliver(sent), 40).tobytes() == sent.tobytes()
+
+    def test_classic_extended_remote_and_esi_frames_keep_their_kind(self) -> None:
+        sent = other_frames()
+        assert receive_all(self.deliver(sent), 5).tobytes() == sent.tobytes()
+
+    def test_an_old_longer_frame_leaves_nothing_in_a_shorter_one(self) -> None:
+        long, short = random_frames(1, lengths=(64,)), other_frames()[:1].copy()
+        bus = self.deliver(np.concatenate([long, short]))
+        frame = new_frames(1)
+        for expected in (long, short):
+            assert bus.receive(frame, 5.0) == 1
+            assert frame.tobytes() == expected.tobytes()
+
+    def test_what_does_not_fit_comes_with_the_next_receive(self) -> None:
+        sent = random_frames(10, seed=2)
+        bus = self.deliver(sent)
+        block = new_frames(4)
+        got: list[bytes] = []
+        while len(got) < 10:
+            count = bus.receive(block, 5.0)
+            assert 0 < count <= 4
+            got += [record.tobytes() for record in block[:count]]
+        assert b"".join(got) == sent.tobytes()
+
+    def test_records_beyond_the_received_ones_are_left_alone(self) -> None:
+        block = random_frames(8, seed=3)
+        before = block[2:].tobytes()
+        assert self.deliver(random_frames(2)).receive(block, 5.0) in (1, 2)
+        assert block[2:].tobytes() == before
+
+    def test_nothing_more_is_zero_frames_at_once(self) -> None:
+        bus = self.deliver(random_frames(3))
+        receive_all(bus, 3)
+        assert bus.receive(new_frames(4)) == 0
+        assert bus.receive(new_frames(4), 0.002) == 0
+
+    def test_stamps_are_nanoseconds_and_never_go_back(self) -> None:
+        bus = self.deliver(random_frames(30))
+        block = new_frames(8)
+        stamps: list[int] = []
+        while len(stamps) < 30:
+            count = bus.receive(block, 5.0)
+            assert count
+            stamps += bus.stamps[:count].tolist()
+        assert bus.stamps.dtype == np.int64
+        assert len(bus.stamps) >= len(block)
+        assert stamps == sorted(stamps)
+
+    def test_nothing_is_dropped_when_somebody_reads(self) -> None:
+        bus = self.deliver(random_frames(20))
+        receive_all(bus, 20)
+        assert bus.dropped == 0
+
+    def test_only_contiguous_frame_records_can_be_filled(self) -> None:
+        bus = self.deliver(random_frames(2))
+        with pytest.raises(TypeError, match="contiguous"):
+            bus.receive(new_frames(8)[::2])
+        with pytest.raises(TypeError, match="new_frames"):
+            bus.receive(np.zeros(4, np.uint64))
+        receive_all(bus, 2)
+
+    def test_closed_is_closed(self) -> None:
+        bus = self.deliver(random_frames(2))
+        bus.close()
+        bus.close()
+        with pytest.raises(BusDown, match="closed"):
+            bus.receive(new_frames(1))
+
+
+class FrameSender:
+    """What every bus does with frames to send; subclasses supply the two `ends` of a wire."""
+
+    @pytest.fixture
+    def ends(self) -> Iterator[tuple[Bus, Bus]]:
+        """Two buses that hear each other."""
+        raise NotImplementedError
+
+    def deliver(self, frames: Frames) -> Bus:
+        self.sender.send(frames)
+        return self.receiver
+
+    @pytest.fixture(autouse=True)
+    def _wire(self, ends: tuple[Bus, Bus]) -> None:
+        self.sender, self.receiver = ends
+
+    def test_both_directions_carry_frames(self) -> None:
+        for source, sink in ((self.sender, self.receiver), (self.receiver, self.sender)):
+            sent = random_frames(22, seed=4)
+            source.send(sent)
+            assert receive_all(sink, 22).tobytes() == sent.tobytes()
+
+    def test_own_frames_are_not_received(self) -> None:
+        self.sender.send(random_frames(3))
+        receive_all(self.receiver, 3)
+        assert self.sender.receive(new_frames(3), 0.002) == 0
+
+    def test_the_sender_may_write_its_array_again_at_once(self) -> None:
+        frames = random_frames(4, seed=5, lengths=(12,))
+        expected = b""
+        for cycle in range(5):
+            frames["data"][:, 0] = cycle
+            frames["can_id"] += 1
+            expected += frames.tobytes()
+            self.sender.send(frames)
+        assert receive_all(self.receiver, 20).tobytes() == expected
+
+    def test_a_batch_of_hundreds_goes_in_one_send(self) -> None:
+        sent = random_frames(300, seed=6)
+        self.sender.send(sent)
+        assert receive_all(self.receiver, 300).tobytes() == sent.tobytes()
+
+    def test_no_frames_is_no_error(self) -> None:
+        self.sender.send(new_frames(0))
+        assert self.receiver.receive(new_frames(2), 0.002) == 0
+
+    @pytest.mark.parametrize(
+        ("can_id", "length", "flags"),
+        [
+            (0x100, 13, FLAG_FDF),
+            (0x100, 65, FLAG_FDF),
+            (0x100, 12, 0),
+            (0x100, 8, FLAG_BRS),
+            (0x800, 8, FLAG_FDF),
+            (0x100 | ID_REMOTE, 0, FLAG_FDF),
+        ],
+    )
+    def test_what_no_controller_could_send_is_refused_and_nothing_goes_out(
+        self, can_id: int, length: int, flags: int
+    ) -> None:
+        frames = random_frames(3, seed=7)
+        self.sender.send(frames)
+        receive_all(self.receiver, 3)
+        frames[2] = (can_id, length, flags, 0, 0)
+        with pytest.raises(ValueError, match=r"frame 2 .*is no CAN frame: with FDF"):
+            self.sender.send(frames)
+        assert self.receiver.receive(new_frames(3), 0.002) == 0
+
+    def test_only_contiguous_frame_records_are_sent(self) -> None:
+        with pytest.raises(TypeError, match="contiguous"):
+            self.sender.send(random_frames(8)[::2])
+        with pytest.raises(TypeError, match="new_frames"):
+            self.sender.send(np.zeros(4, np.uint64))
+
+    def test_closed_sends_nothing(self) -> None:
+        self.sender.close()
+        with pytest.raises(BusDown, match="closed"):
+            self.sender.send(random_frames(1))
+
+    def test_sending_to_a_wire_nobody_listens_to_is_no_error(self) -> None:
+        self.receiver.close()
+        self.sender.send(random_frames(3))
+
+    def test_it_has_a_name(self) -> None:
+        assert self.sender.name
+
+
+class FrameWaiter:
+    """What a bus does that can wait; the lock-step pair and a recording never do."""
+
+    sender: Bus
+    receiver: Bus
+
+    def test_receive_waits_for_the_first_frame(self) -> None:
+        sent = random_frames(1, seed=8)
+        later = threading.Timer(0.02, self.sender.send, (sent,))
+        later.start()
+        frame = new_frames(1)
+        count = self.receiver.receive(frame, 30.0)
+        later.join()
+        assert count == 1
+        assert frame.tobytes() == sent.tobytes()
+
+
+class TestPairBus(FrameSender, FrameReceiver):
+    @pytest.fixture
+    def ends(self) -> Iterator[tuple[Bus, Bus]]:
+        one, other = lockstep_pair()
+        yield one, other
+        one.close()
+        other.close()
+
+
+class TestPythonCanVirtual(FrameSender, FrameReceiver, FrameWaiter):
+    @pytest.fixture
+    def ends(self, request: pytest.FixtureRequest) -> Iterator[tuple[Bus, Bus]]:
+        channel = request.node.name
+        one, other = open_bus("virtual", channel), open_bus("virtual", channel)
+        yield one, other
+        one.close()
+        other.close()
+
+
+class TestReplayLog(FrameReceiver):
+    suffix: ClassVar[str] = ".log"
+
+    @pytest.fixture(autouse=True)
+    def _folder(self, tmp_path: Path) -> Iterator[None]:
+        self.folder = tmp_path
+        self.opened: list[Bus] = []
+        yield
+        for bus in self.opened:
+            bus.close()
+
+    def deliver(self, frames: Frames) -> Bus:
+        self.opened.append(ReplayBus(write_log(self.folder / f"recording{self.suffix}", frames)))
+        return self.opened[-1]
+
+
+class TestReplayAsc(TestReplayLog):
+    suffix = ".asc"
+
+
+class TestReplayBlf(TestReplayLog):
+    suffix = ".blf"
+
+
+class TestReplayZipped(TestReplayLog):
+    suffix = ".log.gz"
+
+
+def write_log(path: Path, frames: Frames) -> Path:
+    """A log of these frames, a millisecond apart, by python-can's writers."""
+    with can.Logger(path) as log:
+        for index, (can_id, length, flags, _, data) in enumerate(frames.tolist()):
+            message = message_of(can_id, length, flags, bytes(data))
+            message.timestamp = 1_700_000_000.0 + index * 1e-3
+            message.channel = 0
+            log.on_message_received(message)
+    return path
+
+
+def test_pair_steps_the_peer_only_when_nothing_is_queued() -> None:
+    hal, emulator = lockstep_pair()
+    inbox, answer = new_frames(8), random_frames(3, seed=9)
+    steps = []
+
+    def step() -> None:
+        steps.append(emulator.receive(inbox))
+        emulator.send(answer)
+
+    hal.step = step
+    hal.send(random_frames(2))
+    frames = new_frames(2)
+    assert hal.receive(frames) == 2
+    assert hal.receive(frames) == 1
+    assert steps == [2]
+    assert hal.receive(frames) == 2
+    assert steps == [2, 0]
+
+
+def test_pair_without_an_answer_is_zero_frames() -> None:
+    hal, _ = lockstep_pair()
+    hal.step = lambda: None
+    assert hal.receive(new_frames(1)) == 0
+
+
+def test_pair_stamps_are_the_owners_time() -> None:
+    one, other = lockstep_pair()
+    one.send(random_frames(3))
+    other.now_ns = 123_456_789_000
+    other.receive(new_frames(3))
+    other.now_ns += 1_000_000
+    assert other.stamps[:3].tolist() == [123_456_789_000] * 3
+
+
+def test_pair_refuses_whole_batches_when_the_peer_does_not_read() -> None:
+    one, other = lockstep_pair(capacity=10)
+    sent = random_frames(4)
+    one.send(sent)
+    one.send(sent)
+    with pytest.raises(BusFull, match="8 frames waiting") as refusal:
+        one.send(sent)
+    assert refusal.value.sent == 0
+    assert receive_all(other, 3).tobytes() == sent[:3].tobytes()
+    one.send(sent)
+    assert receive_all(other, 9).tobytes() == np.concatenate([sent[3:], sent, sent]).tobytes()
+    assert other.receive(new_frames(1)) == 0
+
+
+def test_pair_finds_the_right_memory_of_many_short_lived_arrays() -> None:
+    one, other = lockstep_pair()
+    for seed in range(200):
+        sent, received = random_frames(3, seed), new_frames(3)
+        one.send(sent)
+        assert other.receive(received) == 3
+        assert received.tobytes() == sent.tobytes()
+
+
+def test_virtual_refuses_and_counts_what_another_program_made_up() -> None:
+    with can.Bus(interface="virtual", channel="made-up", protocol=can.CanProtocol.CAN_FD) as stranger:
+        bus = PythonCanBus("virtual", "made-up")
+        for data, is_fd in ((bytes(13), True), (bytes(9), False), (bytes(12), True), (bytes(70), True)):
+            stranger.send(can.Message(arbitration_id=1, is_extended_id=False, is_fd=is_fd, data=data))
+        received = new_frames(4)
+        assert bus.receive(received) == 1
+        assert received["len"][0] == 12
+        assert bus.dropped == 3
+        bus.close()
+
+
+def test_virtual_full_says_how_many_went_out() -> None:
+    listener = PythonCanBus("virtual", "full", rx_queue_size=5)
+    bus = PythonCanBus("virtual", "full")
+    with pytest.raises(BusFull, match="took 5 of 8 frames") as refusal:
+        bus.send(random_frames(8))
+    assert refusal.value.sent == 5
+    bus.close()
+    listener.close()
+
+
+@pytest.mark.parametrize(
+    ("interface", "options", "sentence"),
+    [
+        ("pigeon", {}, "no CAN interface 'pigeon'; use one of .*socketcan.*virtual"),
+        ("serial", {}, "cannot open serial:x for CAN FD: .*atalante doctor"),
+        ("virtual", {"protocol": can.CanProtocol.CAN_20}, "virtual:x carries classic CAN only"),
+    ],
+)
+def test_opening_errors_say_what_is_valid(interface: str, options: dict[str, object], sentence: str) -> None:
+    with pytest.raises(BusAbsent, match=sentence):
+        open_bus(interface, "x", **options)
+
+
+def test_replay_returns_one_cycle_at_a_time(tmp_path: Path) -> None:
+    frames = random_frames(11, lengths=(12,))
+    frames["can_id"] = [0x181, 0x10, 0x181, 0x182, 0x10, 0x10, 0x181, 0x182, 0x183, 0x184, 0x10]
+    bus = ReplayBus(write_log(tmp_path / "run.log", frames), cycle_id=0x10)
+    block = new_frames(4)
+    counts, stamps = [], []
+    while not bus.ended:
+        count = bus.receive(block)
+        counts.append(count)
+        stamps += bus.stamps[:count].tolist()
+    assert counts == [1, 3, 1, 4, 1, 1]
+    assert bus.receive(block) == 0
+    assert np.diff(stamps) == pytest.approx(1_000_000, abs=1000)
+
+
+def test_replay_cannot_be_sent_to(tmp_path: Path) -> None:
+    bus = ReplayBus(write_log(tmp_path / "run.log", random_frames(2)))
+    with pytest.raises(BusError, match="recording: nothing can be sent"):
+        bus.send(random_frames(1))
+    bus.close()
+
+
+def test_replay_counts_records_that_are_no_can_frame(tmp_path: Path) -> None:
+    log = tmp_path / "run.log"
+    log.write_text("(1.0) can0 100##5000102030405060708090A0B0C\n(1.1) can0 101##500\n", encoding="ascii")
+    bus = ReplayBus(log)
+    block = new_frames(4)
+    assert bus.receive(block) == 1
+    assert block["can_id"][0] == 0x101
+    assert bus.dropped == 1
+
+
+def broken_logs(folder: Path) -> dict[str, tuple[Path, str]]:
+    whole = {suffix: write_log(folder / f"whole{suffix}", random_frames(400)) for suffix in (".log", ".asc", ".blf")}
+    cases = {
+        "missing": (folder / "nowhere.log", "nowhere.log cannot be opened as a CAN log: No such file"),
+        "folder": (folder, "unknown log format"),
+        "suffix": (folder / "run.pcap", "unknown log format '.pcap'; use .log"),
+        "no suffix": (folder / "run", "unknown log format"),
+        "csv": (folder / "run.csv", "do not keep CAN FD frames; record .log, .asc or .blf"),
+        "db": (folder / "run.db", "do not keep CAN FD frames"),
+    }
+    for suffix, path in whole.items():
+        cut, empty, noise = (folder / f"{name}{suffix}" for name in ("cut", "empty", "noise"))
+        content = path.read_bytes()
+        cut.write_bytes(content[: len(content) * 2 // 3 - (content[len(content) * 2 // 3 - 1] == ord("\n"))])
+        empty.write_bytes(b"")
+        noise.write_bytes(np.random.default_rng(1).bytes(4000) + b"\n")
+        cases[f"cut {suffix}"] = (cut, "cut.* breaks off")
+        cases[f"empty {suffix}"] = (empty, "empty")
+        cases[f"noise {suffix}"] = (noise, "cannot be read beyond frame 0|no .blf log")
+    return cases
+
+
+def test_replay_says_in_one_sentence_what_is_wrong_with_a_log(tmp_path: Path) -> None:
+    for name, (path, sentence) in broken_logs(tmp_path).items():
+        with pytest.raises(LogUnreadable, match=sentence) as refusal:
+            ReplayBus(path)
+        assert "\n" not in str(refusal.value), name
+
+
+def test_replay_delivers_what_is_before_the_break_of_a_zipped_log(tmp_path: Path) -> None:
+    content = write_log(tmp_path / "run.log", random_frames(2000)).read_bytes()
+    zipped = gzip.compress(content)
+    broken = tmp_path / "run.log.gz"
+    broken.write_bytes(zipped[: len(zipped) // 2])
+    bus = ReplayBus(broken)
+    assert receive_all(bus, 500)["len"].tolist() == random_frames(2000)["len"][:500].tolist()
+    with pytest.raises(LogUnreadable, match="cannot be read beyond frame"):
+        receive_all(bus, 1500)
+
+
+def test_an_error_frame_is_marked_as_one() -> None:
+    frames = new_frames(1)
+    frames["can_id"], frames["len"] = ID_ERROR, 8
+    one, other = open_bus("virtual", "errors"), open_bus("virtual", "errors")
+    one.send(frames)
+    assert receive_all(other, 1)["can_id"][0] & ID_ERROR
+    one.close()
+    other.close()
+
+
+def test_the_legal_lengths_are_those_of_iso_11898() -> None:
+    assert [n for n in range(256) if is_legal(0x100, n, FLAG_FDF)] == [*range(9), 12, 16, 20, 24, 32, 48, 64]
+    assert [n for n in range(256) if is_legal(0x100, n, 0)] == list(range(9))
+    assert [i for i in (0x7FF, 0x800, 0x800 | ID_EXTENDED) if is_legal(i, 8, 0)] == [0x7FF, 0x800 | ID_EXTENDED]
+
+
+def test_one_channel_for_all_buses() -> None:
+    assert parse_channel_map("vcan0", BUSES) == dict.fromkeys(BUSES, "vcan0")
+
+
+def test_a_channel_for_each_bus_in_any_order() -> None:
+    text = "right_leg=can1, left_leg=can0,right_sense=can3,left_sense=can0"
+    assert list(parse_channel_map(text, BUSES).items()) == [
+        ("left_leg", "can0"),
+        ("right_leg", "can1"),
+        ("left_sense", "can0"),
+        ("right_sense", "can3"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "empty entry; write one channel for all"),
+        ("left_leg=can0,,right_leg=can1", "empty entry"),
+        ("can0,can1", "does not say which bus"),
+        ("left_leg=can0,can1", "'can1' in the channel map is not BUS=CHANNEL"),
+        ("left_leg=", "is not BUS=CHANNEL"),
+        ("left_arm=can0", "no bus 'left_arm'; the buses are left_leg, right_leg, left_sense, right_sense"),
+        ("left_leg=can0,left_leg=can1", "names left_leg twice: can0 and can1"),
+        ("left_leg=can0,right_sense=can1", "no channel for right_leg, left_sense; write left_leg=can0,right_leg=can1"),
+    ],
+)
+def test_a_wrong_channel_map_says_what_is_right(text: str, sentence: str) -> None:
+    with pytest.raises(ChannelMapError, match=sentence):
+        parse_channel_map(text, BUSES)
+
+
+def test_each_channel_is_opened_once() -> None:
+    buses = open_channels("virtual", parse_channel_map("map-test", BUSES))
+    assert list(buses) == list(BUSES)
+    assert len({id(bus) for bus in buses.values()}) == 1
+    buses["left_leg"].close()
+
+
+def test_a_channel_that_cannot_be_opened_closes_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[Bus] = []
+
+    def open_first_two(interface: str, channel: str) -> Bus:
+        if len(opened) == 2:
+            raise BusAbsent("there is no interface can2")
+        opened.append(lockstep_pair()[0])
+        return opened[-1]
+
+    monkeypatch.setattr("atalante_hal.bus.channel_map.open_bus", open_first_two)
+    with pytest.raises(BusAbsent, match="can2"):
+        open_channels("socketcan", {bus: f"can{index}" for index, bus in enumerate(BUSES)})
+    assert len(opened) == 2
+    for bus in opened:
+        with pytest.raises(BusDown):
+            bus.receive(new_frames(1))
