@@ -42,8 +42,13 @@ class WallClock:
     After a late cycle the deadlines move on from now: a burst of catch-up cycles would command old states.
     """
 
-    def __init__(self, period: float = PERIOD, now: Callable[[], float] = time.monotonic) -> None:
-        self._period, self._now = period, now
+    def __init__(
+        self,
+        period: float = PERIOD,
+        now: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._period, self._now, self._sleep = period, now, sleep
         self._next = now()
 
     def wait(self) -> float:
@@ -51,7 +56,7 @@ class WallClock:
         self._next += self._period
         now = self._now()
         if now < self._next:
-            time.sleep(self._next - now)
+            self._sleep(self._next - now)
             return max(0.0, self._now() - self._next)
         late = now - self._next
         self._next = now

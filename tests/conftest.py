@@ -1,0 +1,138 @@
+"""What the tests share: the network, the robot, and an embedded rig of HAL and emulator in lock-step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+import atalante_dbc
+from atalante_control.model import ExoskeletonParameters, urdf
+from atalante_emulator.body import PyBulletBody
+from atalante_emulator.emulator import Emulator
+from atalante_emulator.pendant import Operator
+from atalante_hal.bus import Bus
+from atalante_hal.bus.pair import lockstep_pair
+from atalante_hal.frame import Frames
+from atalante_hal.hal import Hal
+from atalante_hal.robot import Robot, load_robot
+from atalante_hal.types import Command, State, SupervisorState
+
+
+@pytest.fixture(scope="session")
+def network() -> atalante_dbc.Network:
+    return atalante_dbc.load()
+
+
+@pytest.fixture(scope="session")
+def robot() -> Robot:
+    return load_robot()
+
+
+@pytest.fixture(scope="session")
+def urdf_text(robot: Robot) -> str:
+    return urdf(ExoskeletonParameters(), robot)
+
+
+class FilterBus:
+    """A bus that lets a test lose, change or add frames on their way to the HAL or to the nodes."""
+
+    def __init__(self, bus: Bus) -> None:
+        self.bus = bus
+        self.to_hal: Callable[[Frames], Frames] = lambda frames: frames
+        self.to_nodes: Callable[[Frames], Frames] = lambda frames: frames
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.bus, name)
+
+    def send(self, frames: Frames) -> None:
+        kept = self.to_nodes(frames)
+        if len(kept):
+            self.bus.send(np.ascontiguousarray(kept))
+
+    def receive(self, frames: Frames, timeout: float = 0.0) -> int:
+        count = self.bus.receive(frames, timeout)
+        kept = self.to_hal(frames[:count].copy())
+        frames[: len(kept)] = kept
+        return len(kept)
+
+
+@dataclass
+class Rig:
+    """HAL and emulator in one process; `cycle` runs one cycle of a stiff position hold."""
+
+    hal: Hal
+    emulator: Emulator
+    bus: FilterBus
+    operator: Operator
+    sent: list[Frames]
+
+    def cycle(self, torque: np.ndarray | None = None) -> State:
+        state = self.hal.read()
+        if state.supervisor is SupervisorState.ACTIVE:
+            if torque is None:
+                torque = (
+                    self.hal.robot.hold_kp * (self._anchor - state.position) - self.hal.robot.hold_kd * state.velocity
+                )
+            self.hal.write(Command(torque, np.zeros(8)))
+        else:
+            self._anchor = state.position.copy()
+            self.hal.hold()
+        return state
+
+    def run(self, cycles: int) -> State:
+        for _ in range(cycles):
+            state = self.cycle()
+        return state
+
+    def until(self, wanted: SupervisorState, cycles: int = 600) -> State:
+        for _ in range(cycles):
+            state = self.cycle()
+            if state.supervisor is wanted:
+                return state
+        raise AssertionError(
+            f"not {wanted.name} after {cycles} cycles: {self.hal.reason}, missing {self.hal.missing()}"
+        )
+
+    def codes(self) -> list[str]:
+        return [event.code for event in self.hal.events]
+
+
+class _Tap:
+    def __init__(self, sent: list[Frames]) -> None:
+        self._sent = sent
+
+    def sent(self, frames: Frames) -> None:
+        self._sent.append(frames.copy())
+
+    def received(self, frames: Frames, count: int) -> None:
+        pass
+
+
+@pytest.fixture
+def make_rig(network: atalante_dbc.Network, robot: Robot, urdf_text: str) -> Iterator[Callable[..., Rig]]:
+    bodies: list[PyBulletBody] = []
+
+    def make(*, seed: int = 0, assistance_factor: float | None = None, starts: bool = True, **options: Any) -> Rig:
+        ours, theirs = lockstep_pair()
+        body = PyBulletBody(urdf_text)
+        bodies.append(body)
+        operator = Operator(assistance_factor, starts=starts)
+        emulator = Emulator(network, robot, body, theirs, seed=seed, operator=operator)
+        ours.step = emulator.poll
+        bus = FilterBus(ours)
+        sent: list[Frames] = []
+        hal = Hal(network, robot, bus, tap=_Tap(sent), **options)
+        return Rig(hal, emulator, bus, operator, sent)
+
+    yield make
+    for body in bodies:
+        body.close()
+
+
+@pytest.fixture
+def rig(make_rig: Callable[..., Rig]) -> Rig:
+    return make_rig()

@@ -1,0 +1,133 @@
+"""The loop: order of a cycle, clocks, and what an exception or a late cycle does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from atalante_hal.loop import GAP_TO_HOLD, LockStep, WallClock, run
+from atalante_hal.types import Command, SupervisorState
+
+S = SupervisorState
+
+
+class Recorder:
+    """A controller that remembers what it was asked."""
+
+    telemetry_fields = (("calls", 1),)
+
+    def __init__(self, fail_at: int | None = None) -> None:
+        self.telemetry = np.zeros(1)
+        self.resets = 0
+        self.fail_at = fail_at
+
+    def reset(self, state):
+        self.resets += 1
+
+    def update(self, state):
+        self.telemetry[0] += 1
+        if self.telemetry[0] == self.fail_at:
+            raise ZeroDivisionError("a controller's mistake")
+        return Command(np.zeros(12), np.full(8, 0.5))
+
+
+class Late:
+    """A clock that is late when it is told."""
+
+    def __init__(self, lateness: dict[int, float]) -> None:
+        self.lateness, self.cycle = lateness, 0
+
+    def wait(self) -> float:
+        self.cycle += 1
+        return self.lateness.get(self.cycle, 0.0)
+
+
+def after(cycles: int):
+    return lambda state: state.cycle >= cycles
+
+
+def test_the_controller_runs_in_active_alone_and_its_telemetry_is_recorded(make_rig):
+    rig = make_rig(controller_fields=Recorder.telemetry_fields)
+    controller = Recorder()
+    seen = []
+    hal = rig.hal
+    statistics = run(
+        hal, controller, LockStep(), until=after(500),
+        record=lambda: seen.append((hal.state.supervisor, hal.record[hal.layout["controller.calls"]][0])),
+    )  # fmt: skip
+    active = [calls for supervisor, calls in seen if supervisor is S.ACTIVE]
+    assert controller.resets == 1
+    assert active == list(range(1, len(active) + 1))
+    assert len(active) > 100
+    assert statistics.cycles == 500
+    assert statistics.overruns == 0
+    assert hal.state.supervisor is S.HOLD
+
+
+def test_an_exception_holds_in_the_same_cycle_and_the_loop_goes_on(make_rig):
+    rig = make_rig(controller_fields=Recorder.telemetry_fields)
+    controller = Recorder(fail_at=10)
+    run(rig.hal, controller, LockStep(), until=after(600))
+    assert "ZeroDivisionError: a controller's mistake" in next(
+        e.text for e in rig.hal.events if e.code == "CONTROLLER_ERROR"
+    )
+    assert controller.telemetry[0] == 10
+    first_hold = next(e.cycle for e in rig.hal.events if e.code == "HOLD")
+    failed = next(e.cycle for e in rig.hal.events if e.code == "CONTROLLER_ERROR")
+    assert first_hold == failed + 1
+
+
+@pytest.mark.parametrize(
+    ("lateness", "expected"),
+    [
+        ({400: 1.5e-3}, S.ACTIVE),
+        ({400: 1.5e-3, 401: 1.5e-3}, S.ACTIVE),
+        ({400: 1.5e-3, 401: 1.5e-3, 402: 1.5e-3}, S.HOLD),
+        ({400: 4e-3}, S.ACTIVE),
+        ({400: GAP_TO_HOLD + 1e-3}, S.HOLD),
+        ({400: 0.9e-3, 401: 0.9e-3, 402: 0.9e-3}, S.ACTIVE),
+    ],
+)
+def test_three_late_cycles_in_a_row_or_one_long_gap_end_in_hold(make_rig, lateness, expected):
+    rig = make_rig(controller_fields=Recorder.telemetry_fields)
+    states = []
+    statistics = run(rig.hal, Recorder(), Late(lateness), until=lambda s: states.append(s.supervisor) or s.cycle >= 420)
+    assert states[390] is S.ACTIVE
+    assert states[-1] is expected
+    assert statistics.overruns == sum(late > 1e-3 for late in lateness.values())
+    assert statistics.lateness_max == max(lateness.values())
+
+
+def test_the_loop_ends_in_hold_whatever_ends_it(make_rig):
+    rig = make_rig(controller_fields=Recorder.telemetry_fields)
+
+    def interrupt(state):
+        if state.cycle == 400:
+            raise KeyboardInterrupt
+        return False
+
+    with pytest.raises(KeyboardInterrupt):
+        run(rig.hal, Recorder(), LockStep(), until=interrupt)
+    assert rig.hal.state.supervisor is S.HOLD
+
+
+def test_deadlines_are_absolute_and_a_missed_one_is_not_made_up_for():
+    now = [10.0]
+    slept = []
+
+    def sleep_until(seconds: float) -> None:
+        slept.append(seconds)
+        now[0] += seconds
+
+    clock = WallClock(1e-3, now=lambda: now[0], sleep=sleep_until)
+    now[0] += 0.4e-3
+    assert clock.wait() == 0.0
+    assert slept[-1] == pytest.approx(0.6e-3)
+    now[0] += 0.9e-3
+    clock.wait()
+    assert slept[-1] == pytest.approx(0.1e-3)
+    now[0] += 3.5e-3
+    assert clock.wait() == pytest.approx(2.5e-3)
+    now[0] += 0.2e-3
+    clock.wait()
+    assert slept[-1] == pytest.approx(0.8e-3)
