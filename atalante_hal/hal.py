@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -24,6 +23,7 @@ from atalante_hal.image import NEVER, ReceiveImage, TransmitImage
 from atalante_hal.limiter import Limiter
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, MOTORS, Robot
 from atalante_hal.supervisor import HOLD_ON, Condition, next_state
+from atalante_hal.telemetry.events import Event
 from atalante_hal.telemetry.layout import Layout
 from atalante_hal.types import Command, State, SupervisorState
 
@@ -49,16 +49,6 @@ class FrameTap(Protocol):
 
     def received(self, frames: Frames, count: int) -> None:
         """`frames[:count]` as they came from the bus."""
-
-
-@dataclass(frozen=True)
-class Event:
-    """Something that went wrong or changed, once, when it began."""
-
-    cycle: int
-    code: str  # name of the condition or state
-    text: str  # one sentence
-    severity: str  # "info", "warning" or "error"
 
 
 class Hal:
@@ -91,6 +81,7 @@ class Hal:
             raise ValueError(f"the assistance factor is between 0 and 1, not {assistance_factor}")
         self.network, self.robot, self.bus, self.tap = network, robot, bus, tap
         self.patience = patience
+        #: What went wrong or changed, once, when it began.
         self.events: list[Event] = []
         self.conditions = Condition(0)
         #: Why the robot is in the state it is in, one sentence.
@@ -424,9 +415,9 @@ class Hal:
             and not self.conditions & HOLD_ON
             and not self.conditions & Condition.DRIVE_FAULT
         ):
-            self._note("DEAD_MAN", "the dead-man was released or the pendant is lost", "warning")
+            self._note("DEAD_MAN", "the dead-man was released or the pendant is lost", "warning", "PENDANT")
         severity = "error" if after is SupervisorState.FAULT else "info"
-        self._note(after.name, f"{before.name} -> {after.name}", severity, counts_as_reason=False)
+        self.events.append(Event(state.cycle, after.name, f"{before.name} -> {after.name}", severity, value=after))
 
     def _judge_ages(self) -> Condition:
         """The slow half of validity: something was not fresh this cycle."""
@@ -438,7 +429,8 @@ class Hal:
             return Condition.NODES_WELL if self._nodes_known else Condition(0)
         if self.state.supervisor is SupervisorState.ACTIVE:
             message = self._rx.codec.messages[int(np.argmax(late))]
-            self._note("NODE_TIMEOUT", f"{message.sender} has not been heard for {message.timeout_ms} cycles", "error")
+            text = f"{message.sender} has not been heard for {message.timeout_ms} cycles"
+            self._note("NODE_TIMEOUT", text, "error", message.sender, message.timeout_ms)
         return Condition.NODE_TIMEOUT
 
     def _judge_drives(self) -> Condition:
@@ -450,10 +442,11 @@ class Hal:
             ):
                 found |= Condition.DRIVE_FAULT
                 if self.state.supervisor is not SupervisorState.FAULT:
-                    self._note("DRIVE_FAULT", f"the drive of {joint} reports a fault", "error")
+                    self._note("DRIVE_FAULT", f"the drive of {joint} reports a fault", "error", joint.upper(), drive)
             elif drive != DriveState.OPERATION_ENABLED and self.state.supervisor is SupervisorState.ACTIVE:
                 found |= Condition.DRIVE_STATE
-                self._note("DRIVE_STATE", f"the drive of {joint} left OPERATION ENABLED by itself", "error")
+                text = f"the drive of {joint} left OPERATION ENABLED by itself"
+                self._note("DRIVE_STATE", text, "error", joint.upper(), drive)
         return found
 
     def _judge_pendant(self) -> Condition:
@@ -473,19 +466,20 @@ class Hal:
             if request == 1:  # START
                 self._start_wanted = _ENABLE_CYCLES
             elif self.state.supervisor is SupervisorState.ACTIVE:
-                self._note("OPERATOR_STOP", "the operator asked to stop", "info")
+                self._note("OPERATOR_STOP", "the operator asked to stop", "info", "PENDANT")
         if values[at["AssistanceSet"]]:
             self.state.assistance_factor = float(values[at["AssistanceFactor"]])
         return found
 
     def _raise_condition(self, condition: Condition, text: str) -> None:
+        """A fault found outside `_supervise`; told once while it lasts."""
+        if not (self.conditions | self._pending) & condition:
+            self._note(str(condition.name), text, "error")
         self._pending |= condition
-        self._note(str(condition.name), text, "error")
 
-    def _note(self, code: str, text: str, severity: str, *, counts_as_reason: bool = True) -> None:
-        self.events.append(Event(self.state.cycle, code, text, severity))
-        if counts_as_reason:
-            self.reason = text
+    def _note(self, code: str, text: str, severity: str, node: str = "HAL", value: float = 0.0) -> None:
+        self.events.append(Event(self.state.cycle, code, text, severity, node, value))
+        self.reason = text
 
     def _send_status(self) -> None:
         values, at = self._status.values, self._status_index
