@@ -16,9 +16,11 @@ import can
 import numpy as np
 import pytest
 
+from atalante_dbc import Message, Network, load
 from atalante_hal.bus import Bus, BusAbsent, BusDown, BusError, BusFull, open_bus
 from atalante_hal.bus.batch import is_legal
 from atalante_hal.bus.channel_map import ChannelMapError, open_channels, parse_channel_map
+from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.bus.python_can import PythonCanBus, message_of
 from atalante_hal.bus.replay import LogUnreadable, ReplayBus
@@ -274,6 +276,30 @@ class TestPythonCanVirtual(FrameSender, FrameReceiver, FrameWaiter):
         yield one, other
         one.close()
         other.close()
+
+
+def network_of(bus_of: dict[int, str]) -> Network:
+    """A network in which every identifier has a bus."""
+    messages = tuple(
+        Message(f"M{i}", frame_id, 8, "HAL", (), bus, "cyclic", 1, 0, 0, i, "")
+        for i, (frame_id, bus) in enumerate(bus_of.items())
+    )
+    return Network((), messages, BUSES, 1_000_000, 5_000_000, 0)
+
+
+class TestJoinedBus(FrameSender, FrameReceiver, FrameWaiter):
+    """Two channels; these frames are all at home on one of them, where their order is defined."""
+
+    @pytest.fixture
+    def ends(self, request: pytest.FixtureRequest) -> Iterator[tuple[Bus, Bus]]:
+        network = network_of(dict.fromkeys([*range(0x800), *other_frames()["can_id"].tolist()], "right_leg"))
+        joined = []
+        for _ in range(2):
+            legs, senses = (open_bus("virtual", f"{request.node.name} {part}") for part in ("legs", "senses"))
+            joined.append(JoinedBus(network, dict(zip(BUSES, (legs, legs, senses, senses), strict=True))))
+        yield joined[0], joined[1]
+        for bus in joined:
+            bus.close()
 
 
 class TestReplayLog(FrameReceiver):
@@ -550,3 +576,84 @@ def test_a_channel_that_cannot_be_opened_closes_the_others(monkeypatch: pytest.M
     for bus in opened:
         with pytest.raises(BusDown):
             bus.receive(new_frames(1))
+
+
+def four_pairs() -> tuple[JoinedBus, dict[str, Bus]]:
+    """The network's four buses joined, and the far end of each."""
+    pairs = {bus: lockstep_pair(capacity=8, names=(bus, f"{bus} peer")) for bus in BUSES}
+    return JoinedBus(load(), {bus: near for bus, (near, _) in pairs.items()}), {
+        bus: far for bus, (_, far) in pairs.items()
+    }
+
+
+def frames_of(*names: str) -> Frames:
+    """Empty frames of these messages."""
+    frames = new_frames(len(names))
+    for frame, name in zip(frames, names, strict=True):
+        message = load().message(name)
+        frame["can_id"], frame["len"], frame["flags"] = message.frame_id, message.length, FLAG_FDF | FLAG_BRS
+    return frames
+
+
+def test_joined_sends_each_frame_where_its_message_lives() -> None:
+    joined, far = four_pairs()
+    frames = frames_of(*(m.name for m in load().messages if m.cycle_ms == 1))
+    for cycle in range(3):
+        frames["data"][:, 3] = cycle
+        joined.send(frames)
+        for bus, end in far.items():
+            expected = frames[[load().messages[i].bus == bus for i in _places(frames)]]
+            assert receive_all(end, len(expected)).tobytes() == expected.tobytes()
+            assert end.receive(new_frames(1)) == 0
+
+
+def _places(frames: Frames) -> list[int]:
+    ids = [m.frame_id for m in load().messages]
+    return [ids.index(frame_id) for frame_id in frames["can_id"].tolist()]
+
+
+def test_joined_receives_from_every_channel_with_its_stamps() -> None:
+    joined, far = four_pairs()
+    for cycle in range(4):  # every channel is first once
+        for place, bus in enumerate(BUSES):
+            frames = frames_of(*[m.name for m in load().messages if m.bus == bus and m.cycle_ms == 1][:2])
+            far[bus].send(frames)
+            joined._links[place].now_ns = 1000 * cycle + place  # type: ignore[attr-defined]
+        block = new_frames(16)
+        assert joined.receive(block) == 8
+        buses = [load().messages[i].bus for i in _places(block[:8])]
+        assert sorted(buses) == sorted(BUSES * 2)
+        assert joined.stamps[:8].tolist() == [1000 * cycle + BUSES.index(bus) for bus in buses]
+
+
+def test_joined_refuses_a_frame_that_has_no_bus_and_sends_nothing() -> None:
+    joined, far = four_pairs()
+    frames = frames_of("SYNC_LEFT_LEG", "SYNC_RIGHT_LEG")
+    frames["can_id"][1] = 0x7FE
+    with pytest.raises(ValueError, match=r"frame 1 \(id 0x7FE\) is no message of the network"):
+        joined.send(frames)
+    assert far["left_leg"].receive(new_frames(1)) == 0
+
+
+def test_joined_serves_the_other_channels_when_one_is_full_or_gone() -> None:
+    joined, far = four_pairs()
+    syncs = frames_of(*(f"SYNC_{bus.upper()}" for bus in BUSES))
+    for _ in range(8):
+        joined.send(syncs)
+        for bus in BUSES[1:]:
+            receive_all(far[bus], 1)
+    with pytest.raises(BusFull, match="left_leg peer has 8 frames waiting") as refusal:
+        joined.send(syncs)
+    assert refusal.value.sent == 3
+    for bus in BUSES[1:]:
+        receive_all(far[bus], 1)
+    joined._links[0].close()
+    with pytest.raises(BusDown, match="left_leg is closed"):
+        joined.send(syncs)
+    for bus in BUSES[1:]:
+        receive_all(far[bus], 1)
+
+
+def test_joined_needs_a_channel_for_every_bus() -> None:
+    with pytest.raises(ValueError, match="no channel given for right_leg; the buses are"):
+        JoinedBus(load(), {"left_leg": lockstep_pair()[0]})

@@ -163,6 +163,10 @@ class SocketCanBus:
         memory[:size] = self._rx_memory[:size]
         return int(count)
 
+    def fileno(self) -> int:
+        """File descriptor, to wait for several buses at once."""
+        return self._file
+
     def close(self) -> None:
         """Close the socket."""
         self._closed = True
