@@ -34,6 +34,9 @@ _RECEIVE_BUDGET = 128
 _ENABLE_CYCLES = 200
 
 _JOINT_COUNT = len(JOINTS)
+# What is judged every cycle, as plain integers: arithmetic on an IntFlag costs a microsecond an operation.
+_NODES_WELL, _DRIVES_ENABLED = int(Condition.NODES_WELL), int(Condition.DRIVES_ENABLED)
+_DEAD_MAN, _START_WANTED = int(Condition.DEAD_MAN), int(Condition.START_WANTED)
 #: One number each at the head of the record.
 HEADER_FIELDS = (
     "cycle", "time", "supervisor", "assistance_factor", "cost_us", "lateness_us",
@@ -90,9 +93,10 @@ class Hal:
         self._build_state(assistance_factor)
         self._build_status(gait_hash)
         self._limiter = Limiter(robot, PERIOD)
-        self._pending = Condition(0)  # raised since the last read, judged in the next
+        self._settled = False  # the supervisor stays where it is while the conditions stay as they are
+        self._pending = 0  # conditions raised since the last read, judged in the next
         self._start_wanted = 0  # cycles left to reach ACTIVE, 0: nobody asked
-        self._last_press: int | None = None
+        self._last_press: float | None = None
         self._send_failures = 0
         self._prepare_hold()
 
@@ -166,9 +170,10 @@ class Hal:
 
         codec = self._rx.codec
         self._pendant_row = codec.rows["PENDANT_STATE"]
-        self._pendant = {
-            s.name: codec.index("PENDANT_STATE", s.name) for s in self.network.message("PENDANT_STATE").signals
-        }
+        places = [codec.index("PENDANT_STATE", name) for name in _PENDANT_SIGNALS]
+        assert places == list(range(places[0], places[0] + len(places)))
+        self._pendant = self._rx.values[places[0] : places[-1] + 1]
+        self._pendant_said, self._pendant_found = b"", 0  # judged last, and what came of it
         slow = self._slow.codec
         self._amplitude = slow.slice("Amplitude")
         self._amplitude_row = slow.rows["HAPTICS_STATE"]
@@ -377,31 +382,34 @@ class Hal:
     def _supervise(self) -> None:
         state = self.state
         found = self._pending
-        self._pending = Condition(0)
+        self._pending = 0
         state.joints_valid = self._rx.all_fresh
         if self._rx.all_fresh:
             state.valid.fill(True)
-            found |= Condition.NODES_WELL if self._nodes_known else Condition(0)
+            found |= _NODES_WELL if self._nodes_known else 0
         else:
             found |= self._judge_ages()
         found |= self._judge_pendant()
         if state.drive_state.tobytes() == self._enabled_states:
-            found |= Condition.DRIVES_ENABLED
+            found |= _DRIVES_ENABLED
         else:
             found |= self._judge_drives()
         if self._stranger is not None:
-            found &= ~Condition.NODES_WELL
+            found &= ~_NODES_WELL
         if self._start_wanted:
-            found |= Condition.START_WANTED
+            found |= _START_WANTED
             self._start_wanted -= 1
-            if found & HOLD_ON or not found & Condition.DEAD_MAN:
+            if found & HOLD_ON or not found & _DEAD_MAN:
                 self._start_wanted = 0
             elif not self._start_wanted:
                 self._note("START_FAILED", f"the drives were not enabled within {_ENABLE_CYCLES} cycles", "error")
-        self.conditions = found
+        if self._settled and found == self.conditions:
+            return
+        self.conditions = Condition(found)
         before = state.supervisor
-        after = next_state(before, found)
-        if after is not before:
+        after = next_state(before, self.conditions)
+        self._settled = after is before
+        if not self._settled:
             self._enter(before, after)
 
     def _enter(self, before: SupervisorState, after: SupervisorState) -> None:
@@ -419,21 +427,21 @@ class Hal:
         severity = "error" if after is SupervisorState.FAULT else "info"
         self.events.append(Event(state.cycle, after.name, f"{before.name} -> {after.name}", severity, value=after))
 
-    def _judge_ages(self) -> Condition:
+    def _judge_ages(self) -> int:
         """The slow half of validity: something was not fresh this cycle."""
         ages = self._rx.age
         np.less_equal(self._rx.check, 1, out=self.state.valid)
         self.state.joints_valid = bool(self.state.valid[self._joint_rows].all())
         late = (ages > self._timeouts) & self._needed
         if not late.any():
-            return Condition.NODES_WELL if self._nodes_known else Condition(0)
+            return _NODES_WELL if self._nodes_known else 0
         if self.state.supervisor is SupervisorState.ACTIVE:
             message = self._rx.codec.messages[int(np.argmax(late))]
             text = f"{message.sender} has not been heard for {message.timeout_ms} cycles"
             self._note("NODE_TIMEOUT", text, "error", message.sender, message.timeout_ms)
         return Condition.NODE_TIMEOUT
 
-    def _judge_drives(self) -> Condition:
+    def _judge_drives(self) -> int:
         found = Condition(0)
         for joint, drive in zip(JOINTS, self.state.drive_state.tolist(), strict=True):
             if (
@@ -449,14 +457,17 @@ class Hal:
                 self._note("DRIVE_STATE", text, "error", joint.upper(), drive)
         return found
 
-    def _judge_pendant(self) -> Condition:
+    def _judge_pendant(self) -> int:
         """Everything an operator can say."""
         row = self._pendant_row
-        if self._rx.age[row] > self._timeouts[row]:
-            return Condition(0)
-        values, at = self._rx.values, self._pendant
-        found = Condition.DEAD_MAN if values[at["DeadMan"]] else Condition(0)
-        request, press = int(values[at["Request"]]), int(values[at["RequestCounter"]])
+        if not self._rx.all_fresh and self._rx.age[row] > self._timeouts[row]:
+            return 0
+        said = self._pendant.tobytes()
+        if said == self._pendant_said:
+            return self._pendant_found
+        self._pendant_said = said
+        dead_man, request, press, factor, factor_set = self._pendant.tolist()
+        found = _DEAD_MAN if dead_man else 0
         if request in (2, 3):  # STOP, HOLD
             found |= Condition.STOP_REQUESTED
         if self._last_press is None:
@@ -467,9 +478,10 @@ class Hal:
                 self._start_wanted = _ENABLE_CYCLES
             elif self.state.supervisor is SupervisorState.ACTIVE:
                 self._note("OPERATOR_STOP", "the operator asked to stop", "info", "PENDANT")
-        if values[at["AssistanceSet"]]:
-            self.state.assistance_factor = float(values[at["AssistanceFactor"]])
-        return found
+        if factor_set:
+            self.state.assistance_factor = factor
+        self._pendant_found = int(found)
+        return self._pendant_found
 
     def _raise_condition(self, condition: Condition, text: str) -> None:
         """A fault found outside `_supervise`; told once while it lasts."""
@@ -506,6 +518,9 @@ def _record_fields(image: ReceiveImage, controller_fields: Sequence[tuple[str, i
         *((f"controller.{name}", length) for name, length in controller_fields),
     ]
 
+
+#: What the pendant says, in the order of the decoded values.
+_PENDANT_SIGNALS = ("DeadMan", "Request", "RequestCounter", "AssistanceFactor", "AssistanceSet")
 
 #: Quantity of the DBC -> field of the record, where the plain name would be ambiguous.
 _FIELD_NAMES = {
