@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
+from operator import itemgetter
 from pathlib import Path
 from struct import Struct
 from typing import Any, Protocol
@@ -28,6 +29,8 @@ PERIOD = 1e-3
 GRAVITY = 9.81  # m/s2
 #: Solver iterations are part of the model, not a speed setting: the standing pose depends on them.
 SOLVER_ITERATIONS = 50
+#: Entries of a PyBullet joint state.
+_POSITION, _VELOCITY = itemgetter(0), itemgetter(1)
 
 
 class Body(Protocol):
@@ -157,7 +160,7 @@ class PyBulletBody:
         )
 
     def _unpack(self, joints: Any, links: Any, contacts: Any) -> None:
-        self._pack(self._state_bytes, 0, *[state[0] for state in joints], *[state[1] for state in joints])
+        self._pack(self._state_bytes, 0, *map(_POSITION, joints), *map(_VELOCITY, joints))
         for place, state in zip(self._moving, links, strict=True):
             self.imu[place] = state[4:]
         self.contact = self._forces(contacts) if contacts else ()

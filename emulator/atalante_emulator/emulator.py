@@ -1,0 +1,374 @@
+"""The emulated robot at the other end of the bus.
+
+    bus -> process image -> E2E + validity -> nodes -> body (PyBullet) -> nodes -> process image -> bus
+
+A cycle begins with SYNC: every node samples and sends, then latches the command of the cycle before, and the body moves on by
+one millisecond. The same object answers an embedded HAL in lock-step (`poll` as the `step` of a `PairBus`) and a HAL in
+another process (`run`). One seed gives one sequence of bytes.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_dbc import Network
+from atalante_emulator.body import PERIOD, Body
+from atalante_emulator.drive import WATCHDOG, DriveParameters, Drives, DriveSignals
+from atalante_emulator.foot import Feet, FootParameters
+from atalante_emulator.haptics import Haptics, HapticsParameters
+from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
+from atalante_emulator.pendant import Operator
+from atalante_hal.bus import Bus, BusFull
+from atalante_hal.codec import Codec
+from atalante_hal.e2e import Check
+from atalante_hal.frame import Frames, new_frames
+from atalante_hal.image import ReceiveImage, TransmitImage
+from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, SIDES, Robot
+
+Vector = npt.NDArray[np.float64]
+
+#: Frames one `receive` can take; a cycle is seven and now and then one more.
+_RECEIVE_BUDGET = 128
+#: Cycles of noise drawn at once.
+_NOISE_CYCLES = 128
+#: Longest wait [s] for the other SYNCs of a cycle once the first is there.
+_SYNC_SKEW = 200e-6
+#: Node states of the slow status, as CiA 301 heartbeat values.
+_BOOTUP, _OPERATIONAL = 0, 5
+_FIRMWARE_VERSION = 0x0100
+_SUPPLY_VOLTAGE = 48.0  # V
+
+
+@dataclass(frozen=True)
+class EmulatorParameters:
+    """What the emulated nodes are like."""
+
+    drive: DriveParameters = field(default_factory=DriveParameters)
+    imu: ImuParameters = field(default_factory=ImuParameters)
+    foot: FootParameters = field(default_factory=FootParameters)
+    haptics: HapticsParameters = field(default_factory=HapticsParameters)
+
+
+class Emulator:
+    """All nodes of the network but the HAL, on one body.
+
+    `before_send` holds callables `(cycle, values)` that may rewrite what the nodes are about to say: `values` is in the order
+    of `signals`.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        robot: Robot,
+        body: Body,
+        buses: Bus | Mapping[str, Bus],
+        *,
+        seed: int = 0,
+        operator: Operator | None = None,
+        parameters: EmulatorParameters | None = None,
+    ) -> None:
+        """Put the nodes on the bus.
+
+        Args:
+            body: the mechanics; the emulator steps it, the caller closes it.
+            buses: one bus for all, or the bus of each of `network.buses` (several may be the same object).
+            seed: of every random number: sensor noise and biases.
+            operator: holds the pendant; None: the pendant is somebody else's node.
+
+        Raises:
+            ValueError: `buses` lacks one of the network's buses.
+        """
+        parameters = parameters or EmulatorParameters()
+        self.network, self.body, self.operator = network, body, operator
+        self.cycle = 0
+        self.frames_lost = 0  # nodes' frames that the bus had no room for
+        self.before_send: list[Callable[[int, Vector], None]] = []
+        self._build_images(buses)
+        self._build_nodes(robot, parameters)
+        self._build_noise(seed)
+
+    @property
+    def signals(self) -> Codec:
+        """Order of the values of the 1 ms messages."""
+        return self._tx.codec
+
+    # -- construction ------------------------------------------------------------------------------------------------
+
+    def _build_images(self, buses: Bus | Mapping[str, Bus]) -> None:
+        network = self.network
+        kinds = ("drive", "imu", "foot", "haptics") + (("pendant",) if self.operator else ())
+        ours = {node.name for node in network.nodes if node.kind in kinds}
+        sent = [m for m in network.messages if m.sender in ours]
+        cyclic = [m for bus in network.buses for m in sent if m.bus == bus and m.cycle_ms == 1]
+        self._tx = TransmitImage(cyclic)
+        self._haptics_tx = TransmitImage([network.message("HAPTICS_STATE")])
+        self._status_tx = TransmitImage([m for m in sent if m.name.endswith("_STATUS")])
+        self._emergency_tx = TransmitImage([m for m in sent if m.name.endswith("_EMCY")])
+
+        heard = [m for m in network.sent_by("HAL") if m.cycle_ms == 1]
+        syncs = [m for m in heard if m.name.startswith("SYNC_")]
+        # As they come on an embedded bus: the commands of the last cycle, then SYNC.
+        self._rx = ReceiveImage([m for m in heard if m not in syncs] + syncs)
+        self._scratch = new_frames(_RECEIVE_BUDGET)
+        self._scratch_from = [self._scratch[place:] for place in range(_RECEIVE_BUDGET)]
+        self._waiting = 0  # frames at the head of the scratch that no SYNC has followed yet
+
+        bus_of = buses if isinstance(buses, Mapping) else dict.fromkeys(network.buses, buses)
+        if missing := [bus for bus in network.buses if bus not in bus_of]:
+            raise ValueError(f"no bus given for {missing[0]}; the buses are {', '.join(network.buses)}")
+        self._bus_of = {name: bus_of[name] for name in network.buses}
+        self._links = list({id(bus): bus for bus in self._bus_of.values()}.values())
+        self._sync_rows = [self._rx.codec.rows[m.name] for m in syncs]
+        self._sync_ids = {m.frame_id for m in syncs}
+        frames = self._tx.frames
+        self._shares: list[tuple[Bus, Frames]] = []  # what the nodes of the bus of each SYNC send
+        for sync in syncs:
+            rows = [row for row, m in enumerate(cyclic) if m.bus == sync.bus]
+            self._shares.append((self._bus_of[sync.bus], frames[rows[0] : rows[-1] + 1]))
+        self._whole = [(self._links[0], frames)] if len(self._links) == 1 else self._shares
+
+        values, codec = self._rx.values, self._rx.codec
+        self._controlword = values[codec.slice("Controlword")]
+        self._target = values[codec.slice("TargetTorque")]
+        self._limit = values[codec.slice("MaxTorque")]
+        self._level = values[codec.slice("Level")]
+        self._hal_state = values[codec.slice("HalState")]
+        self._sync_cycles = values[codec.slice("Cycle")]
+        self._command_rows = [codec.rows[f"COMMAND_{side.upper()}_LEG"] for side in SIDES]
+        self._level_row = codec.rows["HAPTICS_COMMAND"]
+        self._commanded = [False] * len(SIDES)
+        self._last_sync: int | None = None
+
+    def _build_nodes(self, robot: Robot, parameters: EmulatorParameters) -> None:
+        codec = self._tx.codec
+        #: What the signals are before noise; the nodes write into it.
+        self._truth = np.zeros(codec.size)
+        truth = self._truth
+
+        def joint(signal: str) -> Vector:
+            places = [codec.index(f"{name.upper()}_STATE", signal) for name in JOINTS]
+            if places != list(range(places[0], places[0] + len(JOINTS))):
+                raise ValueError(f"the drives' {signal} signals are not in joint order in the DBC")
+            return truth[places[0] : places[-1] + 1]
+
+        drive_signals = DriveSignals(
+            *(joint(s) for s in ("Position", "Velocity", "Torque", "Temperature", "DriveState"))
+        )
+        self.drives = Drives(robot, parameters.drive, drive_signals)
+
+        def wire_row(imu: str) -> int:
+            first: int = codec.slice("Quaternion").start
+            return (codec.index(f"IMU_{imu.upper()}_STATE", "QuaternionW") - first) // 4
+
+        imu_signals = ImuSignals(
+            truth[codec.slice("Quaternion")].reshape(-1, 4),
+            truth[codec.slice("Gyro")].reshape(-1, 3),
+            truth[codec.slice("Accel")].reshape(-1, 3),
+        )
+        self._imus = Imus(parameters.imu, imu_signals, [wire_row(imu) for imu in IMUS])
+        self._feet = Feet(parameters.foot, truth[codec.slice("Force")].reshape(len(FEET), len(CELLS), 3))
+        for kind, temperature in (("IMU", parameters.imu.temperature), ("FOOT", parameters.foot.temperature)):
+            for message in codec.messages:
+                if message.name.startswith(f"{kind}_"):
+                    truth[codec.index(message.name, "Temperature")] = temperature
+        amplitude = self._haptics_tx.values[self._haptics_tx.codec.slice("Amplitude")]
+        self._haptics = Haptics(parameters.haptics, amplitude)
+        self._haptics_cycles = self._haptics_tx.codec.messages[0].cycle_ms
+        self._operator_said: object = None
+        self._build_status()
+
+    def _build_status(self) -> None:
+        values, codec = self._status_tx.values, self._status_tx.codec
+        values[codec.slice("DbcHash")] = self.network.hash32
+        values[codec.slice("FirmwareVersion")] = _FIRMWARE_VERSION
+        values[codec.slice("SupplyVoltage")] = _SUPPLY_VOLTAGE
+        self._node_state, self._uptime = values[codec.slice("NodeState")], values[codec.slice("Uptime")]
+        self._node_state.fill(_BOOTUP)
+        # Spread over the period: no two nodes send their status in the same cycle.
+        period = max(m.cycle_ms for m in codec.messages)
+        gap = period // len(codec.messages)
+        self._status_period = period
+        self._status_due = {gap * row: row for row in range(len(codec.messages))}
+
+    def _build_noise(self, seed: int) -> None:
+        codec = self._tx.codec
+        self._noise = np.zeros((_NOISE_CYCLES, codec.size))
+        self._noise_rows = list(self._noise)
+        torque, gyro, accel, force = (self._noise[:, codec.slice(s)] for s in ("Torque", "Gyro", "Accel", "Force"))
+        # One generator a family: another IMU model does not change what the feet feel.
+        of_drives, of_imus, of_feet = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
+        bias = self._imus.draw_bias(of_imus)
+
+        def draw() -> None:
+            self.drives.draw_noise(of_drives, torque)
+            self._imus.draw_noise(of_imus, bias, gyro, accel)
+            self._feet.draw_noise(of_feet, force)
+
+        self._draw_noise = draw
+
+    # -- bus ---------------------------------------------------------------------------------------------------------
+
+    def poll(self, timeout: float = 0.0) -> bool:
+        """Take what the buses delivered and, if SYNC was in it, run one cycle.
+
+        Args:
+            timeout: longest wait for the first frame [s].
+
+        Returns:
+            Whether a cycle was run.
+        """
+        count = self._links[0].receive(self._scratch_from[self._waiting], timeout) + self._waiting
+        if count < len(self._rx.frames) or len(self._links) > 1:
+            count = self._receive_rest(count)
+            if not count:
+                return False
+        self._rx.accept(self._scratch, count)
+        if self._rx.all_fresh:
+            self._commanded = [False] * len(SIDES)
+            self._cycle((True, True), self._whole)
+            return True
+        return self._imperfect_cycle()
+
+    def _receive_rest(self, count: int) -> int:
+        """Gather until every SYNC of the cycle is there; returns 0 while there is none, and keeps what came for later."""
+        ids = self._scratch["can_id"]
+        deadline = None
+        while True:
+            before, wait = count, 0.0
+            synced = self._sync_ids.intersection(ids[:count].tolist())
+            if synced and len(synced) < len(self._sync_ids):
+                now = time.monotonic()
+                deadline = deadline or now + _SYNC_SKEW
+                wait = max(0.0, deadline - now)
+            for link in self._links:
+                if count < _RECEIVE_BUDGET:
+                    count += link.receive(self._scratch_from[count], wait)
+                    wait = 0.0
+            if count in (before, _RECEIVE_BUDGET):
+                break
+        self._waiting = 0 if synced or count == _RECEIVE_BUDGET else count
+        return count - self._waiting
+
+    def _imperfect_cycle(self) -> bool:
+        """Something is missing or refused: run the cycle with what is there."""
+        checks = self._rx.check.tolist()
+        for leg, row in enumerate(self._command_rows):
+            self._commanded[leg] |= checks[row] <= Check.SOME_LOST
+        synced = [place for place, row in enumerate(self._sync_rows) if checks[row] <= Check.SOME_LOST]
+        if not synced:
+            return False
+        shares = [self._shares[place] for place in synced]
+        number = int(max(self._sync_cycles[synced]))
+        if number == self._last_sync:  # the rest of a cycle that has already run
+            for bus, frames in shares:
+                self._send(bus, frames)
+            return False
+        self._last_sync = number
+        fresh = self._commanded[0], self._commanded[1]
+        self._commanded = [False] * len(SIDES)
+        self._cycle(fresh, shares)
+        return True
+
+    def _send(self, bus: Bus, frames: Frames) -> None:
+        try:
+            bus.send(frames)
+        except BusFull as error:
+            self.frames_lost += len(frames) - error.sent
+
+    # -- one cycle ---------------------------------------------------------------------------------------------------
+
+    def _cycle(self, fresh: tuple[bool, bool], shares: list[tuple[Bus, Frames]]) -> None:
+        """Sample, send, latch, move: [k, k+1] is driven by the command of cycle k-1."""
+        body, drives, tx = self.body, self.drives, self._tx
+        drives.sample(body.position)
+        self._imus.sample(body.imu)
+        self._feet.sample(body.contact, body.foot_rotation)
+        if self.operator is not None:
+            self._ask_operator(self.operator)
+        phase = self.cycle % _NOISE_CYCLES
+        if not phase:
+            self._draw_noise()
+        np.add(self._truth, self._noise_rows[phase], out=tx.values)
+        for rewrite in self.before_send:
+            rewrite(self.cycle, tx.values)
+        tx.seal()
+        for bus, frames in shares:
+            self._send(bus, frames)
+        self._send_slow()
+        drives.command(fresh, self._controlword, self._target, self._limit)
+        if drives.emergencies:
+            self._send_emergencies()
+        body.step(drives.drive(body.velocity))
+        self.cycle += 1
+
+    def _ask_operator(self, operator: Operator) -> None:
+        operator.hear(int(self._hal_state[0]))
+        said = operator.signals
+        if said is self._operator_said:
+            return
+        self._operator_said = said
+        factor = said.assistance_factor
+        at, truth = self._tx.codec.index, self._truth
+        truth[at("PENDANT_STATE", "DeadMan")] = said.dead_man
+        truth[at("PENDANT_STATE", "Request")] = said.request
+        truth[at("PENDANT_STATE", "RequestCounter")] = said.request_counter
+        truth[at("PENDANT_STATE", "AssistanceSet")] = factor is not None
+        truth[at("PENDANT_STATE", "AssistanceFactor")] = factor or 0.0
+
+    def _send_slow(self) -> None:
+        """Messages slower than the cycle, when they are due."""
+        if self.cycle % self._haptics_cycles == 0:
+            self._haptics.advance(self._level, int(self._rx.age[self._level_row]), self._haptics_cycles)
+            self._send(self._bus_of[self._haptics_tx.codec.messages[0].bus], self._haptics_tx.seal())
+        row = self._status_due.get(self.cycle % self._status_period)
+        if row is not None:
+            self._uptime[row] = self.cycle * PERIOD
+            self._send(self._bus_of[self._status_tx.codec.messages[row].bus], self._status_tx.seal_row(row))
+            self._node_state[row] = _OPERATIONAL
+
+    def _send_emergencies(self) -> None:
+        tx = self._emergency_tx
+        for drive, register, code in self.drives.emergencies:
+            name = f"{JOINTS[drive].upper()}_EMCY"
+            tx.values[tx.codec.index(name, "ErrorRegister")] = register
+            tx.values[tx.codec.index(name, "ErrorCode")] = code
+            row = tx.codec.rows[name]
+            self._send(self._bus_of[tx.codec.messages[row].bus], tx.seal_row(row))
+        self.drives.emergencies.clear()
+
+    # -- wall clock --------------------------------------------------------------------------------------------------
+
+    def run(self, stop: Callable[[], bool]) -> None:
+        """Be the robot for another process until `stop()`, asked every millisecond or so.
+
+        Without SYNC for `WATCHDOG` milliseconds the drives hold by themselves, and body and heartbeats go on in real time.
+        """
+        alone_from = time.monotonic() + WATCHDOG * PERIOD
+        while not stop():
+            ran = self.poll(PERIOD)
+            now = time.monotonic()
+            if ran:
+                alone_from = now + WATCHDOG * PERIOD
+                continue
+            while alone_from <= now:
+                self.idle()
+                alone_from += PERIOD
+
+    def idle(self) -> None:
+        """One millisecond without a HAL: the nodes say nothing but their heartbeat, and enabled drives hold."""
+        body, drives = self.body, self.drives
+        drives.sample(body.position)
+        self._imus.sample(body.imu)
+        self._rx.new_cycle()
+        self._send_slow()
+        for leg in range(len(SIDES)):
+            drives.hold(leg)
+        if drives.emergencies:
+            self._send_emergencies()
+        body.step(drives.drive(body.velocity))
+        self.cycle += 1

@@ -1,0 +1,44 @@
+"""The haptics node: eight vibration motors that follow the commanded level with a first-order lag."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_emulator.body import PERIOD
+
+Vector = npt.NDArray[np.float64]
+
+#: Cycles without a valid command after which the motors stop.
+WATCHDOG = 50
+
+
+@dataclass(frozen=True)
+class HapticsParameters:
+    """Response of the emulated vibration motors."""
+
+    rise_time: float = 0.04  # s, time constant of a small eccentric-mass motor
+
+
+class Haptics:
+    """Eight motors. `amplitude` is shape (8,), 0 to 1."""
+
+    def __init__(self, parameters: HapticsParameters, amplitude: Vector) -> None:
+        self.amplitude = amplitude
+        self._parameters = parameters
+
+    def advance(self, level: Vector, silence: int, cycles: int) -> None:
+        """Let the motors follow a level held for some `PERIOD`s: a' = (level - a) / rise_time, solved exactly.
+
+        Args:
+            level: last valid command, shape (8,).
+            silence: cycles since that command came.
+            cycles: how many `PERIOD`s to advance.
+        """
+        lag = math.exp(-cycles * PERIOD / self._parameters.rise_time)
+        self.amplitude *= lag
+        if silence < WATCHDOG:
+            self.amplitude += (1.0 - lag) * level
