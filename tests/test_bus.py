@@ -16,7 +16,7 @@ import can
 import numpy as np
 import pytest
 
-from atalante_dbc import Message, Network, load
+from atalante_dbc import Message, Network
 from atalante_hal.bus import Bus, BusAbsent, BusDown, BusError, BusFull, open_bus
 from atalante_hal.bus.batch import is_legal
 from atalante_hal.bus.channel_map import ChannelMapError, open_channels, parse_channel_map
@@ -578,66 +578,66 @@ def test_a_channel_that_cannot_be_opened_closes_the_others(monkeypatch: pytest.M
             bus.receive(new_frames(1))
 
 
-def four_pairs() -> tuple[JoinedBus, dict[str, Bus]]:
+def four_pairs(network: Network) -> tuple[JoinedBus, dict[str, Bus]]:
     """The network's four buses joined, and the far end of each."""
     pairs = {bus: lockstep_pair(capacity=8, names=(bus, f"{bus} peer")) for bus in BUSES}
-    return JoinedBus(load(), {bus: near for bus, (near, _) in pairs.items()}), {
+    return JoinedBus(network, {bus: near for bus, (near, _) in pairs.items()}), {
         bus: far for bus, (_, far) in pairs.items()
     }
 
 
-def frames_of(*names: str) -> Frames:
+def frames_of(network: Network, *names: str) -> Frames:
     """Empty frames of these messages."""
     frames = new_frames(len(names))
     for frame, name in zip(frames, names, strict=True):
-        message = load().message(name)
+        message = network.message(name)
         frame["can_id"], frame["len"], frame["flags"] = message.frame_id, message.length, FLAG_FDF | FLAG_BRS
     return frames
 
 
-def test_joined_sends_each_frame_where_its_message_lives() -> None:
-    joined, far = four_pairs()
-    frames = frames_of(*(m.name for m in load().messages if m.cycle_ms == 1))
+def test_joined_sends_each_frame_where_its_message_lives(network: Network) -> None:
+    joined, far = four_pairs(network)
+    frames = frames_of(network, *(m.name for m in network.messages if m.cycle_ms == 1))
     for cycle in range(3):
         frames["data"][:, 3] = cycle
         joined.send(frames)
         for bus, end in far.items():
-            expected = frames[[load().messages[i].bus == bus for i in _places(frames)]]
+            expected = frames[[network.messages[i].bus == bus for i in _places(network, frames)]]
             assert receive_all(end, len(expected)).tobytes() == expected.tobytes()
             assert end.receive(new_frames(1)) == 0
 
 
-def _places(frames: Frames) -> list[int]:
-    ids = [m.frame_id for m in load().messages]
+def _places(network: Network, frames: Frames) -> list[int]:
+    ids = [m.frame_id for m in network.messages]
     return [ids.index(frame_id) for frame_id in frames["can_id"].tolist()]
 
 
-def test_joined_receives_from_every_channel_with_its_stamps() -> None:
-    joined, far = four_pairs()
+def test_joined_receives_from_every_channel_with_its_stamps(network: Network) -> None:
+    joined, far = four_pairs(network)
     for cycle in range(4):  # every channel is first once
         for place, bus in enumerate(BUSES):
-            frames = frames_of(*[m.name for m in load().messages if m.bus == bus and m.cycle_ms == 1][:2])
+            frames = frames_of(network, *[m.name for m in network.messages if m.bus == bus and m.cycle_ms == 1][:2])
             far[bus].send(frames)
             joined._links[place].now_ns = 1000 * cycle + place  # type: ignore[attr-defined]
         block = new_frames(16)
         assert joined.receive(block) == 8
-        buses = [load().messages[i].bus for i in _places(block[:8])]
+        buses = [network.messages[i].bus for i in _places(network, block[:8])]
         assert sorted(buses) == sorted(BUSES * 2)
         assert joined.stamps[:8].tolist() == [1000 * cycle + BUSES.index(bus) for bus in buses]
 
 
-def test_joined_refuses_a_frame_that_has_no_bus_and_sends_nothing() -> None:
-    joined, far = four_pairs()
-    frames = frames_of("SYNC_LEFT_LEG", "SYNC_RIGHT_LEG")
+def test_joined_refuses_a_frame_that_has_no_bus_and_sends_nothing(network: Network) -> None:
+    joined, far = four_pairs(network)
+    frames = frames_of(network, "SYNC_LEFT_LEG", "SYNC_RIGHT_LEG")
     frames["can_id"][1] = 0x7FE
     with pytest.raises(ValueError, match=r"frame 1 \(id 0x7FE\) is no message of the network"):
         joined.send(frames)
     assert far["left_leg"].receive(new_frames(1)) == 0
 
 
-def test_joined_serves_the_other_channels_when_one_is_full_or_gone() -> None:
-    joined, far = four_pairs()
-    syncs = frames_of(*(f"SYNC_{bus.upper()}" for bus in BUSES))
+def test_joined_serves_the_other_channels_when_one_is_full_or_gone(network: Network) -> None:
+    joined, far = four_pairs(network)
+    syncs = frames_of(network, *(f"SYNC_{bus.upper()}" for bus in BUSES))
     for _ in range(8):
         joined.send(syncs)
         for bus in BUSES[1:]:
@@ -654,6 +654,6 @@ def test_joined_serves_the_other_channels_when_one_is_full_or_gone() -> None:
         receive_all(far[bus], 1)
 
 
-def test_joined_needs_a_channel_for_every_bus() -> None:
+def test_joined_needs_a_channel_for_every_bus(network: Network) -> None:
     with pytest.raises(ValueError, match="no channel given for right_leg; the buses are"):
-        JoinedBus(load(), {"left_leg": lockstep_pair()[0]})
+        JoinedBus(network, {"left_leg": lockstep_pair()[0]})
