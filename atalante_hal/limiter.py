@@ -30,6 +30,11 @@ class Limiter:
         self._low = np.empty_like(self._step)
         self._high = np.empty_like(self._step)
         self._finite = np.empty(self._step.shape, np.bool_)
+        # Change and size of a torque side by side, to be asked about together.
+        self._asked = np.empty((2, len(self._step)))
+        self._change, self._size = self._asked
+        self._allowed = np.stack([self._step, self._torque_max])
+        self._within = np.empty(self._asked.shape, np.bool_)
         #: What was sent last; the rate limit counts from here. Shape (12,) [Nm].
         self.last = np.zeros_like(self._step)
 
@@ -39,6 +44,12 @@ class Limiter:
         Args:
             torque: shape (12,) [Nm], not changed.
         """
+        np.subtract(torque, self.last, out=self._change)
+        np.copyto(self._size, torque)
+        np.abs(self._asked, out=self._asked)
+        if np.less_equal(self._asked, self._allowed, out=self._within).tobytes() == _ALL_WITHIN:
+            np.copyto(self.last, torque)
+            return _AS_ASKED
         if np.isfinite(torque, out=self._finite).tobytes() != _ALL_TRUE:
             return _NOT_FINITE
         np.subtract(self.last, self._step, out=self._low)
@@ -57,6 +68,7 @@ class Limiter:
 
 
 _ALL_TRUE = b"\1" * 12
+_ALL_WITHIN = b"\1" * 24
 _NOT_FINITE = Limited(finite=False, clamped=False)
 _AS_ASKED = Limited(finite=True, clamped=False)
 _CLAMPED = Limited(finite=True, clamped=True)
