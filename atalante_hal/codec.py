@@ -90,7 +90,7 @@ class Codec:
         self._scaled = np.empty(self.size)
         self._bits = self._scaled.view(np.uint64)
         self._sorted = np.empty(self.size, np.uint64)
-        self._ones = np.ones(self.size)
+        self._ones, self._round = np.ones(self.size), np.full(self.size, _ROUND)
         self._invalid = np.array([s.invalid_raw or 0 for s in signals], np.uint64)
         self._no_invalid = [s.invalid_raw is None for s in signals]
 
@@ -172,19 +172,24 @@ class Codec:
         Raises:
             ValueError: NaN for a signal without an invalid code.
         """
+        self.pack(values, frames.view(np.uint64))
+
+    def pack(self, values: Vector, words: npt.NDArray[np.uint64]) -> None:
+        """As `encode`, into a flat view of the frames made beforehand. Shape (rows * 9,)."""
         scaled = self._scaled
-        np.subtract(values, self._offset, out=scaled)
-        np.divide(scaled, self._factor, out=scaled)
+        if self._has_offset:
+            values = np.subtract(values, self._offset, out=scaled)
+        np.divide(values, self._factor, out=scaled)
         np.maximum(scaled, self._raw_min, out=scaled)
         np.minimum(scaled, self._raw_max, out=scaled)
         no_value = np.isnan(scaled) if math.isnan(scaled.dot(self._ones)) else None
-        np.add(scaled, _ROUND, out=scaled)
+        np.add(scaled, self._round, out=scaled)
         if no_value is not None:
             self._encode_invalid(no_value)
         np.bitwise_and(self._bits, self._mask, out=self._bits)
         self._bits.take(self._by_word, out=self._sorted, mode="clip")
         np.left_shift(self._sorted, self._place, out=self._sorted)
-        frames.view(np.uint64)[self._word_target] = np.bitwise_or.reduceat(self._sorted, self._word_start)
+        words[self._word_target] = np.bitwise_or.reduceat(self._sorted, self._word_start)
 
     def _encode_invalid(self, no_value: npt.NDArray[np.bool_]) -> None:
         for i in np.flatnonzero(no_value).tolist():

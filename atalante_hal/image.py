@@ -200,6 +200,7 @@ class TransmitImage:
         self.codec = Codec(messages)
         self.values = np.zeros(self.codec.size)
         self.frames = self.codec.template()
+        self._words = self.frames.view(np.uint64)
         self._bytes = self.frames.view(np.uint8).reshape(-1, FRAME_BYTES)
         rows = range(len(self.codec.messages))
         # The counter of a row is the low byte of a number that grows by one a frame, so that all rows advance in one addition.
@@ -221,7 +222,7 @@ class TransmitImage:
         Raises:
             ValueError: NaN for a signal without an invalid code.
         """
-        self.codec.encode(self.values, self.frames)
+        self.codec.pack(self.values, self._words)
         self._counters += 1
         self._counter_bytes[:] = self._counters
         self._crcs[:] = [crc_hqx(i, crc_hqx(p, CRC_START)) for p, i in self._protected]
@@ -229,7 +230,7 @@ class TransmitImage:
 
     def seal_row(self, row: int) -> Frames:
         """As `seal` for one row alone, the counters of the others stay. Shape (1,)."""
-        self.codec.encode(self.values, self.frames)
+        self.codec.pack(self.values, self._words)
         self._counters[row : row + 1] += 1
         self._counter_bytes[:] = self._counters
         protected, data_id = self._protected[row]
