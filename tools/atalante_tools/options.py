@@ -1,0 +1,100 @@
+"""Options the commands share: which bus, which clock, what output. `-i` and `-c` are python-can's names."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final, TypeVar
+
+import click
+
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+
+EMBEDDED: Final = "embedded"
+
+#: --json: one object a line on stdout, everything else on stderr.
+json_option = click.option("--json", "as_json", is_flag=True, help="JSON objects on stdout, one a line.")
+
+
+@dataclass(frozen=True)
+class Target:
+    """Where the robot is: an interface of python-can, or the emulator in this process."""
+
+    interface: str
+    channel: str  # one channel, or a channel map; empty when embedded
+    lockstep: bool  # cycles follow the nodes' answers instead of the wall clock
+
+    @property
+    def embedded(self) -> bool:
+        """The robot is emulated in this process."""
+        return self.interface == EMBEDDED
+
+    def __str__(self) -> str:
+        """As the user named it."""
+        return self.interface if self.embedded else f"{self.interface} {self.channel}"
+
+    @property
+    def arguments(self) -> str:
+        """The options that make another process of ours find the same bus."""
+        return f"-i {self.interface} -c {self.channel}"
+
+
+def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command], _Command]:
+    """Give a command `-i`, `-c` and `--lockstep/--wall`, and hand it their meaning as the argument `target`.
+
+    Args:
+        embedded: whether the emulator in this process is a choice, and then the default.
+        clock: whether the command has one.
+    """
+    interfaces = "socketcan, virtual, pcan, ..."
+    options = [
+        click.option(
+            "-i",
+            "--interface",
+            default=EMBEDDED if embedded else "socketcan",
+            show_default=True,
+            metavar="NAME",
+            help=f"{interfaces}{' or embedded: an emulated robot in this process' if embedded else ''}",
+        ),
+        click.option(
+            "-c",
+            "--channel",
+            default="",
+            metavar="CHANNEL",
+            help="For all four buses (vcan0), or one each: left_leg=can0,right_leg=can1,left_sense=can2,right_sense=can3.",
+        ),
+    ]
+    if clock:
+        default = "lock-step when embedded, else wall" if embedded else "wall"
+        options.append(
+            click.option(
+                "--lockstep/--wall",
+                default=None,
+                help=f"Wait for the other side in every cycle (slow machines), or run at 1 kHz.  [default: {default}]",
+            )
+        )
+
+    def decorate(command: _Command) -> _Command:
+        @functools.wraps(command)
+        def with_target(interface: str, channel: str, lockstep: bool | None = None, **arguments: Any) -> Any:
+            return command(target=_target(interface, channel, lockstep, embedded), **arguments)
+
+        wrapped: Any = with_target
+        for option in reversed(options):
+            wrapped = option(wrapped)
+        decorated: _Command = wrapped
+        return decorated
+
+    return decorate
+
+
+def _target(interface: str, channel: str, lockstep: bool | None, embedded: bool) -> Target:
+    if interface == EMBEDDED:
+        if not embedded:
+            raise click.UsageError("this needs a bus that other processes are on: -i socketcan -c vcan0")
+        if channel:
+            raise click.UsageError(f"the embedded robot has no channel; to use {channel} say -i socketcan -c {channel}")
+    elif not channel:
+        raise click.UsageError(f"{interface} needs a channel: -c vcan0, or a channel map of the four buses")
+    return Target(interface, channel, interface == EMBEDDED if lockstep is None else lockstep)
