@@ -20,7 +20,7 @@ import numpy as np
 
 from atalante_hal.bus import BusAbsent, BusDown, BusError, BusFull, Stamps
 from atalante_hal.bus.batch import Batches
-from atalante_hal.frame import FLAG_FDF, FRAME_BYTES, Frames, new_frames
+from atalante_hal.frame import FLAG_FDF, FRAME_BYTES, Frames, as_words, new_frames
 
 CLASSIC_BYTES = 16  # struct can_frame
 CAN_RAW_ERR_FILTER: Final = 2
@@ -34,6 +34,11 @@ IFF_UP: Final = 1
 ERROR_FRAMES = 0x0001 | 0x0004 | 0x0040 | 0x0100
 LINK_LOST = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
 NO_ROOM = (errno.ENOBUFS, errno.EAGAIN)
+
+#: What we take of a received header word: programs and drivers leave a DLC or worse in the reserved bytes; and older
+#: kernels tell CAN FD by the size alone.
+HEADER_FIELDS = np.uint64(0x0000_FFFF_FFFF_FFFF)
+FDF_IN_HEADER = np.uint64(FLAG_FDF << 40)
 
 IOVEC = np.dtype([("base", "u8"), ("length", "u8")])
 #: struct mmsghdr of 64-bit Linux.
@@ -96,7 +101,7 @@ class SocketCanBus:
         # Receive: frames, their headers, their control messages.
         self._rx = new_frames(capacity)
         self._rx_memory = self._rx.view(np.uint8).data
-        self._rx_flags = self._rx["flags"]
+        self._rx_words = as_words(self._rx)[:, 0]
         self._rx_control = np.zeros(capacity, CONTROL)
         self._rx_vectors, self._rx_headers = _headers(self._rx, self._rx_control)
         self._rx_address = _address(self._rx_headers)
@@ -156,8 +161,9 @@ class SocketCanBus:
         if self._rx_lengths[:count].tobytes() != self._all_fd[: 8 * count]:
             self._widen_classic(count)
         else:
-            flags = self._rx_flags[:count]
-            np.bitwise_or(flags, FLAG_FDF, out=flags)  # kernels before 6.1 leave it to the size
+            words = self._rx_words[:count]
+            np.bitwise_and(words, HEADER_FIELDS, out=words)
+            np.bitwise_or(words, FDF_IN_HEADER, out=words)
         self._read_control(count)
         size = count * FRAME_BYTES
         memory[:size] = self._rx_memory[:size]
@@ -194,6 +200,7 @@ class SocketCanBus:
     def _widen_classic(self, count: int) -> None:
         """Clear what a 16-byte `can_frame` left of the record it was written over, and mark the others as CAN FD."""
         for frame, length in zip(self._rx[:count], self._rx_lengths[:count].tolist(), strict=True):
+            frame["res"] = 0
             if length > CLASSIC_BYTES:
                 frame["flags"] |= FLAG_FDF
             else:

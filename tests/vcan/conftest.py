@@ -1,0 +1,113 @@
+"""Real SocketCAN for the tests in this folder: `make test-vcan`, or `pytest tests/vcan` where vcan0 is up.
+
+Nothing here skips: these tests are run where SocketCAN was promised, so a missing interface is a failure that says what
+to type.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Self
+
+import pytest
+
+from atalante_hal.bus import BusAbsent
+from atalante_hal.bus.socketcan import SocketCanBus, require_channel
+from atalante_hal.frame import FLAG_BRS, FLAG_FDF, new_frames
+
+#: Ends a candump log: an identifier the robot's network does not use.
+END_ID = 0x7FF
+PATIENCE = 60.0  # s; the guest of the lane is 20 times slower than a machine
+
+
+@pytest.fixture(scope="session")
+def vcan() -> str:
+    """Name of a virtual CAN FD interface that is up."""
+    channel = os.environ.get("ATALANTE_VCAN", "vcan0")
+    try:
+        require_channel(channel)
+    except BusAbsent as error:
+        pytest.fail(
+            f"these tests need SocketCAN: {error}; or type `make test-vcan`, which does all of it", pytrace=False
+        )
+    return channel
+
+
+def as_root(*command: str) -> None:
+    """Run a command that needs root; fails the test with what to type."""
+    line = command if os.geteuid() == 0 else ("sudo", "-n", *command)
+    try:
+        subprocess.run(line, check=True, capture_output=True, text=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        reason = error.stderr if isinstance(error, subprocess.CalledProcessError) else error
+        pytest.fail(f"this test needs root for `{' '.join(command)}`: {reason}", pytrace=False)
+
+
+@pytest.fixture
+def spare_vcan(vcan: str) -> Iterator[str]:
+    """Name of a second interface, up, that the test may take down, clog or reconfigure."""
+    channel = "vcanspare"
+    as_root("ip", "link", "add", channel, "type", "vcan")
+    as_root("ip", "link", "set", channel, "mtu", "72", "up")
+    yield channel
+    as_root("ip", "link", "del", channel)
+
+
+class Candump:
+    """`candump -L` of can-utils writing every frame of a channel to a log: the second witness of what is on the wire.
+
+    A context: entered, it listens; left, the log is complete. Leaving sends one frame with `END_ID`, which is not in the
+    log.
+    """
+
+    def __init__(self, channel: str, log: Path) -> None:
+        self.log = log
+        self._channel = channel
+
+    def __enter__(self) -> Self:
+        if shutil.which("candump") is None:
+            pytest.fail("candump is missing: type `apt-get install can-utils`", pytrace=False)
+        listening = self._listeners()
+        with self.log.open("wb") as output:
+            command = ["candump", "-L", "-d", "-r", str(8 << 20), self._channel]
+            self._process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
+        self._wait(lambda: self._listeners() > listening)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        try:
+            end = new_frames(1)
+            end["can_id"], end["flags"] = END_ID, FLAG_FDF | FLAG_BRS
+            bus = SocketCanBus(self._channel)
+            bus.send(end)
+            bus.close()
+            self._wait(lambda: f" {END_ID:03X}##" in self.log.read_text()[-200:])
+        finally:
+            self._process.send_signal(signal.SIGTERM)
+            self._process.wait(PATIENCE)
+        lines = self.log.read_text().splitlines(keepends=True)
+        self.log.write_text("".join(line for line in lines if f" {END_ID:03X}##" not in line))
+
+    def _listeners(self) -> int:
+        """Sockets that receive everything from the channel."""
+        table = Path("/proc/net/can/rcvlist_all").read_text()
+        return sum(line.split()[:1] == [self._channel] for line in table.splitlines())
+
+    def _wait(self, ready: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + PATIENCE
+        while not ready():
+            assert self._process.poll() is None, f"candump ended: {self.log.read_text()}"
+            assert time.monotonic() < deadline, "candump is silent"
+            time.sleep(0.01)
+
+
+@pytest.fixture
+def candump(vcan: str, tmp_path: Path) -> Candump:
+    """`with candump: ...` records `vcan` to `candump.log`."""
+    return Candump(vcan, tmp_path / "candump.log")

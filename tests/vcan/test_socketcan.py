@@ -1,0 +1,200 @@
+"""SocketCAN: the behaviour of every bus, what only the kernel does, and two programs that are not ours on the same wire."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import can
+import numpy as np
+import pytest
+
+from atalante_hal.bus import Bus, BusAbsent, BusDown, BusFull, open_bus
+from atalante_hal.bus.channel_map import open_channels, parse_channel_map
+from atalante_hal.bus.python_can import message_of
+from atalante_hal.bus.replay import ReplayBus
+from atalante_hal.bus.socketcan import SocketCanBus
+from atalante_hal.frame import FLAG_BRS, FLAG_FDF, Frames, new_frames
+from tests.test_bus import (
+    BUSES,
+    FrameReceiver,
+    FrameSender,
+    FrameWaiter,
+    other_frames,
+    random_frames,
+    receive_all,
+)
+from tests.vcan.conftest import Candump, as_root
+
+
+class TestSocketCan(FrameSender, FrameReceiver, FrameWaiter):
+    @pytest.fixture
+    def ends(self, vcan: str) -> Iterator[tuple[Bus, Bus]]:
+        one, other = open_bus("socketcan", vcan), open_bus("socketcan", vcan)
+        yield one, other
+        one.close()
+        other.close()
+
+
+@pytest.fixture
+def sender(vcan: str) -> Iterator[SocketCanBus]:
+    bus = SocketCanBus(vcan)
+    yield bus
+    bus.close()
+
+
+@pytest.fixture
+def receiver(vcan: str) -> Iterator[SocketCanBus]:
+    bus = SocketCanBus(vcan)
+    yield bus
+    bus.close()
+
+
+@pytest.fixture
+def stranger(vcan: str) -> Iterator[can.BusABC]:
+    """python-can's own SocketCAN."""
+    with can.Bus(interface="socketcan", channel=vcan, fd=True) as bus:
+        yield bus
+
+
+def messages_of(frames: Frames) -> list[can.Message]:
+    return [message_of(can_id, length, flags, bytes(data)) for can_id, length, flags, _, data in frames.tolist()]
+
+
+def test_stamps_are_the_kernels_clock(sender: SocketCanBus, receiver: SocketCanBus) -> None:
+    block = new_frames(20)
+    before = time.clock_gettime_ns(time.CLOCK_REALTIME)
+    sender.send(random_frames(20))
+    after = time.clock_gettime_ns(time.CLOCK_REALTIME)
+    assert receiver.receive(block, 5.0) == 20
+    stamps = receiver.stamps[:20]
+    assert before <= stamps[0]
+    assert stamps[-1] <= after
+    assert (np.diff(stamps) >= 0).all()
+    assert len(np.unique(stamps % 1000)) > 1, "microseconds, not nanoseconds"
+
+
+def test_what_the_receive_buffer_could_not_hold_is_counted(vcan: str, sender: SocketCanBus) -> None:
+    slow = SocketCanBus(vcan, receive_buffer=1)  # the kernel rounds up to its minimum, a few frames
+    block = new_frames(256)
+    received = sent = 0
+    for burst in (100, 150):
+        sender.send(random_frames(burst))
+        received += slow.receive(block)
+        sender.send(random_frames(1))  # carries the count of what was lost before it
+        received += slow.receive(block)
+        sent += burst + 1
+        assert received < sent
+        assert slow.dropped == sent - received
+    slow.close()
+
+
+def test_more_than_one_system_call_takes_keeps_its_order(sender: SocketCanBus, receiver: SocketCanBus) -> None:
+    sent = random_frames(600, seed=11)
+    sent["flags"][::7], sent["len"][::7] = 0, 8  # classic frames among them
+    sent["data"][::7, 8:] = 0
+    sender.send(sent)
+    assert receive_all(receiver, 600).tobytes() == sent.tobytes()
+
+
+def test_mixed_batches_of_equal_length_go_out_with_their_own_sizes(
+    sender: SocketCanBus, receiver: SocketCanBus
+) -> None:
+    classic = new_frames(3)
+    classic["can_id"], classic["len"] = 0x123, 8
+    for sent in (random_frames(3, seed=12), classic, random_frames(3, seed=13)):
+        sender.send(sent)
+        assert receive_all(receiver, 3).tobytes() == sent.tobytes()
+
+
+def test_python_can_reads_what_we_send(sender: SocketCanBus, stranger: can.BusABC) -> None:
+    sent = np.concatenate([random_frames(22, seed=14), other_frames()])
+    sender.send(sent)
+    for expected in messages_of(sent):
+        message = stranger.recv(5.0)
+        assert message is not None
+        assert message.equals(expected, timestamp_delta=None, check_channel=False, check_direction=False)
+
+
+def test_we_read_what_python_can_sends(receiver: SocketCanBus, stranger: can.BusABC) -> None:
+    sent = np.concatenate([random_frames(22, seed=15), other_frames()])
+    for message in messages_of(sent):
+        stranger.send(message)
+    assert receive_all(receiver, len(sent)).tobytes() == sent.tobytes()
+
+
+def test_candump_sees_the_same_bytes(sender: SocketCanBus, vcan: str, candump: Candump) -> None:
+    sent = random_frames(150, seed=16, lengths=(8, 12, 16, 24, 32, 48, 64))
+    with candump:
+        sender.send(sent)
+    wire = [line.split(maxsplit=1)[1] for line in candump.log.read_text().splitlines()]
+    assert wire == [
+        f"{vcan} {can_id:03X}##{FLAG_FDF | FLAG_BRS:X}{bytes(data[:length]).hex().upper()}"
+        for can_id, length, _, _, data in sent.tolist()
+    ]
+
+
+def test_the_log_of_candump_replays_as_it_was_sent(sender: SocketCanBus, candump: Candump) -> None:
+    sent = random_frames(40, seed=17)
+    with candump:
+        sender.send(sent)
+    replay = ReplayBus(candump.log)
+    assert receive_all(replay, 40).tobytes() == sent.tobytes()
+    assert replay.ended
+    replay.close()
+
+
+def test_a_link_that_goes_down_is_reported_and_comes_back(spare_vcan: str) -> None:
+    one, other = SocketCanBus(spare_vcan), SocketCanBus(spare_vcan)
+    as_root("ip", "link", "set", spare_vcan, "down")
+    with pytest.raises(BusDown, match=f"type `ip link set {spare_vcan} up`"):
+        one.receive(new_frames(4))
+    with pytest.raises(BusDown, match=f"type `ip link set {spare_vcan} up`"):
+        one.send(random_frames(2))
+    with pytest.raises(BusDown):
+        other.receive(new_frames(4), 5.0)
+    as_root("ip", "link", "set", spare_vcan, "up")
+    sent = random_frames(2)
+    one.send(sent)
+    assert receive_all(other, 2).tobytes() == sent.tobytes()
+    one.close()
+    other.close()
+
+
+def test_an_interface_that_is_gone_is_down(spare_vcan: str) -> None:
+    bus = SocketCanBus(spare_vcan)
+    as_root("ip", "link", "del", spare_vcan)
+    with pytest.raises(BusDown):
+        bus.send(random_frames(2))
+    bus.close()
+    as_root("ip", "link", "add", spare_vcan, "type", "vcan")
+
+
+def test_a_full_transmit_queue_says_how_many_went_out(spare_vcan: str) -> None:
+    as_root("tc", "qdisc", "add", "dev", spare_vcan, "root", "netem", "delay", "100s", "limit", "8")
+    bus = SocketCanBus(spare_vcan)
+    with pytest.raises(BusFull, match="took 8 of 20 frames, its transmit queue is full") as refusal:
+        bus.send(random_frames(20))
+    assert refusal.value.sent == 8
+    with pytest.raises(BusFull, match="took 0 of 1 frames"):
+        bus.send(random_frames(1))
+    bus.close()
+
+
+def test_opening_says_what_to_type(spare_vcan: str) -> None:
+    with pytest.raises(BusAbsent, match=r"no interface vcan99: .*`ip link add vcan99 type vcan && .*atalante doctor"):
+        SocketCanBus("vcan99")
+    with pytest.raises(BusAbsent, match="lo is no CAN interface"):
+        SocketCanBus("lo")
+    as_root("ip", "link", "set", spare_vcan, "down")
+    with pytest.raises(BusAbsent, match=f"{spare_vcan} is down: type `ip link set {spare_vcan} up`"):
+        SocketCanBus(spare_vcan)
+    as_root("ip", "link", "set", spare_vcan, "mtu", "16", "up")
+    with pytest.raises(BusAbsent, match=rf"carries classic CAN only \(mtu 16\): .*ip link set {spare_vcan} mtu 72 up"):
+        SocketCanBus(spare_vcan)
+
+
+def test_all_buses_of_the_robot_share_one_vcan(vcan: str) -> None:
+    buses = open_channels("socketcan", parse_channel_map(vcan, BUSES))
+    assert len({id(bus) for bus in buses.values()}) == 1
+    buses["left_leg"].close()
