@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator
 
-
 #: Controller fields carry this prefix in the record.
 CONTROLLER = "controller."
 

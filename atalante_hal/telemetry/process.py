@@ -1,0 +1,300 @@
+"""The telemetry process as the loop's process sees it: a context manager around two or three rings and a child.
+
+The child is a fresh interpreter (`python -m atalante_hal.telemetry`, see `service`), never a fork, in a process group of
+its own: the terminal's Ctrl-C goes to the loop, which then closes the rings. It may be killed, stopped or starved at any
+time: `write` never waits for it, except in lock-step with a recording of every cycle or a CAN log, and there not for
+long.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import selectors
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.telemetry.events import EVENT_BYTES, EVENT_SLOTS, Event, pack
+from atalante_hal.telemetry.frames import FRAME_RECORD, RingTap, Stamps
+from atalante_hal.telemetry.layout import Layout
+from atalante_hal.telemetry.ring import RingWriter
+
+CYCLES_PER_SECOND = 1000
+CYCLE_NS = 1_000_000_000 // CYCLES_PER_SECOND
+#: Between the last record of a run in lock-step and the first of the next [ns], so that a plot shows where one ends.
+RUN_GAP_NS = 1_000_000_000
+
+
+#: For the child to leave its Zenoh session after it has said what became of its files [s].
+_LAST_WORDS = 2.0
+
+
+class TelemetryError(RuntimeError):
+    """Telemetry cannot start as asked; the message says why and what is valid."""
+
+
+@dataclass(frozen=True)
+class TelemetryConfig:
+    """What leaves the robot, and where to."""
+
+    robot: str = "exo"  # one chunk of the Zenoh keys atalante/<robot>/...
+    publish: bool = True  # on Zenoh
+    listen: str | None = None  # Zenoh endpoint; None: first free port from tcp/127.0.0.1:7447 on
+    stream_rate: int = 100  # Hz of robot time, messages of each stream
+    loop_rate: int = 10  # Hz of robot time, loop statistics
+    recording: Path | None = None  # MCAP file
+    record_rate: int = 100  # Hz of robot time; 1000 is every cycle
+    can_log: Path | None = None  # every frame, format by suffix
+    lock_step: bool = False  # virtual time; the loop waits for a recorder that asked for everything
+    slots: int = 1024  # records a ring holds: cycles that telemetry may be late
+    patience: float = 5.0  # s, longest wait of the loop for a recorder in lock-step, once
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9_-]+", self.robot):
+            raise TelemetryError(f"the robot's name {self.robot!r} is not valid; use letters, digits, - and _")
+        for name in ("stream_rate", "loop_rate", "record_rate"):
+            rate = getattr(self, name)
+            if rate < 1 or CYCLES_PER_SECOND % rate:
+                raise TelemetryError(
+                    f"{name.replace('_', ' ')} {rate} Hz is not valid; it must divide {CYCLES_PER_SECOND}, "
+                    "as 1, 10, 50, 100, 200, 250, 500 and 1000 do"
+                )
+
+    @property
+    def every_cycle(self) -> bool:
+        """Whether the recording wants every cycle."""
+        return self.recording is not None and self.record_rate == CYCLES_PER_SECOND
+
+    def to_json(self) -> dict[str, Any]:
+        """As what `json.dumps` takes."""
+        return {name: str(value) if isinstance(value, Path) else value for name, value in asdict(self).items()}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> TelemetryConfig:
+        """The inverse of `to_json`."""
+        paths = {name: Path(values[name]) for name in ("recording", "can_log") if values[name] is not None}
+        return cls(**{**values, **paths})
+
+
+@dataclass(frozen=True)
+class TelemetrySummary:
+    """What became of a session; `complete` is False when the child died and could not say."""
+
+    complete: bool = False
+    published: int = 0  # messages
+    recorded: int = 0  # messages
+    frames_logged: int = 0
+    lost: int = 0  # cycles that telemetry did not see
+    frames_lost: int = 0  # records of the frame ring, one a cycle
+    notices: tuple[str, ...] = field(default=())  # what went wrong, one sentence each
+
+
+class TelemetryProcess:
+    """The telemetry of one session: rings to write, and the child that empties them.
+
+    Use it as a context manager around every run of the session, or call `start` and `close`.
+
+    Args:
+        config: what leaves, and where to.
+        layout: of the records that `write` gets.
+        bus_of: frame id -> network bus, for the CAN log.
+        buses: network buses in the order of the DBC, for the CAN log.
+        diagnostics: names of the bits of the field "diagnostics", lowest first.
+        about: metadata of the recording (hashes, versions, seed).
+    """
+
+    def __init__(
+        self,
+        config: TelemetryConfig,
+        layout: Layout,
+        *,
+        bus_of: Mapping[int, str] | None = None,
+        buses: Sequence[str] = (),
+        diagnostics: Sequence[str] = (),
+        about: Mapping[str, object] | None = None,
+    ) -> None:
+        self.config, self.layout = config, layout
+        self.endpoint: str | None = None  # where subscribers connect, once started
+        self.notices: tuple[str, ...] = ()  # of the start, one sentence each
+        self._start_ns = 0 if config.lock_step else time.time_ns()
+        self._runs = 0
+        self._closed = False
+        self._tap: RingTap | None = None
+        self._child: subprocess.Popen[bytes] | None = None
+        meta = {
+            "layout": layout.to_json(),
+            "diagnostics": list(diagnostics),
+            "about": {name: str(value) for name, value in (about or {}).items()},
+            "start_ns": self._start_ns,
+        }
+        lossless = config.lock_step
+        self.records = RingWriter(
+            layout.size * 8,
+            config.slots,
+            lossless=lossless and config.every_cycle,
+            patience=config.patience,
+            meta=meta,
+        )
+        self.events = RingWriter(EVENT_BYTES, EVENT_SLOTS)
+        self.frames: RingWriter | None = None
+        if config.can_log is not None:
+            frame_meta = {"buses": list(buses), "bus_of": {str(key): bus for key, bus in (bus_of or {}).items()}}
+            self.frames = RingWriter(
+                FRAME_RECORD.itemsize, config.slots, lossless=lossless, patience=config.patience, meta=frame_meta
+            )
+
+    def start(self, timeout: float = 60.0) -> None:
+        """Start the child and wait until it has opened its files and its session.
+
+        Raises:
+            TelemetryError: a file or an endpoint that was asked for cannot be had, or the child was not ready in time [s].
+        """
+        rings = {"records": self.records, "events": self.events, "frames": self.frames}
+        fds = {name: ring.fd for name, ring in rings.items() if ring is not None}
+        order = json.dumps({"config": self.config.to_json(), "rings": fds})
+        self._child = subprocess.Popen(
+            [sys.executable, "-P", "-m", "atalante_hal.telemetry", order],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            pass_fds=tuple(fds.values()),
+            process_group=0,
+        )
+        try:
+            told = self._listen(timeout)
+            if told is None:
+                raise TelemetryError(f"the telemetry process was not ready within {timeout:.0f} s")
+            if "error" in told:
+                raise TelemetryError(told["error"])
+        except TelemetryError:
+            self.close(0.0)
+            raise
+        self.endpoint, self.notices = told["endpoint"], tuple(told["notices"])
+
+    def tap(self, now: Callable[[], int] = time.time_ns, stamps: Callable[[], Stamps] | None = None) -> RingTap:
+        """What the HAL hands its frames to, for the CAN log; one for the session.
+
+        Args:
+            now: time [ns] of frames that are sent; in lock-step virtual time since the start of the run.
+            stamps: times [ns] of the frames last received, such as `lambda: bus.stamps`; without it, `now()`.
+
+        Raises:
+            TelemetryError: the configuration asks for no CAN log.
+        """
+        if self.frames is None:
+            raise TelemetryError("there is no CAN log to tap frames for; set can_log in the telemetry configuration")
+        if self._tap is not None:
+            self._tap.flush()
+        self._tap = RingTap(self.frames, now, stamps)
+        self._tap.begin_run(self._start_ns if self.config.lock_step else 0)
+        return self._tap
+
+    def begin_run(self, name: str, about: Mapping[str, object] | None = None) -> None:
+        """A run begins (e.g. a guide shape), its cycle time from 0: what is written from here on belongs to it.
+
+        Log time goes on: from now on the wall clock, from one second after the last record in lock-step.
+
+        Args:
+            about: metadata of the run (shape, xi, seed).
+        """
+        if not self.config.lock_step:
+            self._start_ns = time.time_ns()
+        elif last := self.records.last():
+            self._start_ns += round(float(np.frombuffer(last)[self.layout["time"]][0]) * 1e9) + RUN_GAP_NS
+        if self._tap is not None:
+            self._tap.begin_run(self._start_ns if self.config.lock_step else 0)
+        facts = {key: str(value) for key, value in (about or {}).items()}
+        self.records.note({"run": self._runs, "name": name, "start_ns": self._start_ns, "about": facts})
+        self._runs += 1
+
+    def write(self, record: npt.NDArray[np.float64]) -> None:
+        """One cycle: copy its record, and the frames tapped since the last, into the rings. Shape (layout.size,)."""
+        if self._tap is not None:
+            self._tap.flush()
+        self.records.write(record)
+
+    def event(
+        self, cycle: int, code: str, text: str, severity: str = "info", node: str = "HAL", value: float = 0.0
+    ) -> None:
+        """Something happened: published and recorded at once, see `events.Event`."""
+        self.events.write(pack(Event(cycle, code, text, severity, node, value), self.records.written))
+
+    @property
+    def alive(self) -> bool:
+        """Whether the child runs (or is stopped). One system call: not for every cycle."""
+        return self._child is not None and self._child.poll() is None
+
+    @property
+    def lost(self) -> int:
+        """Cycles that telemetry has not seen so far."""
+        return self.records.lost
+
+    def close(self, timeout: float = 10.0) -> TelemetrySummary:
+        """Let the child finish its files, then end it, by force after `timeout` [s]; does not raise for what it died of.
+
+        The rings go with it: nothing can be written afterwards. A second call does nothing.
+        """
+        if self._closed:
+            return TelemetrySummary()
+        self._closed = True
+        rings = [ring for ring in (self.frames, self.events, self.records) if ring is not None]
+        summary = TelemetrySummary(lost=self.records.lost)
+        if self._tap is not None:
+            self._tap.flush()
+        for ring in rings:
+            ring.finish()
+        if self._child is not None:
+            told = self._listen(timeout)
+            if told is not None and "error" not in told:
+                summary = TelemetrySummary(complete=True, **{**told, "notices": tuple(told["notices"])})
+            self._end(self._child, _LAST_WORDS if told is not None else 0.0)
+            self._child = None
+        for ring in rings:
+            ring.close()
+        return summary
+
+    @staticmethod
+    def _end(child: subprocess.Popen[bytes], patience: float) -> None:
+        try:
+            child.wait(patience)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+        assert child.stdout is not None
+        child.stdout.close()
+
+    def _listen(self, timeout: float) -> dict[str, Any] | None:
+        """The next line of the child as JSON; None when it says nothing within `timeout` [s] or is gone."""
+        assert self._child is not None
+        assert self._child.stdout is not None
+        pipe, line = self._child.stdout.fileno(), b""
+        give_up = time.monotonic() + timeout
+        with selectors.DefaultSelector() as selector:
+            selector.register(pipe, selectors.EVENT_READ)
+            while not line.endswith(b"\n"):
+                if not selector.select(max(0.0, give_up - time.monotonic())):
+                    return None
+                read = os.read(pipe, 1 << 16)
+                if not read:
+                    return None
+                line += read
+        told: dict[str, Any] = json.loads(line)
+        return told
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,44 @@
+"""The protobuf messages of `messages.proto`, loaded from the committed descriptor set.
+
+Generated `_pb2` modules break across protobuf releases; a descriptor set read through `message_factory` does not.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+PACKAGE = "atalante.v1"
+DESCRIPTORS = Path(__file__).with_name("messages.binpb")
+
+
+@cache
+def _pool() -> Any:
+    pool = descriptor_pool.DescriptorPool()
+    for file in descriptor_pb2.FileDescriptorSet.FromString(descriptor_set()).file:
+        pool.Add(file)
+    return pool
+
+
+@cache
+def descriptor_set() -> bytes:
+    """The serialised FileDescriptorSet, with its imports: the schema that MCAP channels carry."""
+    return DESCRIPTORS.read_bytes()
+
+
+@cache
+def message_class(name: str) -> Any:
+    """Class of a message of this package, e.g. `message_class("JointStates")`.
+
+    Raises:
+        KeyError: there is no message of that name.
+    """
+    return message_factory.GetMessageClass(_pool().FindMessageTypeByName(f"{PACKAGE}.{name}"))
+
+
+def encoding(name: str) -> str:
+    """Zenoh encoding tag of a message, e.g. application/protobuf;atalante.v1.JointStates."""
+    return f"application/protobuf;{PACKAGE}.{name}"
