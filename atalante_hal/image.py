@@ -19,6 +19,10 @@ from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES, CRC_START, Check, check_co
 from atalante_hal.frame import FRAME_BYTES, WORDS, Frames, as_words, new_frames
 
 _HEADER_BYTES = 8
+#: Counter byte -> the next one.
+_NEXT = bytes((counter + 1) & 0xFF for counter in range(256))
+#: Largest `Check` whose data is new, as a plain integer.
+_FRESH = int(Check.SOME_LOST)
 #: Age of a message that never came.
 NEVER = 1 << 30
 
@@ -48,7 +52,7 @@ class ReceiveImage:
         self._lengths = [m.length for m in self.codec.messages]
         self._counter: list[int | None] = [None] * count
         self._expected_headers = as_words(self.frames)[:, 0].tobytes()
-        self._expected_counters: npt.NDArray[np.uint8] | None = None
+        self._expected_counters: bytes | None = None
         #: The last cycle was perfect: every row was committed exactly as expected.
         self.all_fresh = False
         self._scratch: _Scratch | None = None
@@ -96,11 +100,8 @@ class ReceiveImage:
 
         Replaces `new_cycle` and `accept_each` for a perfect cycle; otherwise returns False and changes nothing.
         """
-        expected = self._expected_counters
-        if expected is None or scratch.headers.tobytes() != self._expected_headers:
-            return False
-        counters = scratch.counters.tobytes()
-        if counters != expected.tobytes():
+        expected = self._expected_counters or self._next_counters()
+        if scratch.headers.tobytes() != self._expected_headers or scratch.counters.tobytes() != expected:
             return False
         if [crc_hqx(i, crc_hqx(p, CRC_START)) for p, i in scratch.protected] != scratch.crcs.tolist():
             return False
@@ -108,7 +109,7 @@ class ReceiveImage:
             return False
         self.codec.scale(self.values)
         self._bytes[:] = scratch.bytes
-        expected += 1
+        self._expected_counters = expected.translate(_NEXT)
         if not self.all_fresh:
             self.age.fill(0)
             self.check.fill(Check.OK)
@@ -123,7 +124,7 @@ class ReceiveImage:
         """
         self._synchronise_counters()
         foreign: list[int] = []
-        before, age_before = self._words.copy(), self.age.copy()
+        before, age_before, checks = self._words.copy(), self.age.copy(), self.check.tolist()
         words = as_words(frames)
         committed = False
         for place, header in enumerate(words[:count, 0].tolist()):
@@ -132,17 +133,18 @@ class ReceiveImage:
                 row = self.frame_ids.get(header & 0xFFFFFFFF)
                 if row is None:
                     foreign.append(place)
-                elif not Check(self.check[row]).fresh:
-                    self.check[row] = Check.LENGTH
+                elif checks[row] > _FRESH:
+                    checks[row] = Check.LENGTH
                 continue
             payload = words[place].tobytes()[_HEADER_BYTES : _HEADER_BYTES + self._lengths[row]]
             result = self._judge(row, payload)
-            if result.fresh:
+            if result <= _FRESH:
                 self._words[row * WORDS : (row + 1) * WORDS] = words[place]
                 self.age[row] = 0
                 committed = True
-            if result.fresh or not Check(self.check[row]).fresh:
-                self.check[row] = result
+            if result <= _FRESH or checks[row] > _FRESH:
+                checks[row] = result
+        self.check[:] = checks
         if committed and not self.codec.extract(self._words):
             for row in self.codec.rows_outside():
                 self.check[row], self.age[row] = Check.RANGE, age_before[row]
@@ -150,7 +152,6 @@ class ReceiveImage:
             self.codec.extract(self._words)
         if committed:
             self.codec.scale(self.values)
-        self._expect_next()
         return foreign
 
     def _judge(self, row: int, payload: bytes) -> Check:
@@ -165,13 +166,12 @@ class ReceiveImage:
     def _synchronise_counters(self) -> None:
         """Take over what the fast path counted."""
         if self._expected_counters is not None:
-            self._counter = [(c - 1) & 0xFF for c in self._expected_counters.tolist()]
+            self._counter = [(c - 1) & 0xFF for c in self._expected_counters]
             self._expected_counters = None
 
-    def _expect_next(self) -> None:
-        counters = [c for c in self._counter if c is not None]
-        if len(counters) == len(self._counter):
-            self._expected_counters = np.array([(c + 1) & 0xFF for c in counters], np.uint8)
+    def _next_counters(self) -> bytes:
+        """What the fast path is to expect after the slow one; empty while a message was never received."""
+        return bytes((c + 1) & 0xFF for c in self._counter if c is not None) if None not in self._counter else b""
 
 
 class _Scratch:
