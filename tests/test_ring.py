@@ -1,0 +1,391 @@
+"""The ring: what is written is read, what is overwritten is counted, nobody waits for the dead."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from atalante_hal.telemetry.ring import NOTES_BYTES, RingError, RingReader, RingWriter
+
+SIZE = 24
+
+
+def record(number: int, size: int = SIZE) -> bytes:
+    """Bytes that show a mixture of two records: the number, again and again."""
+    return np.full(size // 8, number, "<i8").tobytes()
+
+
+@contextmanager
+def ends(
+    slots: int = 8, *, size: int = SIZE, lossless: bool = False, patience: float = 5.0
+) -> Iterator[tuple[RingWriter, RingReader]]:
+    with (
+        RingWriter(size, slots, lossless=lossless, patience=patience) as writer,
+        RingReader(os.dup(writer.fd)) as reader,
+    ):
+        yield writer, reader
+
+
+def numbers(read: np.ndarray) -> list[int]:
+    """The numbers of intact records."""
+    values = np.ascontiguousarray(read).view("<i8")
+    assert (values == values[:, :1]).all()
+    return [int(number) for number in values[:, 0]]
+
+
+class TestOrder:
+    def test_everything_written_is_read_once_in_order(self) -> None:
+        with ends() as (writer, reader):
+            assert len(reader.read()) == 0
+            got = []
+            for number in range(100):
+                writer.write(record(number))
+                if number % 7 == 6:
+                    got += numbers(reader.read())
+            got += numbers(reader.read())
+        assert got == list(range(100))
+
+    @pytest.mark.parametrize("size", [1, 7, 8, 20, 4096])
+    def test_any_record_size_comes_back_byte_for_byte(self, size: int) -> None:
+        rng = np.random.default_rng(size)
+        sent = [rng.integers(0, 256, size, np.uint8) for _ in range(5)]
+        with ends(size=size) as (writer, reader):
+            for payload in sent:
+                writer.write(payload)
+            np.testing.assert_array_equal(reader.read(), sent)
+
+    def test_takes_a_vector_of_floats_as_it_is(self) -> None:
+        with ends() as (writer, reader):
+            writer.write(np.array([1.5, -2.0, np.inf]))
+            assert reader.read().view(np.float64).tolist() == [[1.5, -2.0, np.inf]]
+
+    def test_refuses_a_record_of_another_size(self) -> None:
+        with ends() as (writer, reader):
+            with pytest.raises(IndexError):
+                writer.write(record(1, SIZE + 8))
+            assert len(reader.read()) == 0
+
+    def test_last_is_the_record_written_last(self) -> None:
+        with ends(2) as (writer, _):
+            assert writer.last() == b""
+            for number in range(5):
+                writer.write(record(number))
+                assert writer.last() == record(number)
+
+    @pytest.mark.parametrize(("size", "slots"), [(0, 8), (8, 1)])
+    def test_refuses_sizes_that_cannot_be(self, size: int, slots: int) -> None:
+        with pytest.raises(RingError, match="valid are"):
+            RingWriter(size, slots)
+
+
+class TestOverwriting:
+    def test_the_oldest_are_lost_and_counted(self) -> None:
+        with ends(8) as (writer, reader):
+            for number in range(20):
+                writer.write(record(number))
+            assert numbers(reader.read()) == list(range(12, 20))
+            assert writer.lost == reader.lost == 12
+            writer.write(record(20))
+            assert numbers(reader.read()) == [20]
+            assert writer.lost == 12
+
+    def test_read_plus_lost_is_written_whatever_the_pattern(self) -> None:
+        rng = np.random.default_rng(5)
+        with ends(8) as (writer, reader):
+            written, got = 0, []
+            for burst in rng.integers(0, 30, 200):
+                for _ in range(burst):
+                    writer.write(record(written))
+                    written += 1
+                got += numbers(reader.read())
+                assert len(got) + reader.lost == written == writer.written
+        assert got == sorted(set(got))
+
+    def test_a_record_overwritten_while_it_is_copied_is_lost_not_mixed(self) -> None:
+        with ends(4) as (writer, reader):
+            for number in range(4):
+                writer.write(record(number))
+            reader._records = _Overtaken(reader._records, lambda: [writer.write(record(n)) for n in (4, 5)])
+            assert numbers(reader.read()) == [2, 3]
+            assert reader.lost == 2
+            reader._records = reader._records.array
+            assert numbers(reader.read()) == [4, 5]
+            assert reader.lost == 2
+
+    def test_a_record_being_written_counts_as_overwritten(self) -> None:
+        with ends(4) as (writer, reader):
+            for number in range(4):
+                writer.write(record(number))
+            reader._records = _Overtaken(reader._records, lambda: _write_half(writer))
+            assert numbers(reader.read()) == [1, 2, 3]
+            assert reader.lost == 1
+            reader._records = reader._records.array
+
+    def test_no_mixture_is_ever_read_with_both_ends_running(self) -> None:
+        with ends(4, size=8192) as (writer, reader):
+            done = threading.Event()
+
+            def write() -> None:
+                payloads = [np.full(1024, number, "<i8") for number in range(50)]
+                for turn in range(20_000):
+                    payloads[turn % 50].fill(turn)
+                    writer.write(payloads[turn % 50])
+                done.set()
+
+            interval = sys.getswitchinterval()
+            sys.setswitchinterval(1e-6)
+            try:
+                thread = threading.Thread(target=write)
+                thread.start()
+                got = 0
+                while not done.is_set():
+                    got += len(numbers(reader.read()))
+                thread.join()
+            finally:
+                sys.setswitchinterval(interval)
+            got += len(numbers(reader.read()))
+            assert got + reader.lost == 20_000
+
+
+class _Overtaken:
+    """The records of a ring, with a writer that gets in between the copy and the check."""
+
+    def __init__(self, array: np.ndarray, between: object) -> None:
+        self.array, self._between = array, between
+
+    def __len__(self) -> int:
+        return len(self.array)
+
+    def __getitem__(self, place: slice) -> np.ndarray:
+        found = self.array[place].copy()
+        between, self._between = self._between, lambda: None
+        between()
+        return found
+
+
+def _write_half(writer: RingWriter) -> None:
+    """The writer stopped in the middle of a record: announced, not finished."""
+    writer._header[8] = writer.written + 1
+
+
+class TestLossless:
+    def test_the_writer_waits_for_the_reader(self) -> None:
+        with ends(4, lossless=True, patience=60.0) as (writer, reader):
+            got: list[int] = []
+            full = threading.Event()
+
+            def read() -> None:
+                full.wait()
+                while len(got) < 500:
+                    got.extend(numbers(reader.read()))
+
+            thread = threading.Thread(target=read)
+            thread.start()
+            for number in range(500):
+                if number == 4:
+                    full.set()
+                writer.write(record(number))
+            thread.join()
+            assert got == list(range(500))
+            assert writer.lossless
+            assert writer.lost == 0
+
+    def test_a_reader_that_does_not_read_is_given_up_once(self) -> None:
+        with ends(4, lossless=True, patience=0.05) as (writer, reader):
+            for number in range(100):
+                writer.write(record(number))
+            assert not writer.lossless
+            assert numbers(reader.read()) == [96, 97, 98, 99]
+            assert reader.lost == 96
+
+    def test_nobody_waits_without_a_reader(self) -> None:
+        with RingWriter(SIZE, 4, lossless=True, patience=3600.0) as writer:
+            for number in range(100):
+                writer.write(record(number))
+            assert not writer.lossless
+
+    def test_nobody_waits_for_a_closed_reader(self) -> None:
+        with RingWriter(SIZE, 4, lossless=True, patience=3600.0) as writer:
+            RingReader(os.dup(writer.fd)).close()
+            for number in range(100):
+                writer.write(record(number))
+            assert not writer.lossless
+
+
+class TestNotes:
+    def test_a_note_comes_with_the_number_of_the_record_that_follows(self) -> None:
+        with ends() as (writer, reader):
+            writer.note({"run": 0})
+            writer.write(record(0))
+            writer.write(record(1))
+            writer.note({"run": 1})
+            reader.read()
+            assert reader.notes() == [{"run": 0, "from": 0}, {"run": 1, "from": 2}]
+            assert reader.notes() == []
+            writer.note({"run": 2})
+            assert reader.notes() == [{"run": 2, "from": 2}]
+
+    def test_the_room_for_notes_is_bounded_and_full_is_said(self) -> None:
+        with ends() as (writer, reader):
+            for _ in range(60):
+                writer.note({"text": "x" * 1000})
+            with pytest.raises(RingError, match=str(NOTES_BYTES)):
+                writer.note({"text": "x" * 8000})
+            writer.write(record(7))
+            assert len(reader.notes()) == 60
+            assert numbers(reader.read()) == [7]
+
+    def test_meta_is_read_as_written(self) -> None:
+        meta = {"layout": [["position", 12]], "name": "é"}
+        with RingWriter(SIZE, meta=meta) as writer, RingReader(os.dup(writer.fd)) as reader:
+            assert reader.meta == meta
+            assert (reader.record_size, reader.slots) == (SIZE, 1024)
+
+
+class TestEnds:
+    def test_finish_is_seen(self) -> None:
+        with ends() as (writer, reader):
+            assert not reader.closed
+            writer.finish()
+            assert reader.closed
+
+    def test_the_reader_outlives_the_writer(self) -> None:
+        writer = RingWriter(SIZE, 4)
+        writer.write(record(3))
+        reader = RingReader(os.dup(writer.fd))
+        writer.close()
+        writer.close()
+        with reader:
+            assert reader.closed
+            assert numbers(reader.read()) == [3]
+
+    def test_a_file_that_is_no_ring_is_refused(self, tmp_path: Path) -> None:
+        for size in (10, 4096):
+            path = tmp_path / f"{size}"
+            path.write_bytes(b"\1" * size)
+            with pytest.raises(RingError, match="no telemetry ring"):
+                RingReader(os.open(path, os.O_RDWR))
+
+    def test_it_has_no_name_that_could_be_left_behind(self) -> None:
+        with RingWriter(SIZE, 4) as writer:
+            link = os.readlink(f"/proc/self/fd/{writer.fd}")
+        assert link.endswith("(deleted)")
+
+
+READER = """
+import os, sys
+from atalante_hal.telemetry.ring import RingReader
+reader = RingReader(int(sys.argv[1]))
+print("attached", flush=True)
+got = 0
+while sys.stdin.readline():
+    got += len(reader.read())
+    print(got, reader.lost, reader.writer_alive, flush=True)
+"""
+
+
+@contextmanager
+def reader_process(writer: RingWriter) -> Iterator[subprocess.Popen[str]]:
+    with subprocess.Popen(
+        [sys.executable, "-c", READER, str(writer.fd)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        pass_fds=(writer.fd,),
+    ) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "attached\n"
+        try:
+            yield child
+        finally:
+            child.kill()
+
+
+def ask(child: subprocess.Popen[str]) -> list[str]:
+    assert child.stdin is not None
+    assert child.stdout is not None
+    child.stdin.write("\n")
+    child.stdin.flush()
+    return child.stdout.readline().split()
+
+
+class TestAcrossProcesses:
+    def test_records_arrive(self) -> None:
+        with RingWriter(SIZE, 8) as writer, reader_process(writer) as child:
+            for number in range(5):
+                writer.write(record(number))
+            assert ask(child) == ["5", "0", "True"]
+            for number in range(20):
+                writer.write(record(number))
+            assert ask(child) == ["13", "12", "True"]
+            assert writer.lost == 12
+
+    def test_a_second_reader_is_refused(self) -> None:
+        with RingWriter(SIZE, 8) as writer, reader_process(writer), pytest.raises(RingError, match="one reader"):
+            RingReader(os.dup(writer.fd))
+
+    def test_a_killed_reader_is_noticed_before_anybody_has_waited_for_it(self) -> None:
+        with RingWriter(SIZE, 4, lossless=True, patience=3600.0) as writer, reader_process(writer) as child:
+            assert writer.reader_alive
+            child.send_signal(signal.SIGKILL)
+            _wait_for_the_end(child)  # a zombie still: its pid is there, its lock is not
+            assert not writer.reader_alive
+            for number in range(100):
+                writer.write(record(number))
+            assert not writer.lossless
+
+    def test_a_stopped_reader_is_alive_and_waited_for_no_longer_than_patience(self) -> None:
+        with RingWriter(SIZE, 4, lossless=True, patience=0.05) as writer, reader_process(writer) as child:
+            child.send_signal(signal.SIGSTOP)
+            for number in range(100):
+                writer.write(record(number))
+            assert writer.reader_alive
+            assert not writer.lossless
+            child.send_signal(signal.SIGCONT)
+            assert ask(child) == ["4", "96", "True"]
+
+    def test_a_killed_writer_is_noticed_and_its_records_are_still_there(self) -> None:
+        program = (
+            "import os, signal, sys\n"
+            "from atalante_hal.telemetry.ring import RingWriter\n"
+            "writer = RingWriter(24, 8)\n"
+            "[writer.write(bytes(24)) for _ in range(3)]\n"
+            "print(writer.fd, flush=True)\n"
+            "sys.stdin.readline()\n"
+        )
+        with subprocess.Popen(
+            [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as child:
+            assert child.stdout is not None
+            number = int(child.stdout.readline())
+            with RingReader(os.open(f"/proc/{child.pid}/fd/{number}", os.O_RDWR)) as reader:
+                assert reader.writer_alive
+                child.send_signal(signal.SIGKILL)
+                _wait_for_the_end(child)
+                assert not reader.writer_alive
+                assert not reader.closed
+                assert len(reader.read()) == 3
+
+
+def _wait_for_the_end(child: subprocess.Popen[str]) -> None:
+    """Until the process has ended, without taking its exit status: it stays a zombie."""
+    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
+
+
+def test_the_loop_side_imports_no_network_recording_or_can_library() -> None:
+    program = (
+        "import sys\n"
+        "import atalante_hal.telemetry.process, atalante_hal.telemetry.ring, atalante_hal.telemetry.layout\n"
+        "print(*({'zenoh', 'mcap', 'google.protobuf', 'can', 'socket'} & set(sys.modules)))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
