@@ -36,11 +36,25 @@ _POSITION, _VELOCITY = itemgetter(0), itemgetter(1)
 class Body(Protocol):
     """What the nodes need of the mechanics. Arrays keep their identity; they change in `reset` and `step` alone."""
 
-    position: Vector  # (12,) rad, order of JOINTS
-    velocity: Vector  # (12,) rad/s
-    imu: Sequence[LinkState]  # one an IMU of IMUS; the axes are the IMU's
-    contact: Sequence[tuple[int, int, Vector3]]  # foot of FEET, cell of CELLS, world force on it [N] in the last step
-    foot_rotation: Sequence[tuple[float, ...]]  # quaternion xyzw of each of FEET; renewed while it is in contact
+    @property
+    def position(self) -> Vector:
+        """Shape (12,) [rad], order of JOINTS."""
+
+    @property
+    def velocity(self) -> Vector:
+        """Shape (12,) [rad/s]."""
+
+    @property
+    def imu(self) -> Sequence[LinkState]:
+        """One an IMU of IMUS; the axes are the IMU's."""
+
+    @property
+    def contact(self) -> Sequence[tuple[int, int, Vector3]]:
+        """Foot of FEET, cell of CELLS, world force on it [N], of the last step."""
+
+    @property
+    def foot_rotation(self) -> Sequence[tuple[float, ...]]:
+        """Quaternion xyzw of each of FEET; renewed while it is in contact."""
 
     def reset(self, position: Sequence[float]) -> None:
         """Put the joints at rest at `position`. Shape (12,) [rad]."""
