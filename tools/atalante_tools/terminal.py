@@ -43,11 +43,14 @@ class Progress:
     `due()` is cheap enough to be asked every cycle.
     """
 
-    def __init__(self, stream: TextIO | None = None, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, *, period: float | None = None, stream: TextIO | None = None, now: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Begin now; `period` [s] replaces both usual ones."""
         self._stream = stream or sys.stderr
         self._live = self._stream.isatty()
         self._now = now
-        self._period = LIVE if self._live else LOGGED
+        self._period = period or (LIVE if self._live else LOGGED)
         self._next = now() + self._period
         self._width = 0
 

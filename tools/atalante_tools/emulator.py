@@ -1,0 +1,131 @@
+"""`atalante emulator`: be the robot on a bus, until Ctrl-C."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from atalante_tools.options import Target, target_options
+from atalante_tools.signals import StopRequest, stop_requested
+from atalante_tools.terminal import Progress, say
+
+if TYPE_CHECKING:
+    from atalante_emulator.emulator import Emulator
+    from atalante_hal.bus import Bus, Stamps
+    from atalante_hal.frame import Frames
+
+#: Seconds between two status lines.
+STATUS_PERIOD: Final = 1.0
+#: Longest wait for a SYNC in lock-step before looking whether to stop [s].
+LOOK_UP: Final = 0.1
+
+
+@click.command()
+@target_options(embedded=False)
+@click.option("--seed", type=int, default=0, show_default=True, help="Of the sensors' noise.")
+@click.option(
+    "--operator/--no-operator",
+    default=True,
+    show_default=True,
+    help="Hold the pendant too and press START when the HAL is ready; otherwise that is `atalante pendant`.",
+)
+@click.option("--xi", type=click.FloatRange(0.0, 1.0), help="Assistance factor the operator sets, 0 to 1.")
+def command(target: Target, seed: int, operator: bool, xi: float | None) -> None:
+    """Be the robot on a bus: drives, IMUs, feet, motors and, unless told otherwise, the operator's pendant.
+
+    With --wall a millisecond is a millisecond, HAL or not; with --lockstep time goes on with each SYNC alone.
+
+    \b
+    Example: atalante emulator -i socketcan -c vcan0
+    """
+    if xi is not None and not operator:
+        raise click.UsageError("--xi is what the operator sets: leave --no-operator out, or use `atalante pendant xi`")
+    import atalante_dbc
+    from atalante_hal.robot import load_robot
+    from atalante_tools.rig import join, open_body, open_buses
+
+    network, robot = atalante_dbc.load(), load_robot()
+    with stop_requested() as stop, open_body(robot) as body:
+        from atalante_emulator.emulator import Emulator
+        from atalante_emulator.pendant import Operator
+
+        bus = Tally(join(network, open_buses(network, target)))
+        try:
+            pendant = Operator(xi) if operator else None
+            emulator = Emulator(network, robot, body, bus, seed=seed, operator=pendant)
+            say(f"the robot is on {target}; now, in another terminal: atalante hang {target.arguments}")
+            if not operator:
+                say(f"its operator is you: atalante pendant start {target.arguments}")
+            answer(emulator, target, over(stop, emulator, bus))
+        finally:
+            bus.close()
+    raise SystemExit(stop.exit_code)
+
+
+def answer(emulator: Emulator, target: Target, is_over: Callable[[], bool]) -> None:
+    """Be the robot until `is_over()`."""
+    if target.lockstep:
+        while not is_over():
+            emulator.poll(LOOK_UP)
+    else:
+        emulator.run(is_over)
+
+
+def over(stop: StopRequest, emulator: Emulator, bus: Tally) -> Callable[[], bool]:
+    """Whether to stop; prints the status line on the way."""
+    progress = Progress(period=STATUS_PERIOD)
+
+    def is_over() -> bool:
+        if stop.wanted:
+            progress.clear()
+        elif progress.due():
+            progress.show(status_line(emulator, bus))
+        return stop.wanted
+
+    return is_over
+
+
+def status_line(emulator: Emulator, bus: Tally) -> str:
+    """Cycles, frames and drive states."""
+    states = Counter(state.name for state in emulator.drives.state)
+    drives = ", ".join(f"{count} {name}" for name, count in states.items())
+    lost = f", {emulator.frames_lost} lost" if emulator.frames_lost else ""
+    return f"{emulator.cycle} cycles, {bus.received} frames in, {bus.sent} out{lost}; drives: {drives}"
+
+
+class Tally:
+    """A bus that counts what goes through it."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self.name = bus.name
+        self.sent = 0
+        self.received = 0
+
+    @property
+    def stamps(self) -> Stamps:
+        """As `Bus.stamps`."""
+        return self._bus.stamps
+
+    @property
+    def dropped(self) -> int:
+        """As `Bus.dropped`."""
+        return self._bus.dropped
+
+    def send(self, frames: Frames) -> None:
+        """As `Bus.send`."""
+        self._bus.send(frames)
+        self.sent += len(frames)
+
+    def receive(self, frames: Frames, timeout: float = 0.0) -> int:
+        """As `Bus.receive`."""
+        count = self._bus.receive(frames, timeout)
+        self.received += count
+        return count
+
+    def close(self) -> None:
+        """As `Bus.close`."""
+        self._bus.close()
