@@ -10,7 +10,7 @@ another process (`run`). One seed gives one sequence of bytes.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -66,7 +66,7 @@ class Emulator:
         network: Network,
         robot: Robot,
         body: Body,
-        buses: Bus | Mapping[str, Bus],
+        bus: Bus,
         *,
         seed: int = 0,
         operator: Operator | None = None,
@@ -76,19 +76,17 @@ class Emulator:
 
         Args:
             body: the mechanics; the emulator steps it, the caller closes it.
-            buses: one bus for all, or the bus of each of `network.buses` (several may be the same object).
+            bus: that carries all of the network's buses; several channels come as a `JoinedBus`.
             seed: of every random number: sensor noise and biases.
             operator: holds the pendant; None: the pendant is somebody else's node.
-
-        Raises:
-            ValueError: `buses` lacks one of the network's buses.
         """
         parameters = parameters or EmulatorParameters()
-        self.network, self.body, self.operator = network, body, operator
+        self.network, self.body, self.bus, self.operator = network, body, bus, operator
         self.cycle = 0
         self.frames_lost = 0  # nodes' frames that the bus had no room for
         self.before_send: list[Callable[[int, Vector], None]] = []
-        self._build_images(buses)
+        self._build_images()
+        self._bind_commands()
         self._build_nodes(robot, parameters)
         self._build_noise(seed)
 
@@ -99,7 +97,7 @@ class Emulator:
 
     # -- construction ------------------------------------------------------------------------------------------------
 
-    def _build_images(self, buses: Bus | Mapping[str, Bus]) -> None:
+    def _build_images(self) -> None:
         network = self.network
         kinds = ("drive", "imu", "foot", "haptics") + (("pendant",) if self.operator else ())
         ours = {node.name for node in network.nodes if node.kind in kinds}
@@ -118,20 +116,15 @@ class Emulator:
         self._scratch_from = [self._scratch[place:] for place in range(_RECEIVE_BUDGET)]
         self._waiting = 0  # frames at the head of the scratch that no SYNC has followed yet
 
-        bus_of = buses if isinstance(buses, Mapping) else dict.fromkeys(network.buses, buses)
-        if missing := [bus for bus in network.buses if bus not in bus_of]:
-            raise ValueError(f"no bus given for {missing[0]}; the buses are {', '.join(network.buses)}")
-        self._bus_of = {name: bus_of[name] for name in network.buses}
-        self._links = list({id(bus): bus for bus in self._bus_of.values()}.values())
         self._sync_rows = [self._rx.codec.rows[m.name] for m in syncs]
         self._sync_ids = {m.frame_id for m in syncs}
-        frames = self._tx.frames
-        self._shares: list[tuple[Bus, Frames]] = []  # what the nodes of the bus of each SYNC send
+        self._shares: list[Frames] = []  # what the nodes of the bus of each SYNC send
         for sync in syncs:
             rows = [row for row, m in enumerate(cyclic) if m.bus == sync.bus]
-            self._shares.append((self._bus_of[sync.bus], frames[rows[0] : rows[-1] + 1]))
-        self._whole = [(self._links[0], frames)] if len(self._links) == 1 else self._shares
+            self._shares.append(self._tx.frames[rows[0] : rows[-1] + 1])
+        self._whole = [self._tx.frames]
 
+    def _bind_commands(self) -> None:
         values, codec = self._rx.values, self._rx.codec
         self._controlword = values[codec.slice("Controlword")]
         self._target = values[codec.slice("TargetTorque")]
@@ -151,26 +144,22 @@ class Emulator:
         truth = self._truth
 
         def joint(signal: str) -> Vector:
-            places = [codec.index(f"{name.upper()}_STATE", signal) for name in JOINTS]
-            if places != list(range(places[0], places[0] + len(JOINTS))):
-                raise ValueError(f"the drives' {signal} signals are not in joint order in the DBC")
-            return truth[places[0] : places[-1] + 1]
+            first = codec.index(f"{JOINTS[0].upper()}_STATE", signal)
+            return truth[first : first + len(JOINTS)]
 
-        drive_signals = DriveSignals(
-            *(joint(s) for s in ("Position", "Velocity", "Torque", "Temperature", "DriveState"))
+        self.drives = Drives(
+            robot,
+            parameters.drive,
+            DriveSignals(*(joint(s) for s in ("Position", "Velocity", "Torque", "Temperature", "DriveState"))),
         )
-        self.drives = Drives(robot, parameters.drive, drive_signals)
-
-        def wire_row(imu: str) -> int:
-            first: int = codec.slice("Quaternion").start
-            return (codec.index(f"IMU_{imu.upper()}_STATE", "QuaternionW") - first) // 4
-
-        imu_signals = ImuSignals(
-            truth[codec.slice("Quaternion")].reshape(-1, 4),
-            truth[codec.slice("Gyro")].reshape(-1, 3),
-            truth[codec.slice("Accel")].reshape(-1, 3),
+        self._imus = Imus(
+            parameters.imu,
+            ImuSignals(
+                truth[codec.slice("Quaternion")].reshape(len(IMUS), 4),
+                truth[codec.slice("Gyro")].reshape(len(IMUS), 3),
+                truth[codec.slice("Accel")].reshape(len(IMUS), 3),
+            ),
         )
-        self._imus = Imus(parameters.imu, imu_signals, [wire_row(imu) for imu in IMUS])
         self._feet = Feet(parameters.foot, truth[codec.slice("Force")].reshape(len(FEET), len(CELLS), 3))
         for kind, temperature in (("IMU", parameters.imu.temperature), ("FOOT", parameters.foot.temperature)):
             for message in codec.messages:
@@ -222,8 +211,8 @@ class Emulator:
         Returns:
             Whether a cycle was run.
         """
-        count = self._links[0].receive(self._scratch_from[self._waiting], timeout) + self._waiting
-        if count < len(self._rx.frames) or len(self._links) > 1:
+        count = self.bus.receive(self._scratch_from[self._waiting], timeout) + self._waiting
+        if count < len(self._rx.frames):
             count = self._receive_rest(count)
             if not count:
                 return False
@@ -235,24 +224,24 @@ class Emulator:
         return self._imperfect_cycle()
 
     def _receive_rest(self, count: int) -> int:
-        """Gather until every SYNC of the cycle is there; returns 0 while there is none, and keeps what came for later."""
+        """Wait until every SYNC of the cycle is there; returns 0 while there is none, and keeps what came for later."""
         ids = self._scratch["can_id"]
         deadline = None
-        while True:
-            before, wait = count, 0.0
+        while count < _RECEIVE_BUDGET:
             synced = self._sync_ids.intersection(ids[:count].tolist())
-            if synced and len(synced) < len(self._sync_ids):
-                now = time.monotonic()
-                deadline = deadline or now + _SYNC_SKEW
-                wait = max(0.0, deadline - now)
-            for link in self._links:
-                if count < _RECEIVE_BUDGET:
-                    count += link.receive(self._scratch_from[count], wait)
-                    wait = 0.0
-            if count in (before, _RECEIVE_BUDGET):
+            if not synced:
+                self._waiting = count
+                return 0
+            if len(synced) == len(self._sync_ids):
                 break
-        self._waiting = 0 if synced or count == _RECEIVE_BUDGET else count
-        return count - self._waiting
+            now = time.monotonic()
+            deadline = deadline or now + _SYNC_SKEW
+            got = self.bus.receive(self._scratch_from[count], max(0.0, deadline - now))
+            if not got:
+                break
+            count += got
+        self._waiting = 0
+        return count
 
     def _imperfect_cycle(self) -> bool:
         """Something is missing or refused: run the cycle with what is there."""
@@ -265,8 +254,8 @@ class Emulator:
         shares = [self._shares[place] for place in synced]
         number = int(max(self._sync_cycles[synced]))
         if number == self._last_sync:  # the rest of a cycle that has already run
-            for bus, frames in shares:
-                self._send(bus, frames)
+            for frames in shares:
+                self._send(frames)
             return False
         self._last_sync = number
         fresh = self._commanded[0], self._commanded[1]
@@ -274,15 +263,15 @@ class Emulator:
         self._cycle(fresh, shares)
         return True
 
-    def _send(self, bus: Bus, frames: Frames) -> None:
+    def _send(self, frames: Frames) -> None:
         try:
-            bus.send(frames)
+            self.bus.send(frames)
         except BusFull as error:
             self.frames_lost += len(frames) - error.sent
 
     # -- one cycle ---------------------------------------------------------------------------------------------------
 
-    def _cycle(self, fresh: tuple[bool, bool], shares: list[tuple[Bus, Frames]]) -> None:
+    def _cycle(self, fresh: tuple[bool, bool], shares: list[Frames]) -> None:
         """Sample, send, latch, move: [k, k+1] is driven by the command of cycle k-1."""
         body, drives, tx = self.body, self.drives, self._tx
         drives.sample(body.position)
@@ -297,8 +286,8 @@ class Emulator:
         for rewrite in self.before_send:
             rewrite(self.cycle, tx.values)
         tx.seal()
-        for bus, frames in shares:
-            self._send(bus, frames)
+        for frames in shares:
+            self._send(frames)
         self._send_slow()
         drives.command(fresh, self._controlword, self._target, self._limit)
         if drives.emergencies:
@@ -324,11 +313,11 @@ class Emulator:
         """Messages slower than the cycle, when they are due."""
         if self.cycle % self._haptics_cycles == 0:
             self._haptics.advance(self._level, int(self._rx.age[self._level_row]), self._haptics_cycles)
-            self._send(self._bus_of[self._haptics_tx.codec.messages[0].bus], self._haptics_tx.seal())
+            self._send(self._haptics_tx.seal())
         row = self._status_due.get(self.cycle % self._status_period)
         if row is not None:
             self._uptime[row] = self.cycle * PERIOD
-            self._send(self._bus_of[self._status_tx.codec.messages[row].bus], self._status_tx.seal_row(row))
+            self._send(self._status_tx.seal_row(row))
             self._node_state[row] = _OPERATIONAL
 
     def _send_emergencies(self) -> None:
@@ -337,8 +326,7 @@ class Emulator:
             name = f"{JOINTS[drive].upper()}_EMCY"
             tx.values[tx.codec.index(name, "ErrorRegister")] = register
             tx.values[tx.codec.index(name, "ErrorCode")] = code
-            row = tx.codec.rows[name]
-            self._send(self._bus_of[tx.codec.messages[row].bus], tx.seal_row(row))
+            self._send(tx.seal_row(tx.codec.rows[name]))
         self.drives.emergencies.clear()
 
     # -- wall clock --------------------------------------------------------------------------------------------------

@@ -31,7 +31,7 @@ class ImuParameters:
 
 
 class ImuSignals(NamedTuple):
-    """What the state frames will say: rewritten by `Imus.sample`; rows in an order of the owner's choice."""
+    """What the state frames will say: rewritten by `Imus.sample`."""
 
     quaternion: Vector  # (4, 4) wxyz, sensor to world, w >= 0
     gyro: Vector  # (4, 3) rad/s
@@ -43,12 +43,12 @@ _THREE = Struct("3d").pack_into
 
 
 class Imus:
-    """The IMUs of a body. `rows[i]` is the row of the signals that IMU i of `robot.IMUS` writes."""
+    """The IMUs of a body; row i of the signals is IMU i of `robot.IMUS`."""
 
-    def __init__(self, parameters: ImuParameters, signals: ImuSignals, rows: Sequence[int]) -> None:
+    def __init__(self, parameters: ImuParameters, signals: ImuSignals) -> None:
         self._parameters = parameters
-        self._count = len(rows)
-        self._rows = [(signals.quaternion[row].data, signals.gyro[row].data, signals.accel[row].data) for row in rows]
+        self._count = len(signals.quaternion)
+        self._rows = [tuple(signal[imu].data for signal in signals) for imu in range(self._count)]
         self._velocity: list[Sequence[float] | None] = [None] * self._count
         self._seen: list[LinkState | None] = [None] * self._count
 

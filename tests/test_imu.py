@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pinocchio
+import pytest
+
+from atalante_control.model import imu_link, pinocchio_model
+from atalante_emulator.body import GRAVITY, PERIOD, LinkState, PyBulletBody
+from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
+from atalante_hal.robot import IMUS
+
+
+def signals() -> ImuSignals:
+    return ImuSignals(np.zeros((4, 4)), np.zeros((4, 3)), np.zeros((4, 3)))
+
+
+def still(x: float = 0.0, y: float = 0.0, z: float = 0.0, w: float = 1.0) -> LinkState:
+    return (0.0, 0.0, 0.0), (x, y, z, w), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+
+
+def test_at_rest_the_specific_force_points_up() -> None:
+    out = signals()
+    Imus(ImuParameters(), out).sample([still()] * 4)
+    assert out.quaternion.tolist() == [[1.0, 0.0, 0.0, 0.0]] * 4
+    assert not out.gyro.any()
+    assert out.accel.tolist() == [[0.0, 0.0, GRAVITY]] * 4
+
+
+def test_gravity_is_seen_in_the_sensor_s_axes() -> None:
+    """Pitched by +30 degrees (nose down) the x axis points 30 degrees below the horizon."""
+    out = signals()
+    half = math.radians(15.0)
+    tilted = still(y=math.sin(half), w=math.cos(half))
+    Imus(ImuParameters(), out).sample([tilted] * 4)
+    np.testing.assert_allclose(out.accel[0], [-0.5 * GRAVITY, 0.0, math.sqrt(0.75) * GRAVITY])
+
+
+def test_quaternion_has_one_sign() -> None:
+    out = signals()
+    half = math.radians(20.0)
+    Imus(ImuParameters(), out).sample([still(x=-math.sin(half), w=-math.cos(half))] * 4)
+    np.testing.assert_allclose(out.quaternion[2], [math.cos(half), math.sin(half), 0.0, 0.0])
+
+
+def test_a_carousel_feels_its_centripetal_acceleration() -> None:
+    """Constant rate about z at 0.5 m: the sensor, turning with it, feels r w^2 inwards, and its own rate."""
+    out = signals()
+    imus = Imus(ImuParameters(), out)
+    radius, rate = 0.5, 2.0
+    for step in range(20):
+        angle = rate * step * PERIOD
+        link = (
+            (radius * math.cos(angle), radius * math.sin(angle), 0.0),
+            (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2)),
+            (-radius * rate * math.sin(angle), radius * rate * math.cos(angle), 0.0),
+            (0.0, 0.0, rate),
+        )
+        imus.sample([link] * 4)
+    np.testing.assert_allclose(out.accel[1], [-radius * rate**2, 0.0, GRAVITY], atol=3e-3)
+    np.testing.assert_allclose(out.gyro[1], [0.0, 0.0, rate], atol=1e-12)
+
+
+def test_free_fall_feels_nothing() -> None:
+    out = signals()
+    imus = Imus(ImuParameters(), out)
+    for step in range(3):
+        imus.sample(
+            [((0.0, 0.0, 0.0), (0.1, 0.2, 0.3, math.sqrt(0.86)), (0.0, 0.0, -GRAVITY * PERIOD * step), (0.0,) * 3)] * 4
+        )
+    np.testing.assert_allclose(out.accel, 0.0, atol=1e-12)
+
+
+def test_a_moving_exoskeleton_agrees_with_pinocchio(urdf_text: str) -> None:
+    model, q_index, v_index = pinocchio_model(urdf_text)
+    data = model.createData()
+    body, out = PyBulletBody(urdf_text), signals()
+    imus = Imus(ImuParameters(), out)
+    centre = np.array([0.0, 0.0, -0.3, 0.6, -0.1, 0.0] * 2)
+    body.reset(centre.tolist())
+    imus.sample(body.imu)
+    errors = []
+    for step in range(400):  # a leg swing of walking speed
+        reference = centre + np.array([0, 0, 0.25, 0.3, 0, 0, 0, 0, -0.25, -0.3, 0, 0]) * np.sin(5.0 * step * PERIOD)
+        torque = 400.0 * (reference - body.position) - 20.0 * body.velocity
+        q, v, a = np.zeros((3, 12))
+        before = body.velocity.copy()
+        body.step(torque.tolist())
+        imus.sample(body.imu)
+        q[q_index], v[v_index] = body.position, body.velocity
+        a[v_index] = (body.velocity - before) / PERIOD
+        pinocchio.forwardKinematics(model, data, q, v, a)
+        pinocchio.updateFramePlacements(model, data)
+        for imu, name in enumerate(IMUS):
+            frame = model.getFrameId(imu_link(name))
+            rotation = data.oMf[frame].rotation
+            motion = pinocchio.getFrameVelocity(model, data, frame, pinocchio.LOCAL)
+            acceleration = pinocchio.getFrameClassicalAcceleration(model, data, frame, pinocchio.LOCAL).linear
+            w, x, y, z = out.quaternion[imu]
+            np.testing.assert_allclose(pinocchio.Quaternion(w, x, y, z).matrix(), rotation, atol=1e-6)
+            np.testing.assert_allclose(out.gyro[imu], motion.angular, atol=1e-6)
+            if step > 100:
+                errors.append(np.abs(out.accel[imu] - acceleration - rotation.T @ [0.0, 0.0, GRAVITY]).max())
+    body.close()
+    assert body.velocity.max() > 0.5
+    # The difference over the last millisecond is the acceleration half of one ago.
+    assert max(errors) < 0.02
+    assert float(np.median(errors)) < 2e-3
+
+
+def test_noise_and_bias_are_seeded_and_of_the_stated_size() -> None:
+    parameters = ImuParameters()
+    imus = Imus(parameters, signals())
+
+    def draw(seed: int) -> tuple[np.ndarray, np.ndarray]:
+        generator = np.random.default_rng(seed)
+        bias = imus.draw_bias(generator)
+        gyro, accel = np.zeros((2, 4000, 12))
+        imus.draw_noise(generator, bias, gyro, accel)
+        np.testing.assert_allclose(accel.mean(axis=0), bias[1], atol=4 * parameters.accel_noise / math.sqrt(4000))
+        np.testing.assert_allclose(gyro.mean(axis=0), bias[0], atol=4 * parameters.gyro_noise / math.sqrt(4000))
+        assert np.abs(bias[1]).max() < 5 * parameters.accel_bias
+        return gyro, accel
+
+    gyro, accel = draw(7)
+    np.testing.assert_allclose(gyro.std(axis=0), parameters.gyro_noise, rtol=0.1)
+    np.testing.assert_allclose(accel.std(axis=0), parameters.accel_noise, rtol=0.1)
+    again, _ = draw(7)
+    other, _ = draw(8)
+    assert gyro.tobytes() == again.tobytes() != other.tobytes()
+
+
+@pytest.mark.parametrize("moved", [0, 3])
+def test_only_what_moved_is_computed_again(moved: int) -> None:
+    out = signals()
+    imus = Imus(ImuParameters(), out)
+    links = [still() for _ in range(4)]
+    imus.sample(links)
+    out.gyro[:] = 9.0
+    links[moved] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.5, 0.0, 0.0))
+    imus.sample(links)
+    assert out.gyro[moved].tolist() == [0.5, 0.0, 0.0]
+    assert (np.delete(out.gyro, moved, axis=0) == 9.0).all()
