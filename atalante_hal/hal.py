@@ -185,6 +185,8 @@ class Hal:
         ]
         self._nodes_known = False
         self._stranger: str | None = None  # a node that speaks another DBC
+        self._hash_values = self._slow.values[slow.slice("DbcHash")]
+        self._hashes_judged = b""
 
     def _build_status(self, gait_hash: int) -> None:
         self._status = TransmitImage([self.network.message("HAL_STATUS")])
@@ -372,7 +374,10 @@ class Hal:
             self.state.vibration[:] = self._slow.values[self._amplitude]
         if not self._nodes_known:
             self._nodes_known = bool((self._slow.age[self._status_rows] < NEVER).all())
-        self._stranger = next((m.sender for m, row, at in self._hashes if self._speaks_another_dbc(row, at)), None)
+        hashes = self._hash_values.tobytes()
+        if hashes != self._hashes_judged:
+            self._hashes_judged = hashes
+            self._stranger = next((m.sender for m, row, at in self._hashes if self._speaks_another_dbc(row, at)), None)
 
     def _speaks_another_dbc(self, row: int, at: int) -> bool:
         return bool(self._slow.age[row] < NEVER and self._slow.values[at] != self.network.hash32)
