@@ -1,0 +1,45 @@
+"""The layout names every place of the vector once, and travels as JSON."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from atalante_hal.telemetry.layout import Layout
+
+FIELDS = st.lists(
+    st.tuples(st.text("abc.", min_size=1, max_size=4), st.integers(1, 40)),
+    max_size=20,
+    unique_by=lambda field: field[0],
+)
+
+
+@given(FIELDS)
+def test_the_slices_cover_the_vector_in_order_without_a_gap(fields: list[tuple[str, int]]) -> None:
+    layout = Layout(fields)
+    places = list(range(layout.size))
+    assert [place for name in layout for place in places[layout[name]]] == places
+    assert [(name, layout[name].stop - layout[name].start) for name in layout] == fields
+
+
+@given(FIELDS)
+def test_json_keeps_everything(fields: list[tuple[str, int]]) -> None:
+    layout = Layout(fields)
+    back = Layout.from_json(layout.to_json())
+    assert (back.fields, back.size) == (layout.fields, layout.size)
+    assert all(back[name] == layout[name] for name in layout)
+
+
+@pytest.mark.parametrize("fields", [[("q", 1), ("q", 1)], [("q", 0)], [("q", -1)]])
+def test_refuses_a_name_twice_and_a_length_below_one(fields: list[tuple[str, int]]) -> None:
+    with pytest.raises(ValueError, match="'q'"):
+        Layout(fields)
+
+
+def test_an_unknown_field_is_answered_with_those_there_are() -> None:
+    layout = Layout([("position", 12), ("velocity", 12)])
+    assert "position" in layout
+    assert "torque" not in layout
+    with pytest.raises(KeyError, match="position, velocity"):
+        layout["torque"]
