@@ -1,0 +1,392 @@
+"""The controller of the paper, for an exoskeleton that hangs by its pelvis: `State -> Command`, once a cycle.
+
+    step switch -> q_des = q_nom + s -> PID, gravity, flat foot -> u_t --------------------------.
+                                     -> idealization u_i, feedforward u_f, virtual guide u_v ->  merge -> u
+                                     -> haptics
+
+Steps alternate right and left stance and change by time: in the air nothing is hit. The swing leg's SH and SK get the
+assistive torque, every other joint the baseline torque. What the paper leaves open is settled so:
+
+- *Assistance factor.* Xi is taken over at step changes alone, where the state is re-centred and the torque handed over:
+  no guide ever moves under a joint inside a step, so the certificate of each step stays true, whatever the operator does.
+- *Xi towards 1.* The assisted joints get w u_t + (1 - w) (u_i + u_f + u_v), with w a smoothstep from 0 at Xi = 0.9 to
+  exactly 1 at Xi = 1: there it is the baseline torque to the last bit. Their integrals take the same share w.
+- *Hand-over.* At a step change the deadbeat takes the tracking error to zero at once, a leg changes from one law to the
+  other, and the horizon jumps back to T. The torque that would jump is carried over and faded out in `blend`: the
+  command is continuous. This is part of the baseline, and the same with and without assistance.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from struct import Struct
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_control.backup import BackupPolicy
+from atalante_control.certificate import Certificate, HandOver, certify
+from atalante_control.deadbeat import Deadbeat
+from atalante_control.flat_foot import flat_feet
+from atalante_control.gait import PERIOD, Gait
+from atalante_control.guide import GuideConfig, GuideFilter
+from atalante_control.guide_shapes import GuideShape
+from atalante_control.haptics import intensity, levels
+from atalante_control.idealization import AssistedInertia, Friction, Gravity
+from atalante_control.impact import step_over
+from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
+from atalante_control.pid import AIR_GAINS, LEFT, RIGHT, Pid, PidGains
+from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, MOTORS, Robot
+from atalante_hal.types import Command, State
+
+Vector = npt.NDArray[np.float64]
+Pair = tuple[float, float]
+
+_LEG = len(LEG_JOINTS)
+_SH, _SK, _SA, _HA = (LEG_JOINTS.index(joint) for joint in ("SH", "SK", "SA", "HA"))
+_TAIL = Struct("16d")  # what follows q_des in the telemetry
+_STOP_MARGIN, _STOP_FADE = math.radians(1.0), math.radians(3.0)  # flat foot against the ankle's limits
+_PELVIS = IMUS.index("pelvis")
+_TIBIAE = (IMUS.index("left_tibia"), IMUS.index("right_tibia"))
+
+
+@dataclass(frozen=True)
+class HangConfig:
+    """Everything that may be chosen.
+
+    Raises:
+        ValueError: a number out of range.
+    """
+
+    gains: PidGains = AIR_GAINS
+    friction: Friction = field(default_factory=Friction)
+    alpha: float = 0.4  # of a step, until the deadbeat has met the nominal
+    guide_rate: Pair = (28.0, 44.0)  # rad/s, natural frequency of the backup policy on SH and SK
+    guide_damping: float = 1.05  # damping ratio; 1 and above is monotone
+    disturbance: tuple[Pair, Pair] = ((-40.0, 40.0), (-20.0, 20.0))  # Nm, u_ext of SH and SK
+    points: int = 100  # intervals of the horizon grid
+    overlap: float = 0.1  # s, horizon past the step's end
+    zeta: float = 0.03  # s, derivative gain of the guide
+    hand_over: HandOver = field(default_factory=HandOver)
+    decoupled: bool = True  # SH and SK through their common mass matrix; False: u_v on its own joint, as printed
+    feedforward: bool = False  # u_f of the gait on the assisted joints; off in the air
+    flat_foot: bool = True
+    ankle_offset: float = math.radians(1.0)  # rad, on both sagittal ankles
+    fade: float = 0.9  # Xi from which the baseline takes over
+    startup: float = 2.0  # s, from the measured pose to the gait's first
+    blend: float = 0.03  # s, in which a torque step at the step change fades out
+    active: float = 0.05  # gate above which the filter counts as acting
+
+    def __post_init__(self) -> None:
+        for name in ("startup", "blend"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= PERIOD):
+                raise ValueError(f"{name} is at least one cycle ({PERIOD} s), not {getattr(self, name)!r}")
+        if not 0.0 <= self.fade < 1.0:
+            raise ValueError(f"fade is an assistance factor in [0, 1), not {self.fade!r}")
+        if not (min(self.guide_rate) > 0.0 and self.guide_damping > 0.0):
+            raise ValueError("guide_rate and guide_damping are positive")
+
+
+@dataclass
+class HangStatistics:
+    """What the guide did from the first completed right-stance step on."""
+
+    steps: int = 0  # completed right-stance steps
+    cycles: int = 0  # counted
+    inside: int = 0  # of them, both assisted joints in the guide
+    active: int = 0  # of them, the filter acting on one
+    max_ratio: float = 0.0  # largest |e| / q_bound
+    min_h_at_start: float = 1.0  # smallest h at a step's first cycle
+    hand_overs_exceeded: int = 0  # step changes with a deviation beyond the certified hand-over
+
+
+def baseline_share(xi: float, fade: float) -> float:
+    """w(Xi): 0 up to `fade`, smoothstep to exactly 1 at Xi = 1."""
+    x = (xi - fade) / (1.0 - fade)
+    return 0.0 if x <= 0.0 else 1.0 if x >= 1.0 else x * x * (3.0 - 2.0 * x)
+
+
+def _within(angle: float, rate: float, low: float, high: float) -> Pair:
+    """Angle held `_STOP_MARGIN` off the joint's limits, with a speed that fades out before it rather than at it."""
+    low, high = low + _STOP_MARGIN, high - _STOP_MARGIN
+    room = max(0.0, min(angle - low, high - angle) / _STOP_FADE)
+    return min(high, max(low, angle)), rate * min(1.0, room)
+
+
+class HangController:
+    """The controller. It implements `atalante_hal.types.Controller`.
+
+    Attributes:
+        guide: the virtual guide filter.
+        statistics: since `reset`.
+        telemetry, telemetry_fields: for the recording; angles in rad, stance 0 left and 1 right, phase t / T.
+    """
+
+    telemetry_fields = (
+        ("q_des", len(JOINTS)),
+        ("error", 2),  # q - q_des of the swing leg's SH and SK
+        ("q_bound", 2),  # distance to the guide on the error's side
+        ("guide", 2),  # distances to the guide, upper and lower
+        ("h", 2),
+        ("lambda", 2),  # lambda + (1 - lambda) lambda_d
+        ("filter_active", 2),
+        ("step", 1),  # completed right-stance steps
+        ("phase", 1),
+        ("stance", 1),
+        ("assistance_factor", 1),  # Xi of this step
+    )
+
+    def __init__(
+        self,
+        robot: Robot,
+        gait: Gait,
+        shape: GuideShape,
+        config: HangConfig | None = None,
+        exoskeleton: ExoskeletonParameters | None = None,
+    ) -> None:
+        """Prepare every table; nothing is allocated in the loop."""
+        self.config = config = config or HangConfig()
+        exoskeleton = exoskeleton or ExoskeletonParameters()
+        articulated = pinocchio_model(urdf(exoskeleton, robot))
+        self._gait, self._cycles = gait, gait.cycles
+        self._deadbeat = Deadbeat(gait.duration, config.alpha)
+        self._gravity = Gravity(articulated)
+        self._pid = Pid(config.gains)
+        self._flat = flat_feet(exoskeleton) if config.flat_foot else None
+        self._ankle_low, self._ankle_high = robot.position_min.tolist(), robot.position_max.tolist()
+
+        gaits = {RIGHT: gait, LEFT: gait.mirrored()}
+        tables = {stance: step.tables() for stance, step in gaits.items()}
+        ankles = [_SA, _LEG + _SA]
+        #: Rows (q_nom, q_nom') of a step; the working copy gets the deadbeat.
+        self._nominal = {}
+        for stance, table in tables.items():
+            rows = np.hstack([table.q, table.qd])
+            rows[:, ankles] += config.ankle_offset
+            self._nominal[stance] = rows
+        self._reference = {stance: rows.copy() for stance, rows in self._nominal.items()}
+        self._uf = {stance: table.uf for stance, table in tables.items()}
+        time: Vector = np.arange(self._cycles + 1, dtype=np.float64) * PERIOD
+        (c0, c1), (c0d, c1d), _ = self._deadbeat.basis(time)
+        self._fading = int(np.searchsorted(time, self._deadbeat.end))
+        self._cubics = [values[: self._fading].tolist() for values in (c0, c1, c0d, c1d)]
+        n = len(JOINTS)
+        self._basis = np.zeros((2, self._fading, 2 * n))  # of s(0) and s'(0): added to the rows
+        self._basis[0, :, :n], self._basis[0, :, n:] = c0[: self._fading, None], c0d[: self._fading, None]
+        self._basis[1, :, :n], self._basis[1, :, n:] = c1[: self._fading, None], c1d[: self._fading, None]
+
+        self._inertia = AssistedInertia(articulated, tables[RIGHT].q)
+        swing = [_SH, _SK]
+        self.guide = GuideFilter(
+            self._guide_config(robot, tables[RIGHT].q),
+            shape,
+            self._deadbeat,
+            gait.coefficients[swing],
+            gaits[LEFT].coefficients[swing],
+            gait.feedforward[swing] if config.feedforward and gait.feedforward is not None else None,
+        )
+
+        ramp = np.arange(round(config.blend / PERIOD)) * (PERIOD / config.blend)
+        self._blend: list[float] = (0.5 + 0.5 * np.cos(math.pi * ramp)).tolist()
+        self._startup_cycles = round(config.startup / PERIOD)
+
+        self._last, self._carried, self._share = np.zeros(n), np.zeros(n), np.ones(n)
+        self._start_pose, self._start_row = np.zeros(n), np.zeros(2 * n)
+        self._deviation, self._rate, self._added = np.zeros(2 * n), np.zeros(2 * n), np.zeros_like(self._basis)
+        self._command = Command(self._pid.torque, np.zeros(len(MOTORS)))
+        self.telemetry = np.zeros(sum(length for _, length in self.telemetry_fields))
+        self._q_des_out = self.telemetry[:n]
+        self._tail = memoryview(self.telemetry[n:].data).cast("B")
+        self.statistics = HangStatistics()
+        self._forget()
+
+    def certificate(self, xi: float) -> Certificate:
+        """What this controller's guide promises at an assistance factor."""
+        return certify(self.guide, xi, self.config.hand_over)
+
+    def reset(self, state: State) -> None:
+        """Start from where the joints are, and from the torque they have."""
+        self._forget()
+        self._changed_at = state.cycle
+        self._start_pose[:] = state.position
+        self._last[:] = state.torque
+        self._carry = True
+
+    def _forget(self) -> None:
+        self._walking, self._stance, self._xi, self._w = False, RIGHT, 1.0, 1.0
+        self._intensity, self._changed_at, self._carry = 0.0, 0, False
+        self._pid.reset()
+        self._share.fill(1.0)
+        self._command.vibration.fill(0.0)
+        self.telemetry.fill(0.0)
+        self._flat_deviation = self._flat_rate = (0.0, 0.0)
+        self.statistics = HangStatistics()
+
+    def _guide_config(self, robot: Robot, q: Vector) -> GuideConfig:
+        """Backup gains for the inertia the swing leg shows along the step, and the torque left for them."""
+        config = self.config
+        level = (1.0, 0.0, 0.0, 0.0)
+        weight = np.array([np.abs(self._gravity.torque(pose, level)) for pose in q[::20].copy()]).max(axis=0)
+        policies = []
+        for joint, j, rate in zip((_SH, _SK), self._inertia.inertias, config.guide_rate, strict=True):
+            friction = config.friction.torque(joint, 2.0)
+            limit = float(robot.torque_max[joint] - weight[joint]) - friction
+            policies.append(BackupPolicy(j * rate**2, 2.0 * config.guide_damping * j * rate, j, limit))
+        return GuideConfig((policies[0], policies[1]), config.disturbance, config.points, config.overlap, config.zeta)
+
+    # -- one cycle ---------------------------------------------------------------------------------------------------
+
+    def update(self, state: State) -> Command:
+        """One cycle."""
+        cycle = state.cycle - self._changed_at
+        if self._walking:
+            if step_over(cycle, self._cycles):
+                if self._stance == RIGHT:
+                    self.statistics.steps += 1
+                self._change_step(state, LEFT if self._stance == RIGHT else RIGHT)
+                cycle = 0
+        elif cycle < self._startup_cycles:
+            return self._move_to_start(state, cycle)
+        else:
+            self._walking = True
+            self._change_step(state, RIGHT)
+            cycle = 0
+        row = self._reference[self._stance][cycle]
+        leg = _LEG if self._stance == LEFT else 0  # first joint of the swing leg
+        if self._flat is not None:
+            self._level_foot(state, row, cycle, leg)
+        gravity = self._baseline(state, row)
+        self._assist(state, row, cycle, leg, gravity)
+        self._hand_over(cycle)
+        return self._command
+
+    def _move_to_start(self, state: State, cycle: int) -> Command:
+        """Minimum-jerk move from the pose at `reset` to the first of the gait, by the baseline alone."""
+        x = cycle / self._startup_cycles
+        row, n = self._start_row, len(JOINTS)
+        way = self._nominal[RIGHT][0, :n] - self._start_pose
+        row[:n] = self._start_pose + way * (x * x * x * (10.0 + x * (6.0 * x - 15.0)))
+        row[n:] = way * (30.0 * x * x * (1.0 - x) * (1.0 - x) / self.config.startup)
+        self._baseline(state, row)
+        self._hand_over(cycle)
+        self._q_des_out[:] = row[:n]
+        return self._command
+
+    def _change_step(self, state: State, stance: int) -> None:
+        self._changed_at, self._stance = state.cycle, stance
+        config, n = self.config, len(JOINTS)
+        self._xi = xi = min(1.0, max(0.0, state.assistance_factor))
+        self._w, self._intensity = baseline_share(xi, config.fade), intensity(xi)
+        leg = _LEG if stance == LEFT else 0
+        self._share.fill(1.0)
+        self._share[[leg + _SH, leg + _SK]] = self._w
+
+        nominal, deviation, rate = self._nominal[stance], self._deviation, self._rate
+        np.subtract(state.position, nominal[0, :n], out=deviation[:n])
+        np.subtract(state.velocity, nominal[0, n:], out=rate[:n])
+        deviation[n:], rate[n:] = deviation[:n], rate[:n]
+        np.multiply(self._basis[0], deviation, out=self._added[0])
+        np.multiply(self._basis[1], rate, out=self._added[1])
+        np.add(self._added[0], self._added[1], out=self._added[0])
+        np.add(nominal[: self._fading], self._added[0], out=self._reference[stance][: self._fading])
+
+        hip, knee = leg + _SH, leg + _SK
+        deviations, rates = (float(deviation[hip]), float(deviation[knee])), (float(rate[hip]), float(rate[knee]))
+        self.guide.start_step(xi, deviations, rates)
+        largest = config.hand_over
+        if max(map(abs, deviations)) > largest.deviation or max(map(abs, rates)) > largest.rate:
+            self.statistics.hand_overs_exceeded += 1
+        if self._flat is not None:
+            angles, speeds = self._flat_target(state, leg)
+            q, qd = state.position, state.velocity
+            self._flat_deviation = (float(q[leg + _SA]) - angles[0], float(q[leg + _HA]) - angles[1])
+            self._flat_rate = (float(qd[leg + _SA]) - speeds[0], float(qd[leg + _HA]) - speeds[1])
+        self._carry = True
+
+    def _flat_target(self, state: State, leg: int) -> tuple[Pair, Pair]:
+        """Angles and speeds of SA and HA that hold the swing sole level, within the joints' limits."""
+        feet, low, high = self._flat, self._ankle_low, self._ankle_high
+        assert feet is not None  # asked for only where flat foot is on
+        imu, foot = _TIBIAE[leg > 0], feet[leg > 0]
+        w, x, y, z = state.imu_quaternion[imu].tolist()
+        angles, speeds = foot.angles((w, x, y, z)), foot.rates(*state.imu_gyro[imu].tolist())
+        sagittal, henke = angles[0] + self.config.ankle_offset, angles[1]
+        sa, ha = leg + _SA, leg + _HA
+        sagittal, sagittal_rate = _within(sagittal, speeds[0], low[sa], high[sa])
+        henke, henke_rate = _within(henke, speeds[1], low[ha], high[ha])
+        return (sagittal, henke), (sagittal_rate, henke_rate)
+
+    def _level_foot(self, state: State, row: Vector, cycle: int, leg: int) -> None:
+        """Put the flat-foot targets, with their own deadbeat, in the place of the nominal ones."""
+        angles, speeds = self._flat_target(state, leg)
+        if cycle < self._fading:
+            c0, c1, c0d, c1d = (values[cycle] for values in self._cubics)
+            (d0, d1), (r0, r1) = self._flat_deviation, self._flat_rate
+            angles = (angles[0] + d0 * c0 + r0 * c1, angles[1] + d1 * c0 + r1 * c1)
+            speeds = (speeds[0] + d0 * c0d + r0 * c1d, speeds[1] + d1 * c0d + r1 * c1d)
+        n = len(JOINTS)
+        row[leg + _SA], row[leg + _HA] = angles
+        row[n + leg + _SA], row[n + leg + _HA] = speeds
+
+    def _baseline(self, state: State, row: Vector) -> Vector:
+        """u_t into the command: PID and the gravity of the empty exoskeleton. Returns u_g."""
+        n = len(JOINTS)
+        gravity = self._gravity.torque(state.position, state.imu_quaternion[_PELVIS].tolist())
+        torque = self._pid.update(self._stance, row[:n], row[n:], state.position, state.velocity, self._share)
+        np.add(torque, gravity, out=torque)
+        return gravity
+
+    def _assist(self, state: State, row: Vector, cycle: int, leg: int, gravity: Vector) -> None:
+        """Merge the assistive torque into the command of the swing leg's SH and SK; haptics, telemetry, statistics."""
+        hip, knee = leg + _SH, leg + _SK
+        q, qd, desired = state.position.tolist(), state.velocity.tolist(), row.tolist()
+        n = len(JOINTS)
+        e_hip, e_knee = q[hip] - desired[hip], q[knee] - desired[knee]
+        guide, w, config = self.guide, self._w, self.config
+        v_hip, v_knee = guide.tick(cycle, e_hip, qd[hip] - desired[n + hip], e_knee, qd[knee] - desired[n + knee])
+        if w < 1.0:
+            if config.decoupled:
+                v_hip, v_knee = self._inertia.torques(q[knee], qd[hip], qd[knee], (v_hip, v_knee))
+            friction, torque = config.friction, self._pid.torque
+            u_hip = float(gravity[hip]) + friction.torque(_SH, qd[hip]) + v_hip
+            u_knee = float(gravity[knee]) + friction.torque(_SK, qd[knee]) + v_knee
+            if config.feedforward:
+                uf = self._uf[self._stance][cycle]
+                u_hip, u_knee = u_hip + float(uf[hip]), u_knee + float(uf[knee])
+            torque[hip] = w * float(torque[hip]) + (1.0 - w) * u_hip
+            torque[knee] = w * float(torque[knee]) + (1.0 - w) * u_knee
+
+        upper, lower = guide.bounds
+        bounds = (upper if e_hip > 0.0 else lower, upper if e_knee > 0.0 else lower)
+        levels(leg > 0, (e_hip, e_knee), bounds, self._intensity, self._command.vibration)
+        g_hip, g_knee = guide.gates
+        acting = config.active
+        statistics = self.statistics
+        h_hip, h_knee = guide.h
+        if statistics.steps:
+            ratio = max(abs(e_hip) / bounds[0], abs(e_knee) / bounds[1])
+            statistics.cycles += 1
+            if ratio <= 1.0:
+                statistics.inside += 1
+            if ratio > statistics.max_ratio:
+                statistics.max_ratio = ratio
+            if g_hip > acting or g_knee > acting:
+                statistics.active += 1
+            if cycle == 0:
+                statistics.min_h_at_start = min(statistics.min_h_at_start, h_hip, h_knee)
+        self._q_des_out[:] = row[:n]
+        _TAIL.pack_into(
+            self._tail, 0, e_hip, e_knee, *bounds, upper, lower, h_hip, h_knee, g_hip, g_knee,
+            g_hip > acting, g_knee > acting, statistics.steps, cycle / self._cycles, self._stance, self._xi,
+        )  # fmt: skip
+
+    def _hand_over(self, cycle: int) -> None:
+        """Carry over what the torque would jump by at a change, and fade it out."""
+        torque = self._pid.torque
+        if self._carry:
+            np.subtract(self._last, torque, out=self._carried)
+            self._carry = False
+        if cycle < len(self._blend):
+            np.add(torque, self._carried * self._blend[cycle], out=torque)
+        self._last[:] = torque

@@ -1,0 +1,235 @@
+"""Gait: twelve joint trajectories of one right-stance step as Bezier polynomials, read strictly from a file.
+
+`gait file -> Gait -> StepTables (1 ms) -> baseline controller, guide filter`. The left-stance step is the right-stance
+step of the mirrored robot: the legs swap and each joint takes its MIRROR_SIGN. A gait that does not continue through
+that swap, or that leaves the robot's limits, is refused when it is read, not when it is walked.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import comb
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.robot import JOINTS, LEG_JOINTS, MIRROR_SIGN, SIDES, Robot
+
+Vector = npt.NDArray[np.float64]
+
+FORMAT = "atalante-gait/1"
+DEGREE = 7
+PERIOD = 1e-3  # s, the cycle; tables and step durations lie on it
+HANG_GAIT = Path(__file__).with_name("gaits") / "hang.json"
+
+#: Joint i of the mirrored robot is joint SWAP[i] of the robot, times SIGN[i].
+SWAP = np.r_[len(LEG_JOINTS) : len(JOINTS), 0 : len(LEG_JOINTS)]
+SIGN = np.array(MIRROR_SIGN * len(SIDES), dtype=np.float64)
+
+POSITION_JUMP = math.radians(0.1)  # rad, largest discontinuity accepted at the step change
+VELOCITY_JUMP = 0.05  # rad/s
+DURATION_RANGE = (0.3, 3.0)  # s
+
+_REQUIRED = ("format", "name", "duration", "joints")
+_OPTIONAL = ("feedforward", "parameters", "solver")
+
+
+class GaitError(ValueError):
+    """The gait file is not a gait of this robot; the message names the key and what is valid."""
+
+
+@dataclass(frozen=True)
+class StepTables:
+    """A step sampled every cycle from 0 to T included: arrays of shape (N + 1, 12), read-only."""
+
+    q: Vector  # rad
+    qd: Vector  # rad/s
+    qdd: Vector  # rad/s2
+    uf: Vector  # Nm, feedforward without gravity; zero where the gait has none
+
+
+@dataclass(frozen=True)
+class Gait:
+    """One right-stance step: the left leg swings. The step of the other leg is `mirrored()`."""
+
+    name: str
+    duration: float  # s, T
+    coefficients: Vector  # (12, 8) rad, Bezier control points in the order of JOINTS
+    feedforward: Vector | None = None  # (12, 8) Nm, Bezier control points of u_f, gravity not in it
+    parameters: Mapping[str, float] = field(default_factory=dict)  # what the gait was made for: patient, step length
+    solver: Mapping[str, Any] = field(default_factory=dict)  # how it was made; kept, never read
+
+    @property
+    def cycles(self) -> int:
+        """Cycles in a step, N."""
+        return round(self.duration / PERIOD)
+
+    @property
+    def hash32(self) -> int:
+        """CRC-32 of what is walked: duration, trajectories, feedforward."""
+        content = np.float64(self.duration).tobytes() + np.ascontiguousarray(self.coefficients).tobytes()
+        if self.feedforward is not None:
+            content += np.ascontiguousarray(self.feedforward).tobytes()
+        return zlib.crc32(content)
+
+    def mirrored(self) -> Gait:
+        """The step with the other stance leg. Twice mirrored is the gait itself."""
+        feedforward = None if self.feedforward is None else _mirror(self.feedforward)
+        return Gait(self.name, self.duration, _mirror(self.coefficients), feedforward, self.parameters, self.solver)
+
+    def tables(self) -> StepTables:
+        """The step on the cycle grid."""
+        phase = np.arange(self.cycles + 1) / self.cycles
+        first, second = derivative(self.coefficients), derivative(derivative(self.coefficients))
+        uf = np.zeros_like(self.coefficients) if self.feedforward is None else self.feedforward
+        return StepTables(
+            _read_only(bezier(self.coefficients, phase)),
+            _read_only(bezier(first, phase) / self.duration),
+            _read_only(bezier(second, phase) / self.duration**2),
+            _read_only(bezier(uf, phase)),
+        )
+
+
+def bezier(coefficients: Vector, phase: Vector) -> Vector:
+    """Bezier polynomials of control points (m, d + 1) at phases (n,) in [0, 1]. Shape (n, m)."""
+    degree = coefficients.shape[1] - 1
+    x = phase[:, None]
+    k = np.arange(degree + 1)
+    binomial = np.array([comb(degree, int(i)) for i in k], dtype=np.float64)
+    basis: Vector = binomial * x**k * (1.0 - x) ** (degree - k)
+    return basis @ coefficients.T
+
+
+def derivative(coefficients: Vector) -> Vector:
+    """Control points of the derivative with respect to the phase: (m, d + 1) to (m, d)."""
+    return np.asarray((coefficients.shape[1] - 1) * np.diff(coefficients, axis=1))
+
+
+def power_basis(coefficients: Vector) -> Vector:
+    """Coefficients in powers of the phase, lowest first, of Bezier control points. Shape kept, (m, d + 1)."""
+    degree = coefficients.shape[1] - 1
+    change = np.zeros((degree + 1, degree + 1))
+    for power in range(degree + 1):
+        for k in range(power + 1):
+            change[power, k] = comb(degree, power) * comb(power, k) * (-1) ** (power - k)
+    return coefficients @ change.T
+
+
+def load_gait(path: Path, robot: Robot) -> Gait:
+    """Read a gait file (JSON) strictly and check it against the robot.
+
+    Keys: `format` ("atalante-gait/1"), `name`, `duration` [s], `joints` (each of JOINTS: 8 Bezier control points [rad]
+    of the right-stance step); optional `feedforward` (the same, [Nm], gravity not in it), `parameters` (name: number),
+    `solver` (anything).
+
+    Raises:
+        GaitError: unknown, missing or malformed key; a value that is not finite; a discontinuity through the step
+            change over 0.1 degrees or 0.05 rad/s; a position or speed beyond the robot's limits.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise GaitError(f"{path}: {error}") from error
+    if not isinstance(document, dict):
+        raise GaitError(f"{path}: a gait file is a JSON object with the keys {', '.join(_REQUIRED)}")
+    if unknown := sorted(set(document) - {*_REQUIRED, *_OPTIONAL}):
+        raise GaitError(f"{path}: {unknown[0]} is unknown; valid keys are {', '.join(_REQUIRED + _OPTIONAL)}")
+    if missing := [key for key in _REQUIRED if key not in document]:
+        raise GaitError(f"{path}: {missing[0]} is missing; required keys are {', '.join(_REQUIRED)}")
+    if document["format"] != FORMAT:
+        raise GaitError(f"{path}: format is {FORMAT!r}, not {document['format']!r}")
+    name, parameters, solver = document["name"], document.get("parameters", {}), document.get("solver", {})
+    if not (isinstance(name, str) and name):
+        raise GaitError(f"{path}: name is a text that is not empty, not {name!r}")
+    if not isinstance(parameters, dict) or not all(_is_number(value) for value in parameters.values()):
+        raise GaitError(f"{path}: parameters is an object of finite numbers, not {parameters!r}")
+    if not isinstance(solver, dict):
+        raise GaitError(f"{path}: solver is an object, not {solver!r}")
+    gait = Gait(
+        name,
+        _duration(path, document["duration"]),
+        _control_points(path, "joints", document["joints"]),
+        _control_points(path, "feedforward", document["feedforward"]) if "feedforward" in document else None,
+        {key: float(value) for key, value in parameters.items()},
+        solver,
+    )
+    check_gait(gait, robot, str(path))
+    return gait
+
+
+def check_gait(gait: Gait, robot: Robot, where: str = "gait") -> None:
+    """Refuse a gait that jumps at the step change or leaves the robot's limits.
+
+    Raises:
+        GaitError: names the joint, what it does and what is allowed.
+    """
+    right, left = gait.tables(), gait.mirrored().tables()
+    for end, start, limit, unit in (
+        (right.q[-1], left.q[0], POSITION_JUMP, "rad"),
+        (right.qd[-1], left.qd[0], VELOCITY_JUMP, "rad/s"),
+    ):
+        jump = np.abs(end - start)
+        worst = int(jump.argmax())
+        if jump[worst] > limit:
+            raise GaitError(
+                f"{where}: joints.{JOINTS[worst]} jumps by {jump[worst]:.4g} {unit} at the step change; "
+                f"at most {limit:.4g} {unit} is allowed against the mirrored start"
+            )
+    # The mirrored step has mirrored limits: checking both steps also covers limits that are not symmetric.
+    for tables in (right, left):
+        for values, low, high, unit in (
+            (tables.q, robot.position_min, robot.position_max, "rad"),
+            (tables.qd, -robot.velocity_max, robot.velocity_max, "rad/s"),
+        ):
+            beyond = np.maximum(values - high, low - values).max(axis=0)
+            worst = int(beyond.argmax())
+            if beyond[worst] > 0.0:
+                raise GaitError(
+                    f"{where}: joints.{JOINTS[worst]} leaves its range by {beyond[worst]:.4g} {unit}; "
+                    f"it is [{low[worst]:.4g}, {high[worst]:.4g}] {unit}"
+                )
+
+
+def _duration(path: Path, value: Any) -> float:
+    low, high = DURATION_RANGE
+    if not (_is_number(value) and low <= value <= high):
+        raise GaitError(f"{path}: duration is a number of seconds from {low} to {high}, not {value!r}")
+    cycles = value / PERIOD
+    if abs(cycles - round(cycles)) > 1e-6:
+        raise GaitError(f"{path}: duration is a whole number of milliseconds, not {value!r} s")
+    return float(value)
+
+
+def _control_points(path: Path, key: str, table: Any) -> Vector:
+    if not isinstance(table, dict):
+        raise GaitError(f"{path}: {key} is an object with one list for each of {', '.join(JOINTS)}")
+    if unknown := sorted(set(table) - set(JOINTS)):
+        raise GaitError(f"{path}: {key}.{unknown[0]} is unknown; valid joints are {', '.join(JOINTS)}")
+    for joint in JOINTS:
+        points = table.get(joint)
+        if not isinstance(points, list) or len(points) != DEGREE + 1 or not all(_is_number(p) for p in points):
+            raise GaitError(f"{path}: {key}.{joint} is a list of {DEGREE + 1} finite numbers, not {points!r}")
+    return _read_only(np.array([table[joint] for joint in JOINTS], dtype=np.float64))
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)
+
+
+def _refuse_constant(text: str) -> float:
+    raise ValueError(f"{text} is not allowed; every number in a gait file is finite")
+
+
+def _mirror(rows: Vector) -> Vector:
+    return _read_only(rows[SWAP] * SIGN[:, None])
+
+
+def _read_only(array: Vector) -> Vector:
+    array.setflags(write=False)
+    return array

@@ -1,0 +1,442 @@
+r"""Virtual guide filter of the swing leg's SH and SK, with the exact flow of the backup policy.
+
+`e, e' of both joints -> safe backward image h -> lambda -> u_v`. Each cycle asks where the backup policy would lead the
+two joints over the rest of the step under the worst disturbances, and lets it act the more, the closer that comes to
+the guide. The flow is linear (see `backup`), so the answer is one matrix product over the horizon for both joints and
+both extremes, not an integration; where the backup policy would saturate the drive, the rollout is stepped instead.
+
+The horizon is a grid of `points` intervals ending at T, the same points all step long, plus `overlap` beyond T: there
+the joint goes on along the next step's nominal and the guide keeps its last width. Without it the last cycles of a
+step look no further than the step's end, and admit any speed there (see `certificate`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_control.backup import BackupPolicy, forced_response, free_drift
+from atalante_control.deadbeat import Deadbeat
+from atalante_control.gait import PERIOD
+from atalante_control.guide_shapes import GuideShape
+
+Vector = npt.NDArray[np.float64]
+
+#: Rows of the product. Rollouts: e of SH under the upper extreme, -e under the lower one, SK likewise, over the bound;
+#: then the torque Kp e + Kd e' (against the side) along the same rollouts, over the limit.
+_ROWS = 8
+#: Columns of its left factor: Phi11 and Phi12 of SH, of SK, and what the disturbance adds to each rollout.
+_TERMS = 8
+_HOPELESS = 2.0  # |e| / q_bound from which a stepped rollout is left: lambda is 1 from 1 on
+
+
+@dataclass(frozen=True)
+class GuideConfig:
+    """What the guide filter needs to know of the two assisted joints, SH then SK.
+
+    Raises:
+        ValueError: a disturbance interval that does not contain zero, or a number out of range.
+    """
+
+    policies: tuple[BackupPolicy, BackupPolicy]
+    disturbance: tuple[tuple[float, float], tuple[float, float]]  # Nm, (u_ext_min, u_ext_max) of each joint
+    points: int = 100  # grid intervals over a step
+    overlap: float = 0.1  # s, horizon beyond the step's end
+    zeta: float = 0.03  # s, gain of the derivative term lambda_d
+    derivative_time: float = 0.005  # s, time constant of the low pass on dh/dt
+
+    def __post_init__(self) -> None:
+        for low, high in self.disturbance:
+            if not (math.isfinite(low) and math.isfinite(high) and low <= 0.0 <= high):
+                raise ValueError(f"a disturbance bound is (min <= 0, max >= 0) in Nm, not {(low, high)!r}")
+        if self.points < 2:
+            raise ValueError(f"points is at least 2, not {self.points!r}")
+        for name in ("overlap", "zeta", "derivative_time"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
+                raise ValueError(f"{name} is not negative and finite, in s, not {getattr(self, name)!r}")
+
+
+def gate(h: float, xi: float) -> float:
+    """lambda of the paper, (1 + (Xi^10 - 1) h)^3, clamped to [0, 1]; 1 outside the safe backward image."""
+    if h <= 0.0:
+        return 1.0
+    base = 1.0 + (xi**10 - 1.0) * h
+    return base * base * base if base > 0.0 else 0.0
+
+
+def damped_gate(gate: float, rate: float, zeta: float) -> float:
+    """lambda + (1 - lambda) lambda_d with lambda_d = zeta max(0, -dh/dt) clamped to 1; in [0, 1] for lambda in it.
+
+    Args:
+        rate: dh/dt [1/s].
+        zeta: derivative gain [s].
+    """
+    damping = -zeta * rate
+    if damping <= 0.0:
+        return gate
+    return gate + (1.0 - gate) * damping if damping < 1.0 else 1.0
+
+
+class GuideFilter:
+    """The filter on both joints, for one gait and one shape; the same for either swing leg, by symmetry.
+
+    Call `start_step` at each step change, then `tick` once a cycle.
+
+    Attributes:
+        h: safe backward image function at the last tick, SH and SK; at least 0 inside it.
+        gates: lambda + (1 - lambda) lambda_d at the last tick.
+        bounds: guide at the last tick, upper and lower [rad].
+        cycles, stride, grid, horizon: cycles of a step, of a grid interval, of the grid points, of the horizon's end.
+        time: of every cycle to the horizon's end [s]; `forced`: responses of SH and SK on it that P is made of.
+        stepped: rollouts so far that were not linear, because the backup policy saturates along them.
+    """
+
+    def __init__(
+        self,
+        config: GuideConfig,
+        shape: GuideShape,
+        deadbeat: Deadbeat,
+        nominal: Vector,
+        following: Vector,
+        feedforward: Vector | None = None,
+    ) -> None:
+        """Prepare every table of a step.
+
+        Args:
+            nominal: Bezier control points of the swing leg's SH and SK, shape (2, 8) [rad].
+            following: of the same joints in the step after, when the leg stands, shape (2, 8) [rad].
+            feedforward: of u_f where it is applied, shape (2, 8) [Nm].
+        """
+        self.config, self.shape, self.deadbeat = config, shape, deadbeat
+        self.cycles = round(deadbeat.duration / PERIOD)
+        self.stride = max(1, -(-self.cycles // config.points))
+        beyond = math.ceil(round(config.overlap / PERIOD) / self.stride) * self.stride
+        self.horizon = self.cycles + beyond
+        self.grid = np.arange(self.cycles % self.stride, self.horizon + 1, self.stride)
+        self.time: Vector = np.arange(self.horizon + 1, dtype=np.float64) * PERIOD
+
+        ufs = (None, None) if feedforward is None else (feedforward[0], feedforward[1])
+        parts = list(zip(config.policies, nominal, following, ufs, strict=True))
+        self.forced = [forced_response(p, deadbeat, q, after, self.time, uf) for p, q, after, uf in parts]
+        drifts = [free_drift(p, deadbeat, q, after, self.time, uf) for p, q, after, uf in parts]
+        # Tables of (e, e') of SH, then of SK: nominal, per deviation, per rate; P is their sum for the step.
+        self._p_parts = tuple(np.hstack(columns) for columns in zip(*self.forced, strict=True))
+        self._drift_parts = tuple(np.hstack(columns) for columns in zip(*drifts, strict=True))
+        self._p, self._drift, self._scratch = (np.empty((self.horizon + 1, 4)) for _ in range(3))
+        self._deviation, self._rate, self._drift_known = np.zeros(4), np.zeros(4), False
+
+        lags = len(self.grid)
+        self._flow = _rollout_table(config, self.stride, lags)
+        # For every first grid point, the rest of the grid as one contiguous block: numpy is twice as fast on it.
+        self._blocks = np.concatenate(
+            [np.arange(_ROWS * lags).reshape(_ROWS, lags)[:, i:].ravel() for i in range(lags)]
+        )
+        self._packed_p, self._packed_scale = np.empty(len(self._blocks)), np.empty(len(self._blocks))
+        self._bounds = np.empty((self.horizon + 1, 2))
+        self._rows_p, self._rows_scale = np.empty((_ROWS, lags)), np.empty((_ROWS, lags))
+        limits = [policy.torque_limit for policy in config.policies]
+        self._rows_scale[4:] = np.repeat(1.0 / np.array(limits), 2)[:, None]
+        self._out = np.empty(_ROWS * lags)
+        self._views = [self._view(cycle) for cycle in range(self.horizon + 1)]
+        # Kp e + Kd e' along a rollout, in terms of Phi11 and Phi12: e' of the state y is e of the state A y.
+        self._torque_of = [
+            (p.kp, p.kd, p.kp - p.kd * p.kd / p.inertia, -p.kd * p.kp / p.inertia) for p in config.policies
+        ]
+        self._z = np.zeros((_ROWS, _TERMS))
+        self._z[range(4), range(4, 8)] = 1.0
+        for joint, policy in enumerate(config.policies):
+            self._z[4 + 2 * joint, 4 + 2 * joint] = self._z[5 + 2 * joint, 5 + 2 * joint] = policy.kp
+        self._push = [
+            (policy.kd * high / policy.inertia, -policy.kd * low / policy.inertia)
+            for policy, (low, high) in zip(config.policies, config.disturbance, strict=True)
+        ]
+        self._cells = memoryview(self._z.data).cast("B").cast("d")
+        one = np.array([PERIOD])
+        self._cycle_flow = [
+            (*p.transition(one)[0].ravel().tolist(), *p.step_response(one)[0].tolist()) for p in config.policies
+        ]
+        self._allowance = [
+            _allowance(p, d, self.time) for p, d in zip(config.policies, config.disturbance, strict=True)
+        ]
+        self._monotone = all(p.monotone for p in config.policies)
+
+        self._smoothing = PERIOD / (config.derivative_time + PERIOD)
+        self._xi, self._fresh, self._dh, self._ratio = math.nan, True, [0.0, 0.0], [0.0, 0.0]
+        self.h, self.gates, self.bounds, self.stepped = [1.0, 1.0], [0.0, 0.0], [0.0, 0.0], 0
+        self.start_step(0.0, (0.0, 0.0), (0.0, 0.0))
+
+    def start_step(self, xi: float, deviation: tuple[float, float], rate: tuple[float, float]) -> None:
+        """Take the step change: width from Xi, P from what the deadbeat has to undo.
+
+        Args:
+            xi: assistance factor of the whole step.
+            deviation: s(0) of SH and SK [rad].
+            rate: s'(0) of SH and SK [rad/s].
+        """
+        if xi != self._xi:
+            self._bounds[:] = self.shape.bounds(self.time / self.deadbeat.duration, xi)
+            self._rows_scale[:4] = np.tile(1.0 / self._bounds[self.grid].T, (2, 1))
+            self._rows_scale.take(self._blocks, out=self._packed_scale, mode="clip")
+            self._xi = xi
+        self._deviation[:] = deviation[0], deviation[0], deviation[1], deviation[1]
+        self._rate[:] = rate[0], rate[0], rate[1], rate[1]
+        self._sum(self._p_parts, self._p)
+        self._drift_known = False
+        p, rows = self._p[self.grid].T, self._rows_p
+        for joint, policy in enumerate(self.config.policies):
+            e, ed = p[2 * joint], p[2 * joint + 1]
+            rows[2 * joint], rows[4 + 2 * joint] = e, policy.kp * e + policy.kd * ed
+        np.negative(rows[::2], out=rows[1::2])
+        rows.take(self._blocks, out=self._packed_p, mode="clip")
+        self._fresh = True
+
+    def tick(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> tuple[float, float]:
+        """u_v of SH and SK [Nm].
+
+        Args:
+            cycle: since the step change; past the step's end it stays there.
+            e_hip, e_knee: q - q_des [rad].
+            ed_hip, ed_knee: q' - q_des' [rad/s].
+        """
+        if cycle > self.cycles:
+            cycle = self.cycles
+        self._predict(cycle, e_hip, ed_hip, e_knee, ed_knee)
+        fresh, self._fresh = self._fresh, False
+        return self._act(0, e_hip, ed_hip, fresh), self._act(1, e_knee, ed_knee, fresh)
+
+    def rollouts(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Vector:
+        """Errors the unsaturated backup policy leads to at the rest of the grid, from the exact flow.
+
+        Returns:
+            Shape (4, n) [rad]: of SH the largest e and the largest -e under the disturbance bounds, then of SK.
+        """
+        flow, p, _, _, _ = self._views[cycle]
+        self._load(cycle, e_hip, ed_hip, e_knee, ed_knee)
+        return np.asarray((self._z @ flow + p)[:4])
+
+    def solution(self) -> Vector:
+        """P of this step on the cycle grid, (e, e') of SH then of SK. Shape (horizon + 1, 4) [rad, rad/s]."""
+        return self._p.copy()
+
+    def _act(self, joint: int, e: float, ed: float, fresh: bool) -> float:
+        policy, bounds, config = self.config.policies[joint], self.bounds, self.config
+        ratio = max(self._ratio[joint], e / bounds[0], -e / bounds[1])
+        h = 1.0 - ratio * ratio
+        rate = 0.0
+        if not fresh:
+            rate = self._dh[joint]
+            rate += self._smoothing * ((h - self.h[joint]) / PERIOD - rate)
+        self._dh[joint], self.h[joint] = rate, h
+        self.gates[joint] = weight = damped_gate(gate(h, self._xi), rate, config.zeta)
+        u, limit = -policy.kp * e - policy.kd * ed, policy.torque_limit
+        return weight * (limit if u > limit else -limit if u < -limit else u)
+
+    def _load(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> None:
+        """x - P(t) into the product's left factor: both joints, both signs, error rows and torque rows."""
+        p0, p1, p2, p3 = self._p[cycle].tolist()
+        cells, (hip, knee), (hip_push, knee_push) = self._cells, self._torque_of, self._push
+        y, yd = e_hip - p0, ed_hip - p1
+        cells[0], cells[1], cells[8], cells[9] = y, yd, -y, -yd
+        t, td = hip[0] * y + hip[1] * yd, hip[2] * yd + hip[3] * y
+        cells[32], cells[33], cells[40], cells[41] = t, td + hip_push[0], -t, hip_push[1] - td
+        y, yd = e_knee - p2, ed_knee - p3
+        cells[18], cells[19], cells[26], cells[27] = y, yd, -y, -yd
+        t, td = knee[0] * y + knee[1] * yd, knee[2] * yd + knee[3] * y
+        cells[50], cells[51], cells[58], cells[59] = t, td + knee_push[0], -t, knee_push[1] - td
+
+    def _predict(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> None:
+        """Largest ratio to the bound ahead, of each joint, into `_ratio`."""
+        flow, p, scale, out, bounds = self._views[cycle]
+        self._load(cycle, e_hip, ed_hip, e_knee, ed_knee)
+        np.dot(self._z, flow, out=out)
+        np.add(out, p, out=out)
+        np.multiply(out, scale, out=out)
+        # argmax and eight reads cost half of a maximum along the rows.
+        i0, i1, i2, i3, i4, i5, i6, i7 = out.argmax(1).tolist()
+        a, b, c, d = float(out[0, i0]), float(out[1, i1]), float(out[2, i2]), float(out[3, i3])
+        self._ratio[0], self._ratio[1] = a if a > b else b, c if c > d else d
+        self.bounds = bounds.tolist()
+        hip, knee = self.config.policies
+        if not self._monotone:
+            np.abs(out[4:], out=out[4:])
+            i4, i5, i6, i7 = out[4:].argmax(1).tolist()
+        hip_torques, knee_torques = (float(out[4, i4]), float(out[5, i5])), (float(out[6, i6]), float(out[7, i7]))
+        now = (hip.kp * e_hip + hip.kd * ed_hip) / hip.torque_limit
+        if hip_torques[0] > 1.0 or hip_torques[1] > 1.0 or now > 1.0 or now < -1.0:
+            self._ratio[0] = self._limited(0, cycle, e_hip, ed_hip, now, (a, b), hip_torques)
+        now = (knee.kp * e_knee + knee.kd * ed_knee) / knee.torque_limit
+        if knee_torques[0] > 1.0 or knee_torques[1] > 1.0 or now > 1.0 or now < -1.0:
+            self._ratio[1] = self._limited(1, cycle, e_knee, ed_knee, now, (c, d), knee_torques)
+
+    def _limited(
+        self,
+        joint: int,
+        cycle: int,
+        e: float,
+        ed: float,
+        now: float,
+        ratios: tuple[float, float],
+        torques: tuple[float, float],
+    ) -> float:
+        """Largest ratio where a rollout saturates.
+
+        Only the rollouts along which the drive saturates against the side they are to be held from are stepped: one of
+        a monotone loop that saturates the other way stays below the linear rollout, which is kept as its bound.
+        """
+        worst = 0.0
+        for side in (0, 1):
+            against = abs(now) if not self._monotone else -now if side else now
+            if against > 1.0 or torques[side] > 1.0:
+                worst = max(worst, self._stepped(joint, side, cycle, e, ed))
+            else:
+                worst = max(worst, ratios[side])
+        return worst
+
+    def _stepped(self, joint: int, side: int, cycle: int, e: float, ed: float) -> float:
+        """Largest |e| / q_bound ahead on one side, with the drive's limit.
+
+        Saturated, the torque is constant and the error a known drift plus a parabola: the cycle it comes off the limit
+        is found, and its largest error until then. From there on the flow is linear again. A rollout that saturates a
+        second time, or for long, goes on cycle by cycle.
+        """
+        if not self._drift_known:
+            self._sum(self._drift_parts, self._drift)
+            self._drift_known = True
+        self.stepped += 1
+        policy, columns = self.config.policies[joint], slice(2 * joint, 2 * joint + 2)
+        kp, kd, limit = policy.kp, policy.kd, policy.torque_limit
+        phi00, phi01, phi10, phi11, s0, s1 = self._cycle_flow[joint]
+        external, allowance = self.config.disturbance[joint][1 - side], self._allowance[joint][side]
+        sign, start, worst, linear = (-1.0 if side else 1.0), cycle, 0.0, False
+        while cycle < self.horizon and worst < _HOPELESS:
+            u = -kp * e - kd * ed
+            if -limit <= u <= limit:
+                if not linear:
+                    ratio, torque = self._finish(joint, side, cycle, e, ed)
+                    if torque <= 1.0:
+                        return max(worst, ratio)
+                linear = True
+                (p0, p1), (n0, n1) = self._p[cycle : cycle + 2, columns].tolist()
+                e, ed = e - p0, ed - p1
+                e, ed = n0 + phi00 * e + phi01 * ed + s0 * external, n1 + phi10 * e + phi11 * ed + s1 * external
+                cycle += 1
+            else:
+                linear = False
+                e, ed, cycle, peak = self._off_limit(joint, cycle, e, ed, math.copysign(limit, u) + external, sign)
+                worst = max(worst, peak)
+            worst = max(worst, (sign * e + allowance[cycle - start]) / float(self._bounds[cycle, side]))
+        return worst
+
+    def _off_limit(
+        self, joint: int, cycle: int, e: float, ed: float, force: float, sign: float
+    ) -> tuple[float, float, int, float]:
+        """The cycle at which a saturated rollout comes off the limit, by false position on the excess torque.
+
+        Args:
+            force: torque until then, limit and disturbance together [Nm].
+            sign: +1 towards the upper bound, -1 towards the lower one.
+
+        Returns:
+            e, e', cycle there, and the largest ratio where the error turns in between (0: it does not).
+        """
+        policy, column = self.config.policies[joint], 2 * joint
+        kp, kd, limit, a = policy.kp, policy.kd, policy.torque_limit, force / policy.inertia
+        drift, (z, zd) = self._drift, self._drift[cycle, column : column + 2].tolist()
+        e0, ed0 = e - z, ed - zd
+        way = 1.0 if kp * e + kd * ed > 0.0 else -1.0
+
+        def state(n: int) -> tuple[float, float, float]:
+            t = n * PERIOD
+            zn, znd = drift[cycle + n, column : column + 2].tolist()
+            then, rate = e0 + ed0 * t + 0.5 * a * t * t + zn, ed0 + a * t + znd
+            return then, rate, way * (kp * then + kd * rate) - limit
+
+        # g > 0 at `inner`, still saturated; g <= 0 at `outer`, off the limit.
+        inner, g, last = 0, way * (kp * e + kd * ed) - limit, self.horizon - cycle
+        outer, g_outer, found = 0, 0.0, (e, ed)
+        slope = -way * (kp * ed + kd * (a + (drift[cycle + 1, column + 1] - zd) / PERIOD)) * PERIOD
+        reach = 4 * self.stride
+        for trial in range(12):
+            if outer:
+                # False position, and halving now and then: g bends where the error turns.
+                part = g / (g - g_outer) if trial % 3 else 0.5
+                n = inner + min(max(1, round((outer - inner) * part)), outer - inner - 1)
+            else:
+                n = min(last, inner + (math.ceil(g / slope) if slope * reach > g else reach))
+            then, rate, more = state(n)
+            if more <= 0.0:
+                outer, g_outer, found = n, more, (then, rate)
+            else:
+                slope, inner, g = (g - more) / (n - inner), n, more
+                if not outer:
+                    found = then, rate
+            if inner == last or outer - inner == 1:
+                break
+        end = outer or inner
+
+        peak, curvature = 0.0, a + (drift[cycle + end, column + 1] - zd) / (end * PERIOD)
+        if sign * ed > 0.0 > sign * found[1]:
+            turn = min(end, round(-ed / curvature / PERIOD))
+            peak = sign * state(turn)[0] / float(self._bounds[cycle + turn, 0 if sign > 0.0 else 1])
+        return found[0], found[1], cycle + end, peak
+
+    def _finish(self, joint: int, side: int, cycle: int, e: float, ed: float) -> tuple[float, float]:
+        """Largest ratio and largest torque over the limit of one linear rollout from `cycle` on."""
+        flow, p, scale, out, _ = self._views[cycle]
+        if joint:
+            self._load(cycle, 0.0, 0.0, e, ed)
+        else:
+            self._load(cycle, e, ed, 0.0, 0.0)
+        np.dot(self._z, flow, out=out)
+        np.add(out, p, out=out)
+        np.multiply(out, scale, out=out)
+        row, best = 2 * joint + side, out.argmax(1)
+        return float(out[row, best[row]]), float(out[row + 4, best[row + 4]])
+
+    def _sum(self, parts: tuple[Vector, ...], out: Vector) -> None:
+        np.multiply(parts[1], self._deviation, out=out)
+        np.multiply(parts[2], self._rate, out=self._scratch)
+        np.add(out, self._scratch, out=out)
+        np.add(out, parts[0], out=out)
+
+    def _block(self, first: int) -> int:
+        """Where the packed block of the grid points from `first` on begins."""
+        return _ROWS * (first * len(self.grid) - first * (first - 1) // 2)
+
+    def _view(self, cycle: int) -> tuple[Vector, ...]:
+        first = int(np.searchsorted(self.grid, cycle))
+        lag, n = int(self.grid[first]) - cycle, len(self.grid) - first
+        block = slice(self._block(first), self._block(first + 1))
+        return (
+            self._flow[lag, :n].T,
+            self._packed_p[block].reshape(_ROWS, n),
+            self._packed_scale[block].reshape(_ROWS, n),
+            self._out[: _ROWS * n].reshape(_ROWS, n),
+            self._bounds[cycle],
+        )
+
+
+def _rollout_table(config: GuideConfig, stride: int, lags: int) -> Vector:
+    """Right factor of the product, for each offset of the cycle before a grid point. Shape (stride, lags, 8).
+
+    Terms: Phi11 and Phi12 of SH, of SK, then what the disturbance adds in each of the four rollouts [rad].
+    """
+    flow = np.empty((stride, lags, _TERMS))
+    for joint, (policy, (low, high)) in enumerate(zip(config.policies, config.disturbance, strict=True)):
+        for offset in range(stride):
+            tau = (offset + stride * np.arange(lags, dtype=np.float64)) * PERIOD
+            largest, smallest = policy.disturbance(tau, low, high)
+            flow[offset, :, 2 * joint : 2 * joint + 2] = policy.transition(tau)[:, 0]
+            flow[offset, :, 4 + 2 * joint : 6 + 2 * joint] = np.stack([largest, -smallest], axis=1)
+    return flow
+
+
+def _allowance(policy: BackupPolicy, disturbance: tuple[float, float], time: Vector) -> tuple[list[float], list[float]]:
+    """What the worst disturbance adds to a constant extreme, upper and lower [rad]: zero for a monotone loop."""
+    largest, smallest = policy.disturbance(time, *disturbance)
+    step = policy.step_response(time)[:, 0]
+    low, high = disturbance
+    return (largest - high * step).tolist(), (low * step - smallest).tolist()

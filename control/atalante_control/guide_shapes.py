@@ -1,0 +1,111 @@
+"""Shapes of the virtual guide: how wide the tube is along a step, above and below the desired trajectory.
+
+`shape, assistance factor -> bounds over the phase -> guide filter, certificate, plots`. The shape is free in the paper;
+its full half-width is the paper's 0.5 + 7 (1 - Xi) degrees.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Vector = npt.NDArray[np.float64]
+
+PINCH_WIDTH = math.radians(1.0)  # rad, what the pinched guide closes to
+SNAP_WIDTH = math.radians(0.1)  # rad, what the snapping guide closes to
+
+
+def half_width(xi: float) -> float:
+    """Full half-width of the guide [rad] for an assistance factor: 0.5 + 7 (1 - Xi) degrees.
+
+    Raises:
+        ValueError: Xi outside [0, 1].
+    """
+    if not 0.0 <= xi <= 1.0:
+        raise ValueError(f"the assistance factor is between 0 and 1, not {xi!r}")
+    return math.radians(0.5 + 7.0 * (1.0 - xi))
+
+
+@dataclass(frozen=True)
+class GuideShape:
+    """A named shape. `fractions(phase, half_width)` gives the parts of the half-width, upper and lower, each (n,)."""
+
+    name: str
+    summary: str
+    fractions: Callable[[Vector, float], tuple[Vector, Vector]]
+
+    def bounds(self, phase: Vector, xi: float) -> Vector:
+        """Distances from the desired trajectory to the guide.
+
+        Args:
+            phase: (t - t_i) / T, shape (n,); what is past 1 gets the width at 1.
+            xi: assistance factor in [0, 1].
+
+        Returns:
+            Shape (n, 2) [rad], upper and lower, both positive.
+        """
+        width = half_width(xi)
+        upper, lower = self.fractions(np.clip(phase, 0.0, 1.0), width)
+        return width * np.stack([upper, lower], axis=1)
+
+
+def _constant(phase: Vector, width: float) -> tuple[Vector, Vector]:
+    return np.ones_like(phase), np.ones_like(phase)
+
+
+def _widening(phase: Vector, width: float) -> tuple[Vector, Vector]:
+    fraction = 0.5 + 0.5 * _rise(phase, 0.1, 0.9)
+    return fraction, fraction
+
+
+def _narrowing(phase: Vector, width: float) -> tuple[Vector, Vector]:
+    fraction = 1.0 - 0.5 * _rise(phase, 0.1, 0.9)
+    return fraction, fraction
+
+
+def _pinched(phase: Vector, width: float) -> tuple[Vector, Vector]:
+    closed = min(1.0, PINCH_WIDTH / width)
+    fraction = 1.0 - (1.0 - closed) * _rise(phase, 0.4, 0.8)
+    return fraction, fraction
+
+
+def _asymmetric(phase: Vector, width: float) -> tuple[Vector, Vector]:
+    return np.ones_like(phase), 0.6 * np.ones_like(phase)
+
+
+def _snap(phase: Vector, width: float) -> tuple[Vector, Vector]:
+    closed = min(1.0, SNAP_WIDTH / width)
+    fraction = 1.0 - (1.0 - closed) * (_rise(phase, 0.35, 0.37) - _rise(phase, 0.7, 0.72))
+    return fraction, fraction
+
+
+def _rise(phase: Vector, start: float, end: float) -> Vector:
+    """From 0 at `start` to 1 at `end`, half a cosine."""
+    x = np.clip((phase - start) / (end - start), 0.0, 1.0)
+    return np.asarray(0.5 - 0.5 * np.cos(math.pi * x))
+
+
+CONSTANT = GuideShape("constant", "the same width all along the step", _constant)
+WIDENING = GuideShape("widening", "half width at the start, full at the end", _widening)
+NARROWING = GuideShape("narrowing", "full width at the start, half at the end", _narrowing)
+PINCHED = GuideShape("pinched", "full width until 0.4 T, closing to 1 degree by 0.8 T", _pinched)
+ASYMMETRIC = GuideShape("asymmetric", "full width above, 0.6 of it below", _asymmetric)
+SNAP = GuideShape("snap", "closes to 0.1 degrees in 0.02 T: what no backup policy follows", _snap)
+
+#: The shapes that ship, by name. `snap` cannot be certified; it shows how that is announced.
+SHAPES = {shape.name: shape for shape in (CONSTANT, WIDENING, NARROWING, PINCHED, ASYMMETRIC, SNAP)}
+
+
+def shape_named(name: str) -> GuideShape:
+    """The shape of that name.
+
+    Raises:
+        ValueError: there is none; the message lists the names.
+    """
+    if name not in SHAPES:
+        raise ValueError(f"guide shape {name!r} is unknown; the shapes are {', '.join(SHAPES)}")
+    return SHAPES[name]

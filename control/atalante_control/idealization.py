@@ -1,0 +1,157 @@
+"""Joint idealization: what makes an assisted joint feel like a free inertia. `q, q', pelvis attitude -> u_i, u_g`.
+
+The paper's u_i = k_d sign(q') + k_v q' + u_g, with three things it leaves open settled here:
+
+- It prints sign(q) and k_v q; friction opposes the velocity, and that is what is meant.
+- sign is smoothed to tanh(q' / v_s): at rest the measured velocity changes sign with its noise, and a torque of
+  +-k_d each cycle would shake the joint.
+- The guide takes the two joints for separate inertias J, J q'' = u_v. They are not: hip and knee share the shank (3.6
+  kg m2 off the diagonal against 1.9 on it), so a torque on one throws the other, and a moving knee pulls at the hip.
+  `AssistedInertia` turns the torques meant for the separate inertias into those that give the coupled pair the same
+  accelerations, and gives the pair's velocity torques (centrifugal, Coriolis), which belong to u_i as gravity does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pinocchio
+
+from atalante_control.model import ArticulatedModel
+from atalante_hal.robot import JOINTS, LEG_JOINTS
+
+Vector = npt.NDArray[np.float64]
+Pair = tuple[float, float]
+
+_GRAVITY = 9.81  # m/s2
+
+
+@dataclass(frozen=True)
+class Friction:
+    """Joint friction as identified on the robot, each leg joint FH to HA.
+
+    Raises:
+        ValueError: not six values, a negative one, or a smoothing speed that is not positive.
+    """
+
+    coulomb: tuple[float, ...] = (4.0, 3.0, 5.0, 5.0, 2.0, 1.0)  # Nm, k_d
+    viscous: tuple[float, ...] = (6.0, 4.0, 6.0, 4.0, 1.0, 0.5)  # Nm s/rad, k_v
+    smoothing: float = 0.05  # rad/s, v_s
+
+    def __post_init__(self) -> None:
+        for name in ("coulomb", "viscous"):
+            values = getattr(self, name)
+            if len(values) != len(LEG_JOINTS) or not all(math.isfinite(v) and v >= 0.0 for v in values):
+                raise ValueError(f"{name} is {len(LEG_JOINTS)} finite numbers, none negative, not {values!r}")
+        if not (math.isfinite(self.smoothing) and self.smoothing > 0.0):
+            raise ValueError(f"smoothing is a positive speed in rad/s, not {self.smoothing!r}")
+
+    def torque(self, joint: int, velocity: float) -> float:
+        """Compensation k_d tanh(q' / v_s) + k_v q' [Nm] of one of `LEG_JOINTS` by index."""
+        return self.coulomb[joint] * math.tanh(velocity / self.smoothing) + self.viscous[joint] * velocity
+
+
+class Gravity:
+    """u_g: generalized gravity of the empty exoskeleton, by Pinocchio, hanging from a pelvis of known attitude."""
+
+    def __init__(self, articulated: ArticulatedModel) -> None:
+        """Take a model with the pelvis fixed; it is copied."""
+        self._model = pinocchio.Model(articulated.model)
+        self._data = self._model.createData()
+        self._into, self._out_of = articulated.q, articulated.v
+        self._ordered = np.array_equal(articulated.q, np.arange(len(JOINTS))) and np.array_equal(
+            articulated.v, np.arange(len(JOINTS))
+        )
+        self._q = pinocchio.neutral(self._model)
+        self._down = np.zeros(3)
+
+    def torque(self, position: Vector, pelvis: Sequence[float]) -> Vector:
+        """Torques that hold the exoskeleton still.
+
+        Args:
+            position: shape (12,) [rad].
+            pelvis: attitude of the pelvis IMU, unit quaternion wxyz, pelvis to world.
+
+        Returns:
+            Shape (12,) [Nm], overwritten by the next call.
+        """
+        w, x, y, z = pelvis
+        down = self._down
+        down[0] = -_GRAVITY * 2.0 * (x * z - w * y)
+        down[1] = -_GRAVITY * 2.0 * (y * z + w * x)
+        down[2] = -_GRAVITY * (1.0 - 2.0 * (x * x + y * y))
+        self._model.gravity.linear = down
+        if self._ordered:
+            return pinocchio.computeGeneralizedGravity(self._model, self._data, position)  # type: ignore[no-any-return]
+        self._q[self._into] = position
+        return np.asarray(pinocchio.computeGeneralizedGravity(self._model, self._data, self._q)[self._out_of])
+
+
+class AssistedInertia:
+    """Mass matrix of SH and SK of one leg, which depends on the knee alone, in closed form.
+
+    The block is M(q_SK) = A + B cos q_SK + C sin q_SK; A, B, C come from three evaluations of Pinocchio's CRBA with the
+    other joints at rest in the middle of their swing.
+
+    Attributes:
+        inertias: J of SH and SK [kg m2], the largest diagonal of M along the swing.
+    """
+
+    def __init__(self, articulated: ArticulatedModel, swing: Vector) -> None:
+        """Identify the block of the left leg; the right one is the same by symmetry.
+
+        Args:
+            swing: poses of a step the left leg swings in, shape (n, 12) [rad].
+        """
+        posture = swing.mean(axis=0)
+        model = articulated.model
+        data = model.createData()
+        hip, knee = JOINTS.index("left_SH"), JOINTS.index("left_SK")
+        rows = articulated.v[[hip, knee]]
+        angles = np.array([0.0, 0.8, 1.6])
+        entries = []
+        for angle in angles:
+            q = pinocchio.neutral(model)
+            pose = posture.copy()
+            pose[knee] = angle
+            q[articulated.q] = pose
+            upper = np.triu(pinocchio.crba(model, data, q))
+            mass = upper + np.triu(upper, 1).T
+            entries.append(mass[np.ix_(rows, rows)][[0, 0, 1], [0, 1, 1]])
+        basis = np.stack([np.ones(3), np.cos(angles), np.sin(angles)], axis=1)
+        self._fit: list[list[float]] = np.linalg.solve(basis, np.array(entries)).T.tolist()
+        blocks = np.array([self.block(float(angle)) for angle in swing[:, knee]])
+        self.inertias: Pair = (float(blocks[:, 0].max()), float(blocks[:, 2].max()))
+
+    def block(self, knee: float) -> tuple[float, float, float]:
+        """M11, M12, M22 [kg m2] at a knee angle [rad]; 1 is SH, 2 is SK."""
+        c, s = math.cos(knee), math.sin(knee)
+        (a11, b11, c11), (a12, b12, c12), (a22, b22, c22) = self._fit
+        return a11 + b11 * c + c11 * s, a12 + b12 * c + c12 * s, a22 + b22 * c + c22 * s
+
+    def torques(self, knee: float, hip_rate: float, knee_rate: float, u: Pair) -> Pair:
+        """Torques of SH and SK [Nm] under which each moves as J q'' = u, while the leg's other joints rest.
+
+        tau = M J^-1 u + c, with c the velocity torques of M(q_SK): c1 = M11' q1' q2' + M12' q2'^2, c2 = -M11' q1'^2 / 2.
+
+        Args:
+            knee: angle of SK [rad].
+            hip_rate, knee_rate: [rad/s].
+            u: torques meant for the separate inertias `inertias` [Nm].
+        """
+        c, s = math.cos(knee), math.sin(knee)
+        (a11, b11, c11), (a12, b12, c12), (a22, b22, c22) = self._fit
+        m12, m11_slope, m12_slope = a12 + b12 * c + c12 * s, c11 * c - b11 * s, c12 * c - b12 * s
+        hip_acceleration, knee_acceleration = u[0] / self.inertias[0], u[1] / self.inertias[1]
+        return (
+            (a11 + b11 * c + c11 * s) * hip_acceleration
+            + m12 * knee_acceleration
+            + (m11_slope * hip_rate + m12_slope * knee_rate) * knee_rate,
+            m12 * hip_acceleration
+            + (a22 + b22 * c + c22 * s) * knee_acceleration
+            - 0.5 * m11_slope * hip_rate * hip_rate,
+        )

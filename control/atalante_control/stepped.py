@@ -1,0 +1,60 @@
+"""The virtual guide's rollouts integrated step by step: the witness and the baseline of the exact flow.
+
+Not in the control loop. It does what the guide filter does without its idea: for each cycle it marches all four
+rollouts (two joints, two extreme disturbances) over the same horizon grid, with as few numpy operations a step as such
+a march can have: each interval exactly discretised beforehand, the rollouts of all joints side by side.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_control.gait import PERIOD
+from atalante_control.guide import GuideFilter
+
+Vector = npt.NDArray[np.float64]
+
+
+class SteppedRollouts:
+    """Marches the rollouts of a guide filter; monotone, unsaturated backup policies."""
+
+    def __init__(self, guide: GuideFilter) -> None:
+        """Take over the guide's grid, gains and disturbance bounds."""
+        self._guide = guide
+        config = guide.config
+        lengths = np.arange(guide.stride + 1, dtype=np.float64) * PERIOD
+        joints = [0, 0, 1, 1]
+        self._phi = np.stack([config.policies[j].transition(lengths) for j in joints], axis=3)
+        # The march is in e for every rollout; the lower extreme pushes down.
+        extremes = [config.disturbance[j][side] for j, side in zip(joints, (1, 0, 1, 0), strict=True)]
+        self._push = np.stack(
+            [config.policies[j].step_response(lengths) * u for j, u in zip(joints, extremes, strict=True)], axis=2
+        )
+        self._sign = np.array([1.0, -1.0, 1.0, -1.0])
+        self.start_step()
+
+    def start_step(self) -> None:
+        """Take over P after the guide's own `start_step`: what the forcing adds over each interval."""
+        guide = self._guide
+        self._p = guide.solution()[:, [[0, 0, 2, 2], [1, 1, 3, 3]]]
+        interval = self._p[guide.grid]
+        carried = np.einsum("abr,nbr->nar", self._phi[guide.stride], interval[:-1])
+        self._added = interval[1:] - carried + self._push[guide.stride]
+
+    def rollouts(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Vector:
+        """As `GuideFilter.rollouts`. Shape (4, n) [rad]."""
+        guide = self._guide
+        first = int(np.searchsorted(guide.grid, cycle))
+        lag = int(guide.grid[first]) - cycle
+        state = np.array([[e_hip, e_hip, e_knee, e_knee], [ed_hip, ed_hip, ed_knee, ed_knee]])
+        phi = self._phi[lag]
+        state = (phi * (state - self._p[cycle])).sum(axis=1) + self._p[guide.grid[first]] + self._push[lag]
+        e, ed = state
+        (phi00, phi01), (phi10, phi11) = self._phi[guide.stride]
+        errors = np.empty((len(guide.grid) - first, 4))
+        errors[0] = e
+        for i, (added, added_rate) in enumerate(self._added[first:], start=1):
+            e, ed = phi00 * e + phi01 * ed + added, phi10 * e + phi11 * ed + added_rate
+            errors[i] = e
+        return np.asarray((errors * self._sign).T)
