@@ -236,3 +236,7 @@ class TransmitImage:
         protected, data_id = self._protected[row]
         self._crcs[row] = crc(protected, data_id)
         return self._singles[row]
+
+    def resume(self, row: int, counter: int) -> None:
+        """Go on after the frame with this alive counter, which another sender of the row sent."""
+        self._counters[row] = counter

@@ -52,7 +52,7 @@ def command(target: Target, seed: int, operator: bool, xi: float | None) -> None
         from atalante_emulator.emulator import Emulator
         from atalante_emulator.pendant import Operator
 
-        bus = Tally(join(network, open_buses(network, target)))
+        bus = Line(join(network, open_buses(network, target)), network.message("PENDANT_STATE").frame_id)
         try:
             pendant = Operator(xi) if operator else None
             emulator = Emulator(network, robot, body, bus, seed=seed, operator=pendant)
@@ -74,11 +74,17 @@ def answer(emulator: Emulator, target: Target, is_over: Callable[[], bool]) -> N
         emulator.run(is_over)
 
 
-def over(stop: StopRequest, emulator: Emulator, bus: Tally) -> Callable[[], bool]:
+def over(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[[], bool]:
     """Whether to stop; prints the status line on the way."""
     progress = Progress(period=STATUS_PERIOD)
+    has_pendant = emulator.operator is not None
 
     def is_over() -> bool:
+        nonlocal has_pendant
+        if has_pendant and bus.pendant_given_away:
+            has_pendant = False
+            progress.clear()
+            say("another pendant speaks: the emulated operator has put his down")
         if stop.wanted:
             progress.clear()
         elif progress.due():
@@ -88,7 +94,7 @@ def over(stop: StopRequest, emulator: Emulator, bus: Tally) -> Callable[[], bool
     return is_over
 
 
-def status_line(emulator: Emulator, bus: Tally) -> str:
+def status_line(emulator: Emulator, bus: Line) -> str:
     """Cycles, frames and drive states."""
     states = Counter(state.name for state in emulator.drives.state)
     drives = ", ".join(f"{count} {name}" for name, count in states.items())
@@ -96,14 +102,20 @@ def status_line(emulator: Emulator, bus: Tally) -> str:
     return f"{emulator.cycle} cycles, {bus.received} frames in, {bus.sent} out{lost}; drives: {drives}"
 
 
-class Tally:
-    """A bus that counts what goes through it."""
+class Line:
+    """The emulated robot's bus: counts frames, and gives the pendant away.
 
-    def __init__(self, bus: Bus) -> None:
-        self._bus = bus
+    When somebody else speaks as the pendant, the emulated operator's own frames are kept back from then on, as a pendant
+    process falls silent for a newer one.
+    """
+
+    def __init__(self, bus: Bus, pendant_id: int) -> None:
+        self._bus, self._pendant_id = bus, pendant_id
+        self._without: dict[int, tuple[Frames, Frames]] = {}
         self.name = bus.name
         self.sent = 0
         self.received = 0
+        self.pendant_given_away = False
 
     @property
     def stamps(self) -> Stamps:
@@ -117,6 +129,8 @@ class Tally:
 
     def send(self, frames: Frames) -> None:
         """As `Bus.send`."""
+        if self.pendant_given_away:
+            frames = self._without_pendant(frames)
         self._bus.send(frames)
         self.sent += len(frames)
 
@@ -124,8 +138,19 @@ class Tally:
         """As `Bus.receive`."""
         count = self._bus.receive(frames, timeout)
         self.received += count
+        if not self.pendant_given_away and (frames["can_id"][:count] == self._pendant_id).any():
+            self.pendant_given_away = True
         return count
 
     def close(self) -> None:
         """As `Bus.close`."""
         self._bus.close()
+
+    def _without_pendant(self, frames: Frames) -> Frames:
+        """The batch less the pendant's frame, which is the last of a batch; a view, the same one every cycle."""
+        if not len(frames) or frames["can_id"][-1] != self._pendant_id:
+            return frames
+        known = self._without.get(id(frames))
+        if known is None:
+            known = self._without[id(frames)] = (frames, frames[:-1])
+        return known[1]

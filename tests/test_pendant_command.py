@@ -1,0 +1,451 @@
+"""`atalante pendant`: the node on the wire, taking over, what the operator is told, the commands."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from atalante_dbc import Network
+from atalante_emulator.body import PyBulletBody
+from atalante_emulator.emulator import Emulator
+from atalante_emulator.pendant import Operator
+from atalante_hal.bus import BusDown
+from atalante_hal.frame import Frames, new_frames
+from atalante_hal.hal import Hal
+from atalante_hal.robot import Robot
+from atalante_hal.types import Command, SupervisorState
+from atalante_tools import pendant, pendant_session
+from atalante_tools.cli import cli
+from atalante_tools.emulator import Line
+from atalante_tools.options import Target
+from atalante_tools.pendant_node import GRACE, PendantNode, Request
+from atalante_tools.pendant_session import Keyboard, Session
+from atalante_tools.signals import StopRequest
+
+OFF, READY, ACTIVE, HOLD = (SupervisorState[name] for name in ("OFF", "READY", "ACTIVE", "HOLD"))
+TARGET = Target("virtual", "test", lockstep=False)
+
+
+class Wire:
+    """A wire with any number of ends, in lock-step: what one end sends, all others receive."""
+
+    def __init__(self) -> None:
+        self.ends: list[WireEnd] = []
+
+    def end(self, empty: Callable[[], object] = lambda: None) -> WireEnd:
+        self.ends.append(WireEnd(self, empty))
+        return self.ends[-1]
+
+
+class WireEnd:
+    """One of them; `empty` is called when nothing has arrived and the owner asks."""
+
+    name = "wire"
+    dropped = 0
+    stamps = np.zeros(256, np.int64)
+
+    def __init__(self, wire: Wire, empty: Callable[[], object]) -> None:
+        self.wire, self.empty = wire, empty
+        self.queue: list[Any] = []
+        self.closed = False
+
+    def send(self, frames: Frames) -> None:
+        if self.closed:
+            raise BusDown("the wire is closed")
+        for end in self.wire.ends:
+            if end is not self and not end.closed:
+                end.queue += [frame.copy() for frame in frames]
+
+    def receive(self, frames: Frames, timeout: float = 0.0) -> int:
+        if not self.queue:
+            self.empty()
+        count = min(len(frames), len(self.queue))
+        for place in range(count):
+            frames[place] = self.queue[place]
+        del self.queue[:count]
+        return count
+
+    def close(self) -> None:
+        self.closed = True
+        self.queue.clear()
+
+
+class World:
+    """A HAL, an emulated robot without an operator, and ends for pendants that make time go on by listening."""
+
+    def __init__(self, network: Network, robot: Robot, body: PyBulletBody, operator: Operator | None = None) -> None:
+        self.network, self.wire = network, Wire()
+        self.now = 0.0
+        self.nodes: list[PendantNode] = []
+        line = Line(self.wire.end(), network.message("PENDANT_STATE").frame_id)
+        self.emulator = Emulator(network, robot, body, line, operator=operator)
+        self.hal = Hal(network, robot, self.wire.end(self.emulator.poll))
+        self.running = True
+        self.states: list[SupervisorState] = []
+        self.anchor = np.zeros(12)
+
+    def cycle(self) -> None:
+        """One millisecond."""
+        self.now += 1e-3
+        if self.running:
+            self._hal_cycle()
+        for node in self.nodes:
+            while node._bus.queue:  # type: ignore[attr-defined]
+                node.poll()
+
+    def _hal_cycle(self) -> None:
+        hal = self.hal
+        state = hal.read()
+        self.states.append(state.supervisor)
+        if state.supervisor is ACTIVE:
+            torque = hal.robot.hold_kp * (self.anchor - state.position) - hal.robot.hold_kd * state.velocity
+            hal.write(Command(torque, np.zeros(8)))
+        else:
+            self.anchor = state.position.copy()
+            hal.hold()
+
+    def run(self, cycles: int) -> SupervisorState:
+        for _ in range(cycles):
+            self.cycle()
+        return self.hal.state.supervisor
+
+    def node(self) -> PendantNode:
+        self.nodes.append(PendantNode(self.network, self.wire.end()))
+        return self.nodes[-1]
+
+    def speaking(self) -> PendantNode:
+        node = self.node()
+        node.dead_man = True
+        node.speak()
+        return node
+
+    def active(self) -> PendantNode:
+        node = self.speaking()
+        assert self.run(200) is READY
+        node.press(Request.START)
+        assert self.run(50) is ACTIVE
+        return node
+
+    def session(self, stop: StopRequest | None = None, keyboard: Keyboard | None = None) -> Session:
+        node = PendantNode(self.network, self.wire.end(self.cycle))
+        return Session(node, TARGET, stop or StopRequest(), keyboard or Keyboard(None), now=lambda: self.now)
+
+
+@pytest.fixture
+def make_world(network: Network, robot: Robot, urdf_text: str) -> Iterator[Callable[..., World]]:
+    bodies: list[PyBulletBody] = []
+
+    def make(operator: Operator | None = None) -> World:
+        bodies.append(PyBulletBody(urdf_text))
+        return World(network, robot, bodies[-1], operator)
+
+    yield make
+    for body in bodies:
+        body.close()
+
+
+@pytest.fixture
+def world(make_world: Callable[..., World]) -> World:
+    return make_world()
+
+
+# -- the node --------------------------------------------------------------------------------------------------------
+
+
+def test_it_answers_every_sync_with_a_protected_frame(world: World) -> None:
+    world.speaking()
+    ids = {m.name: m.frame_id for m in world.network.messages}
+    tap = world.wire.end()
+    world.run(300)
+    frames = np.array(tap.queue, dtype=new_frames(0).dtype)
+    state = frames[frames["can_id"] == ids["PENDANT_STATE"]]
+    assert len(state) == 300
+    assert state["data"][:, 2].tolist() == [i & 0xFF for i in range(300)]
+    assert (frames["can_id"] == ids["PENDANT_STATUS"]).sum() == 3
+    assert world.hal.crc_errors == 0
+
+
+def test_start_needs_a_press_and_the_dead_man(world: World) -> None:
+    node = world.speaking()
+    assert world.run(200) is READY
+    node.dead_man = False
+    node.press(Request.START)
+    assert world.run(250) is READY
+    node.dead_man = True
+    assert world.run(50) is READY
+    node.press(Request.START)
+    assert world.run(50) is ACTIVE
+    assert node.hal is ACTIVE
+
+
+@pytest.mark.parametrize("request_", [Request.STOP, Request.HOLD])
+def test_stop_and_hold_end_in_hold(world: World, request_: Request) -> None:
+    node = world.active()
+    node.press(request_)
+    assert world.run(3) is HOLD
+
+
+def test_a_pendant_that_falls_silent_is_a_stop(world: World) -> None:
+    world.active()
+    world.nodes.clear()
+    assert world.run(10) is HOLD
+
+
+def test_the_dial_sets_the_assistance_factor_and_otherwise_leaves_it(world: World) -> None:
+    node = world.active()
+    assert world.hal.state.assistance_factor == 1.0
+    node.assist(0.3)
+    world.run(3)
+    assert world.hal.state.assistance_factor == pytest.approx(0.3, abs=1e-4)
+
+
+def test_a_damaged_sync_is_not_answered(world: World, network: Network) -> None:
+    node = PendantNode(network, world.wire.end())
+    node.speak()
+    world.run(2)
+    ours = node._bus.queue  # type: ignore[attr-defined]
+    sync = next(f for f in ours if f["can_id"] == network.message("SYNC_RIGHT_SENSE").frame_id)
+    sync["data"][4] ^= 1
+    ours[:] = [sync]
+    assert not node.poll()
+    assert node.cycles == 0
+
+
+# -- taking over -----------------------------------------------------------------------------------------------------
+
+
+def test_a_new_pendant_takes_over_without_the_hal_noticing(world: World) -> None:
+    old = world.active()
+    old.assist(0.4)
+    world.run(100)
+    events = len(world.hal.events)
+    new = world.node()
+    world.run(50)
+    assert new.heard_another
+    assert new.dead_man
+    new.speak()
+    assert world.run(400) is ACTIVE
+    assert old.displaced
+    assert not new.refused
+    assert not new.displaced
+    assert new.spoken == 400
+    assert old.spoken + new.spoken - world.hal.state.cycle in (0, 1)
+    assert world.hal.state.assistance_factor == pytest.approx(0.4, abs=1e-4)
+    assert len(world.hal.events) == events
+    assert world.hal.crc_errors == 0
+
+
+def test_a_press_of_the_new_pendant_counts_once(world: World) -> None:
+    world.active()
+    new = world.node()
+    world.run(50)
+    new.press(Request.STOP)
+    new.speak()
+    assert world.run(20) is HOLD
+    new.press(Request.START)
+    assert world.run(30) is ACTIVE
+
+
+def test_a_pendant_that_does_not_give_way_keeps_the_pendant(world: World) -> None:
+    hardware = world.active()
+    hardware._hear_another = lambda check: None  # type: ignore[method-assign]
+    new = world.node()
+    world.run(50)
+    new.speak()
+    assert world.run(200) is ACTIVE
+    assert new.refused
+    assert new.spoken == GRACE
+    assert not hardware.displaced
+
+
+def test_the_emulated_operator_gives_his_pendant_away(make_world: Callable[..., World]) -> None:
+    world = make_world(Operator())
+    for _ in range(400):
+        world.run(1)
+    assert world.hal.state.supervisor is ACTIVE
+    new = world.node()
+    world.run(50)
+    new.press(Request.HOLD)
+    new.speak()
+    world.run(100)
+    assert world.emulator.bus.pendant_given_away  # type: ignore[attr-defined]
+    assert not new.refused
+    assert world.hal.state.supervisor is HOLD
+    new.press(Request.START)
+    assert world.run(50) is ACTIVE
+
+
+# -- the session -----------------------------------------------------------------------------------------------------
+
+
+def test_start_presses_once_the_hal_is_ready_and_says_so(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    operator = world.session()
+    operator.take()
+    operator.start_wanted = True
+    operator.stay(0.6)
+    said = capsys.readouterr().err
+    assert said.splitlines() == [
+        "pendant in hand",
+        "the HAL is OFF",
+        "the HAL is READY",
+        "START pressed",
+        "the HAL is ACTIVE",
+        "STOP: the HAL is HOLD",
+    ]
+
+
+def test_typed_lines_are_obeyed(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    operator = world.session()
+    operator.take()
+    operator.start_wanted = True
+    operator.stay(0.5)
+    capsys.readouterr()
+    operator.node.dead_man = True
+    for line, state in (("start", ACTIVE), (" XI 0.25 ", ACTIVE), ("hold", HOLD), ("start", ACTIVE), ("stop", HOLD)):
+        operator.typed(line)
+        operator.speak_for(60)
+        assert operator.node.hal is state, line
+    assert world.hal.state.assistance_factor == pytest.approx(0.25, abs=1e-4)
+    for line in ("xi 1.5", "xi", "run", "start now", "", "xi nan"):
+        operator.typed(line)
+    operator.speak_for(20)
+    assert operator.node.hal is HOLD
+    assert world.hal.state.assistance_factor == pytest.approx(0.25, abs=1e-4)
+    assert capsys.readouterr().err.count("is none of: start, stop, hold, xi X") == 5
+
+
+def test_ctrl_c_is_a_stop_with_the_dead_man_released_last(world: World) -> None:
+    stop = StopRequest()
+    operator = world.session(stop)
+    operator.take()
+    operator.start_wanted = True
+    operator.stay(0.5)
+    before = world.hal.state.cycle
+    operator.node.dead_man = True
+    operator.typed("start")
+    operator.speak_for(50)
+    assert world.hal.state.supervisor is ACTIVE
+    stop.ask(2)
+    operator.stay(None)
+    assert world.hal.state.supervisor is HOLD
+    codes = [event.code for event in world.hal.events if event.cycle > before]
+    assert "OPERATOR_STOP" in codes
+    assert "DEAD_MAN" not in codes
+    assert not operator.node.dead_man
+    assert stop.exit_code == 130
+
+
+def test_the_older_session_ends_with_a_sentence(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    older = world.session()
+    older.take()
+    older.start_wanted = True
+    newer = world.node()
+
+    class TakesOver(Keyboard):
+        def lines(self) -> list[str]:
+            if older.node.spoken > 2 * GRACE:
+                newer.speak()
+            return []
+
+    older._keyboard = TakesOver(None)
+    older.stay(None)
+    assert capsys.readouterr().err.endswith("the HAL is ACTIVE\nanother pendant has taken over\n")
+    assert world.hal.state.supervisor is ACTIVE
+
+
+def test_no_hal_is_said_once_and_waited_for(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    world.running = False
+    operator = world.session()
+    operator.take()
+    operator.stay(3.0)
+    assert capsys.readouterr().err.splitlines() == [
+        "pendant in hand",
+        "no SYNC on virtual test: no HAL is running there; waiting for one",
+    ]
+
+
+def test_a_start_that_leads_nowhere_is_said(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    operator = world.session()
+    operator.take()
+    operator.speak_for(200)
+    world.emulator.before_send.append(
+        lambda cycle, values: values.__setitem__(world.emulator.signals.slice("DriveState"), 0x40)
+    )
+    operator.start_wanted = True
+    operator.stay(1.0)
+    assert "the HAL did not become ACTIVE; type start to press START again" in capsys.readouterr().err
+
+
+def test_the_keyboard_gives_whole_lines_and_ends_with_the_file() -> None:
+    reading, writing = os.pipe()
+    keyboard = Keyboard(reading)
+    assert keyboard.lines() == []
+    os.write(writing, b"sta")
+    assert keyboard.lines() == []
+    os.write(writing, b"rt\nxi 0.3\nho")
+    assert keyboard.lines() == ["start", "xi 0.3"]
+    os.close(writing)
+    assert keyboard.lines() == []
+    os.close(reading)
+    assert keyboard.lines() == []
+
+
+# -- the commands ----------------------------------------------------------------------------------------------------
+
+
+def invoke(world: World, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> Result:
+    monkeypatch.setattr(pendant, "open_pendant_bus", lambda target: (world.network, world.wire.end(world.cycle)))
+    monkeypatch.setattr(pendant_session, "Session", partial(Session, now=lambda: world.now))
+    return CliRunner().invoke(cli, ["pendant", *arguments, "-i", "virtual", "-c", "test"])
+
+
+@pytest.mark.parametrize("button", ["stop", "hold"])
+def test_stop_and_hold_say_what_became_of_the_hal(world: World, monkeypatch: pytest.MonkeyPatch, button: str) -> None:
+    world.active()
+    result = invoke(world, monkeypatch, button)
+    assert (result.exit_code, result.stdout) == (0, f"{button.upper()}: the HAL was ACTIVE and is HOLD\n")
+
+
+def test_stop_without_a_hal_fails_with_a_sentence(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    world.running = False
+    result = invoke(world, monkeypatch, "stop")
+    assert result.exit_code == 1
+    assert "no SYNC on virtual test: no HAL is running there, so there is nothing to stop" in result.stderr
+
+
+def test_start_runs_for_a_time_and_ends_in_hold(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = invoke(world, monkeypatch, "start", "--for", "0.5")
+    assert result.exit_code == 0
+    assert ACTIVE in world.states
+    assert world.hal.state.supervisor is HOLD
+
+
+def test_xi_takes_over_and_sets_the_factor(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    world.active()
+    result = invoke(world, monkeypatch, "xi", "0.7", "--for", "0.1")
+    assert result.exit_code == 0
+    assert result.stderr.startswith("taking over from another pendant on virtual test\nassistance factor 0.7\n")
+    assert world.hal.state.assistance_factor == pytest.approx(0.7, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["xi", "1.2", "-i", "virtual", "-c", "x"], "1.2 is not in the range 0.0<=x<=1.0"),
+        (["start"], "socketcan needs a channel: -c vcan0"),
+        (["stop", "-i", "embedded"], "this needs a bus that other processes are on: -i socketcan -c vcan0"),
+        (["stop", "-c", "left_leg=a,b"], "'b' in the channel map is not BUS=CHANNEL"),
+    ],
+)
+def test_misuse_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
+    result = CliRunner().invoke(cli, ["pendant", *arguments])
+    assert result.exit_code == 2
+    assert sentence in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert result.stdout == ""
