@@ -7,6 +7,7 @@ same frames is `.log` alone (and `.blf`, which dates from the first frame); `.as
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -64,6 +65,7 @@ class CanLog:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._logger = can.Logger(path)
+            self._open = True
         except OSError as error:
             raise SinkError("RECORD_STOPPED", f"the CAN log {path} cannot be made: {error.strerror}") from error
 
@@ -98,15 +100,23 @@ class CanLog:
                     )
                 )
         except OSError as error:
-            raise SinkError("RECORD_STOPPED", f"the CAN log {self.path} stopped: {error.strerror}") from error
+            raise self._failed(error) from error
         self.frames += len(frames)
 
     def close(self) -> None:
-        """Finish the file; raises as `write`."""
-        try:
+        """Finish the file; raises as `write`. A second call does nothing."""
+        if self._open:
+            self._open = False
+            try:
+                self._logger.stop()
+            except OSError as error:
+                raise self._failed(error) from error
+
+    def _failed(self, error: OSError) -> SinkError:
+        self._open = False
+        with contextlib.suppress(OSError):  # what the buffer still holds does not fit either
             self._logger.stop()
-        except OSError as error:
-            raise SinkError("RECORD_STOPPED", f"the CAN log {self.path} stopped: {error.strerror}") from error
+        return SinkError("RECORD_STOPPED", f"the CAN log {self.path} stopped: {error.strerror}")
 
     def __enter__(self) -> Self:
         return self

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 #: In the order of the enum `Severity` of messages.proto.
 SEVERITIES = ("info", "warning", "error")
-#: Cycle records written before the event, cycle, value, severity, code, node, text.
+#: Number of the run, cycle, value, severity, code, node, text.
 _RECORD = struct.Struct("<qqdB39s32s216s")
 EVENT_BYTES = _RECORD.size
 EVENT_SLOTS = 1024
@@ -31,10 +31,10 @@ class Event:
             )
 
 
-def pack(event: Event, records: int) -> bytes:
-    """Bytes of an event that happened when `records` cycle records had been written. Too long texts are cut."""
+def pack(event: Event, run: int) -> bytes:
+    """Bytes of an event of the run of that number. Too long texts are cut."""
     return _RECORD.pack(
-        records,
+        run,
         event.cycle,
         event.value,
         SEVERITIES.index(event.severity),
@@ -45,9 +45,9 @@ def pack(event: Event, records: int) -> bytes:
 
 
 def unpack(packed: bytes) -> tuple[Event, int]:
-    """The event and the `records` it was packed with."""
-    records, cycle, value, severity, code, node, text = _RECORD.unpack(packed)
-    return Event(cycle, _text(code), _text(text), SEVERITIES[severity], _text(node), value), records
+    """The event and the number of its run."""
+    run, cycle, value, severity, code, node, text = _RECORD.unpack(packed)
+    return Event(cycle, _text(code), _text(text), SEVERITIES[severity], _text(node), value), run
 
 
 def _text(packed: bytes) -> str:

@@ -226,7 +226,7 @@ class TelemetryProcess:
         self, cycle: int, code: str, text: str, severity: str = "info", node: str = "HAL", value: float = 0.0
     ) -> None:
         """Something happened: published and recorded at once, see `events.Event`."""
-        self.events.write(pack(Event(cycle, code, text, severity, node, value), self.records.written))
+        self.events.write(pack(Event(cycle, code, text, severity, node, value), max(0, self._runs - 1)))
 
     @property
     def alive(self) -> bool:

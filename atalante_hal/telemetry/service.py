@@ -93,8 +93,9 @@ class Service:
         self._begin_runs()
         if len(records) and self._encoder is not None:
             self._handle_records(self._encoder, records.view(np.float64), first)
-        for event, records_before in events:
-            self._tell(event, self._run_of(records_before).start_ns + event.cycle * CYCLE_NS)
+        for event, number in events:
+            run = next(run for run in reversed(self._runs) if run.number == number)
+            self._tell(event, run.start_ns + event.cycle * CYCLE_NS)
         logged = self._frames is not None and self._handle_frames(self._frames.read())
         self._report_lost()
         return bool(len(records) or events or logged)
