@@ -207,14 +207,18 @@ class TestCycle:
         assert len(master.trace[-1]) == 6
         assert emulator.cycle == cycle
 
-    def test_frames_without_sync_wait_for_it(self, make: Callable[..., Setup]) -> None:
+    def test_commands_that_come_before_their_sync_wait_for_it(self, make: Callable[..., Setup]) -> None:
+        """As on a wire, where commands and the next SYNC are a millisecond apart."""
         master, emulator = make()
         master.enable()
-        cycle = emulator.cycle
-        assert not emulator.poll()
-        assert emulator.cycle == cycle
-        master.sync()
-        assert emulator.drives.missed == [0, 0]
+        for _ in range(50):
+            cycle = emulator.cycle
+            assert not emulator.poll()
+            assert emulator.cycle == cycle
+            master.sync()
+            master.command()
+            assert emulator.cycle == cycle + 1
+            assert emulator.drives.missed == [0, 0]
 
     def test_foreign_frames_are_ignored(self, make: Callable[..., Setup], network: Network) -> None:
         master, emulator = make()

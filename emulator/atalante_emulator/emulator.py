@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +23,7 @@ from atalante_emulator.drive import WATCHDOG, DriveParameters, Drives, DriveSign
 from atalante_emulator.foot import Feet, FootParameters
 from atalante_emulator.haptics import Haptics, HapticsParameters
 from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
-from atalante_emulator.pendant import Operator
+from atalante_emulator.pendant import Operator, PendantSignals
 from atalante_hal.bus import Bus, BusFull
 from atalante_hal.codec import Codec
 from atalante_hal.e2e import Check
@@ -52,6 +53,14 @@ class EmulatorParameters:
     imu: ImuParameters = field(default_factory=ImuParameters)
     foot: FootParameters = field(default_factory=FootParameters)
     haptics: HapticsParameters = field(default_factory=HapticsParameters)
+
+
+class _Status(NamedTuple):
+    """The slow status of one node, and where its changing signals are."""
+
+    tx: TransmitImage
+    node_state: int
+    uptime: int
 
 
 class Emulator:
@@ -105,7 +114,7 @@ class Emulator:
         cyclic = [m for bus in network.buses for m in sent if m.bus == bus and m.cycle_ms == 1]
         self._tx = TransmitImage(cyclic)
         self._haptics_tx = TransmitImage([network.message("HAPTICS_STATE")])
-        self._status_tx = TransmitImage([m for m in sent if m.name.endswith("_STATUS")])
+        self._status_messages = [m for m in sent if m.name.endswith("_STATUS")]
         self._emergency_tx = TransmitImage([m for m in sent if m.name.endswith("_EMCY")])
 
         heard = [m for m in network.sent_by("HAL") if m.cycle_ms == 1]
@@ -168,21 +177,22 @@ class Emulator:
         amplitude = self._haptics_tx.values[self._haptics_tx.codec.slice("Amplitude")]
         self._haptics = Haptics(parameters.haptics, amplitude)
         self._haptics_cycles = self._haptics_tx.codec.messages[0].cycle_ms
-        self._operator_said: object = None
+        self._operator_said: PendantSignals | None = None
         self._build_status()
 
     def _build_status(self) -> None:
-        values, codec = self._status_tx.values, self._status_tx.codec
-        values[codec.slice("DbcHash")] = self.network.hash32
-        values[codec.slice("FirmwareVersion")] = _FIRMWARE_VERSION
-        values[codec.slice("SupplyVoltage")] = _SUPPLY_VOLTAGE
-        self._node_state, self._uptime = values[codec.slice("NodeState")], values[codec.slice("Uptime")]
-        self._node_state.fill(_BOOTUP)
         # Spread over the period: no two nodes send their status in the same cycle.
-        period = max(m.cycle_ms for m in codec.messages)
-        gap = period // len(codec.messages)
-        self._status_period = period
-        self._status_due = {gap * row: row for row in range(len(codec.messages))}
+        self._status_period = max(m.cycle_ms for m in self._status_messages)
+        gap = self._status_period // len(self._status_messages)
+        self._status_due: dict[int, _Status] = {}
+        for place, message in enumerate(self._status_messages):
+            tx = TransmitImage([message])
+            at = {signal.name: tx.codec.index(message.name, signal.name) for signal in message.signals}
+            tx.values[at["NodeState"]] = _BOOTUP
+            tx.values[at["DbcHash"]] = self.network.hash32
+            tx.values[at["FirmwareVersion"]] = _FIRMWARE_VERSION
+            tx.values[at["SupplyVoltage"]] = _SUPPLY_VOLTAGE
+            self._status_due[gap * place] = _Status(tx, at["NodeState"], at["Uptime"])
 
     def _build_noise(self, seed: int) -> None:
         codec = self._tx.codec
@@ -216,6 +226,7 @@ class Emulator:
             count = self._receive_rest(count)
             if not count:
                 return False
+        self._waiting = 0
         self._rx.accept(self._scratch, count)
         if self._rx.all_fresh:
             self._commanded = [False] * len(SIDES)
@@ -240,7 +251,6 @@ class Emulator:
             if not got:
                 break
             count += got
-        self._waiting = 0
         return count
 
     def _imperfect_cycle(self) -> bool:
@@ -298,8 +308,10 @@ class Emulator:
     def _ask_operator(self, operator: Operator) -> None:
         operator.hear(int(self._hal_state[0]))
         said = operator.signals
-        if said is self._operator_said:
-            return
+        if said is not self._operator_said:
+            self._speak_for(said)
+
+    def _speak_for(self, said: PendantSignals) -> None:
         self._operator_said = said
         factor = said.assistance_factor
         at, truth = self._tx.codec.index, self._truth
@@ -314,11 +326,12 @@ class Emulator:
         if self.cycle % self._haptics_cycles == 0:
             self._haptics.advance(self._level, int(self._rx.age[self._level_row]), self._haptics_cycles)
             self._send(self._haptics_tx.seal())
-        row = self._status_due.get(self.cycle % self._status_period)
-        if row is not None:
-            self._uptime[row] = self.cycle * PERIOD
-            self._send(self._status_tx.seal_row(row))
-            self._node_state[row] = _OPERATIONAL
+        status = self._status_due.get(self.cycle % self._status_period)
+        if status is not None:
+            tx, node_state, uptime = status
+            tx.values[uptime] = self.cycle * PERIOD
+            self._send(tx.seal())
+            tx.values[node_state] = _OPERATIONAL
 
     def _send_emergencies(self) -> None:
         tx = self._emergency_tx

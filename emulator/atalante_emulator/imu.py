@@ -69,16 +69,15 @@ class Imus:
         if before is None:
             ax, ay, az = 0.0, 0.0, GRAVITY
         else:
-            ax = (vx - before[0]) / PERIOD
-            ay = (vy - before[1]) / PERIOD
-            az = (vz - before[2]) / PERIOD + GRAVITY
+            bx, by, bz = before
+            ax, ay, az = (vx - bx) / PERIOD, (vy - by) / PERIOD, (vz - bz) / PERIOD + GRAVITY
         # Rows of the matrix that turns world vectors into the sensor.
-        xx, yy, zz = x * x, y * y, z * z
-        xy, xz, yz = x * y, x * z, y * z
-        wx2, wy2, wz2 = w * x, w * y, w * z
-        r00, r01, r02 = 1.0 - 2.0 * (yy + zz), 2.0 * (xy + wz2), 2.0 * (xz - wy2)
-        r10, r11, r12 = 2.0 * (xy - wz2), 1.0 - 2.0 * (xx + zz), 2.0 * (yz + wx2)
-        r20, r21, r22 = 2.0 * (xz + wy2), 2.0 * (yz - wx2), 1.0 - 2.0 * (xx + yy)
+        x2, y2, z2 = x + x, y + y, z + z
+        xx, yy, zz, xy, xz, yz = x * x2, y * y2, z * z2, x * y2, x * z2, y * z2
+        xw, yw, zw = w * x2, w * y2, w * z2
+        r00, r01, r02 = 1.0 - yy - zz, xy + zw, xz - yw
+        r10, r11, r12 = xy - zw, 1.0 - xx - zz, yz + xw
+        r20, r21, r22 = xz + yw, yz - xw, 1.0 - xx - yy
         quaternion, gyro, accel = self._rows[imu]
         if w < 0.0:
             w, x, y, z = -w, -x, -y, -z
