@@ -30,6 +30,8 @@ from atalante_hal.types import Command, State, SupervisorState
 PERIOD = 1e-3  # s, the SYNC period
 #: Frames one `receive` can take; the cyclic set is about 20.
 _RECEIVE_BUDGET = 128
+#: Longest wait [s] for nodes of which none has been heard.
+_FIRST_PATIENCE = 0.1
 #: Cycles within which every drive must have followed to OPERATION ENABLED.
 _ENABLE_CYCLES = 200
 
@@ -222,8 +224,9 @@ class Hal:
         state = self.state
         state.cycle += 1
         state.time = state.cycle * PERIOD
+        late = 0 if self._rx.all_fresh else self._receive(0)  # what the last cycle did not wait for
         self._send(self._syncs)
-        count = self._receive()
+        count = self._receive(late, self.patience)
         before = self._rx.crc_errors
         foreign = self._rx.accept(self._scratch, count)
         if foreign:
@@ -326,22 +329,29 @@ class Hal:
         if self.tap is not None:
             self.tap.sent(frames)
 
-    def _receive(self) -> int:
-        """Frames of this cycle into the scratch buffer: returns when every expected message is there or patience ends."""
-        bus, scratch = self.bus, self._scratch
+    def _receive(self, count: int, patience: float | None = None) -> int:
+        """Append to the first `count` frames of the scratch buffer what the bus has.
+
+        Args:
+            patience: longest wait [s] for messages of this cycle; None: whatever is there at once.
+
+        Returns:
+            Frames in the buffer now.
+        """
+        bus, scratch, first = self.bus, self._scratch, count
         try:
-            count = bus.receive(scratch)
-            if count < len(self._rx.frames):
-                count = self._receive_rest(count)
+            count += bus.receive(scratch[first:] if first else scratch)
+            if patience is not None and (first or not self._rx.begins(scratch, count)):
+                count = self._receive_rest(first, count, patience)
         except BusError as error:
             self._raise_condition(Condition.BUS_DOWN, f"the bus {bus.name} fails: {error}")
-            count = 0
+            count = first
         if self.tap is not None:
-            self.tap.received(scratch, count)
+            self.tap.received(scratch[first:] if first else scratch, count - first)
         return count
 
-    def _receive_rest(self, count: int) -> int:
-        # Messages that have been silent beyond their timeout are not waited for.
+    def _receive_rest(self, first: int, count: int, patience: float) -> int:
+        """Wait until every message that is still alive has come after the `first` frames, at most `patience` [s]."""
         expected = {
             message.frame_id
             for message, age, timeout in zip(
@@ -349,15 +359,15 @@ class Hal:
             )
             if age <= timeout
         }
-        deadline = time.monotonic() + self.patience
-        first = 0
+        # Nobody heard yet: take whoever answers until they fall silent, so that no answer is left for the next cycle.
+        nobody = not expected
+        deadline = time.monotonic() + (min(patience, _FIRST_PATIENCE) if nobody else patience)
         while count < _RECEIVE_BUDGET:
             expected.difference_update(self._scratch["can_id"][first:count].tolist())
             remaining = deadline - time.monotonic()
-            if remaining <= 0.0 or (not expected and first > 0):
+            if remaining <= 0.0 or not (expected or nobody):
                 break
             first = count
-            # Nobody expected (nothing heard yet): still give the nodes the time to answer.
             got = self.bus.receive(self._scratch[count:], remaining)
             if got == 0:
                 break

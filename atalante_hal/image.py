@@ -90,6 +90,10 @@ class ReceiveImage:
         self.new_cycle()
         return self.accept_each(frames, count)
 
+    def begins(self, frames: Frames, count: int) -> bool:
+        """Whether `frames[:count]` begin with every message of this image, in order: then a cycle is complete."""
+        return count >= len(self._headers) and self._scratch_of(frames).headers.tobytes() == self._expected_headers
+
     def _scratch_of(self, frames: Frames) -> _Scratch:
         if self._scratch is None or self._scratch.frames is not frames:
             self._scratch = _Scratch(frames, self._lengths, self._data_ids)

@@ -116,7 +116,14 @@ class _Tap:
 def make_rig(network: atalante_dbc.Network, robot: Robot, urdf_text: str) -> Iterator[Callable[..., Rig]]:
     bodies: list[PyBulletBody] = []
 
-    def make(*, seed: int = 0, assistance_factor: float | None = None, starts: bool = True, **options: Any) -> Rig:
+    def make(
+        *,
+        seed: int = 0,
+        assistance_factor: float | None = None,
+        starts: bool = True,
+        hal_network: atalante_dbc.Network = network,
+        **options: Any,
+    ) -> Rig:
         ours, theirs = lockstep_pair()
         body = PyBulletBody(urdf_text)
         bodies.append(body)
@@ -125,7 +132,7 @@ def make_rig(network: atalante_dbc.Network, robot: Robot, urdf_text: str) -> Ite
         ours.step = emulator.poll
         bus = FilterBus(ours)
         sent: list[Frames] = []
-        hal = Hal(network, robot, bus, tap=_Tap(sent), **options)
+        hal = Hal(hal_network, robot, bus, tap=_Tap(sent), **options)
         return Rig(hal, emulator, bus, operator, sent)
 
     yield make
