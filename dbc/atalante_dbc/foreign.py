@@ -1,0 +1,371 @@
+"""Any DBC as data: layouts of messages that are not ours, for the validator and for bulk decoding.
+
+`loader.load` is strict, because its network drives a robot. Here nothing of ours is required: a DBC that cantools reads gives
+a `Catalogue`, our attributes are used where the file carries them, and a message whose layout cannot be decoded without doubt
+is refused by name with the reason, never guessed.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import zlib
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cantools
+from cantools.database.can import Database
+from cantools.database.can import Message as RawMessage
+from cantools.database.can import Signal as RawSignal
+from cantools.database.errors import Error as CantoolsError
+
+from atalante_dbc.loader import DbcError
+
+#: Longest payload of one frame, CAN FD and classic; longer J1939 messages travel in several.
+_FRAME_BYTES, _CLASSIC_BYTES = 64, 8
+_WORD = 64
+_FLOAT_BITS = (16, 32, 64)
+#: E2E Profile 5 header: name -> (start bit, bits), as in our own network.
+_E2E_HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
+#: Values of GenMsgSendType that promise one frame every GenMsgCycleTime.
+_CYCLIC = ("", "cyclic", "cyclicx", "periodic", "fixedperiodic", "fixed_periodic")
+#: J1939: the bits of an identifier that name the parameter group; with PF below 240 the next byte is an address.
+_PGN_PEER, _PGN_BROADCAST, _PDU2 = 0x03FF0000, 0x03FFFF00, 240
+_QUOTED = re.compile(r'"[^"]*"')
+_WRITTEN = re.compile(r"\bBO_\s+(\d+)\s+(\w+)\s*:|\bSG_\s+(\w+)\s+(M|m\d+M?)?\s*:")
+
+
+@dataclass(frozen=True)
+class Field:
+    """One signal of any DBC; physical = raw * factor + offset."""
+
+    name: str
+    start: int  # Intel: least significant bit; Motorola: most significant bit, in DBC numbering
+    length: int  # bits
+    big_endian: bool  # Motorola
+    kind: str  # "unsigned", "signed" or "float" (IEEE 754)
+    factor: int | float
+    offset: int | float
+    minimum: float | None  # physical; None: the DBC gives no range
+    maximum: float | None
+    unit: str
+    invalid_raw: int | None  # raw code (as unsigned bits) that says "no value"
+    choices: Mapping[int, str]  # raw value -> name; empty when there is no value table
+    #: Multiplexer signals and the raw values of each at which this signal is in the frame; empty: always.
+    selectors: tuple[tuple[str, frozenset[int]], ...]
+
+    @property
+    def first_bit(self) -> int:
+        """Place of the first bit, counted in the direction of the byte order: Intel from the least significant bit of byte 0,
+        Motorola from the most significant."""
+        return self.start ^ 7 if self.big_endian else self.start
+
+    @property
+    def bits(self) -> range | tuple[int, ...]:
+        """Bits of the payload it occupies, numbered from the least significant bit of byte 0."""
+        places = range(self.first_bit, self.first_bit + self.length)
+        return tuple(place ^ 7 for place in places) if self.big_endian else places
+
+
+@dataclass(frozen=True)
+class Layout:
+    """One message of any DBC."""
+
+    name: str
+    frame_id: int
+    extended: bool  # 29-bit identifier
+    fd: bool | None  # CAN FD frame; None: the DBC does not say
+    bit_rate_switch: bool | None  # None: the DBC does not say
+    length: int  # bytes
+    sender: str | None
+    fields: tuple[Field, ...]
+    bus: str | None
+    cyclic: bool  # sent every `cycle_ms`; otherwise on events
+    cycle_ms: float | None
+    timeout_ms: float | None
+    inhibit_ms: float | None  # least time between two events
+    data_id: int | None  # AUTOSAR E2E Profile 5; None: the message is not protected
+    pgn_mask: int  # bits of the identifier that name it; all of them unless it is a J1939 parameter group
+    #: Multiplexer signal -> raw values for which the DBC has a layout.
+    multiplexers: Mapping[str, frozenset[int]]
+
+    def field(self, name: str) -> Field:
+        """The signal of that name.
+
+        Raises:
+            KeyError: with the names there are.
+        """
+        for field in self.fields:
+            if field.name == name:
+                return field
+        raise KeyError(f"no signal {name!r} in {self.name}: {', '.join(f.name for f in self.fields)}")
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A message of the DBC that is not decoded, and why."""
+
+    name: str
+    frame_id: int
+    extended: bool
+    reason: str
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """What a DBC says about the wire. Layouts are in file order."""
+
+    path: Path
+    layouts: tuple[Layout, ...]
+    refused: tuple[Refused, ...]
+    nodes: Mapping[str, str]  # name -> kind, "" where the DBC has no NodeKind
+    buses: tuple[str, ...]
+    nominal_bitrate: float | None  # bit/s
+    data_bitrate: float | None  # bit/s
+    hash32: int  # CRC-32 of the file
+
+    @cached_property
+    def _by_name(self) -> dict[str, Layout]:
+        return {layout.name: layout for layout in self.layouts}
+
+    def layout(self, name: str) -> Layout:
+        """The message of that name.
+
+        Raises:
+            KeyError: with the names there are, or the reason why it is refused.
+        """
+        if name in self._by_name:
+            return self._by_name[name]
+        for refused in self.refused:
+            if refused.name == name:
+                raise KeyError(f"the message {name} is not decoded: {refused.reason}")
+        raise KeyError(f"no message {name!r}; there are {', '.join(self._by_name)}")
+
+
+def catalogue(path: Path) -> Catalogue:
+    """Layouts of a DBC file; messages that cannot be decoded without doubt are in `refused`.
+
+    Raises:
+        DbcError: the file cannot be read or is no DBC.
+    """
+    try:
+        raw = path.read_bytes()
+        text = raw.decode("cp1252", errors="replace")
+        database = cantools.database.load_string(text, database_format="dbc", strict=False)
+    except (OSError, ValueError, KeyError, IndexError, CantoolsError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise DbcError(f"{path} cannot be read as a DBC: {reason}") from error
+    assert isinstance(database, Database)
+    written = _Written(text)
+    reasons = [(m, next(_unsupported(m, written), "")) for m in database.messages]
+    data_bitrate = _number(_of(database, "DataBitrate"))
+    return Catalogue(
+        path=path,
+        layouts=tuple(_layout(m, data_bitrate) for m, reason in reasons if not reason),
+        refused=tuple(Refused(m.name, m.frame_id, m.is_extended_frame, reason) for m, reason in reasons if reason),
+        nodes={node.name: _text(_of(node, "NodeKind")) for node in database.nodes},
+        buses=tuple(_definitions(database)["Bus"].choices or ()) if "Bus" in _definitions(database) else (),
+        nominal_bitrate=_number(_of(database, "NominalBitrate")) or _number(_of(database, "Baudrate")),
+        data_bitrate=data_bitrate,
+        hash32=zlib.crc32(raw),
+    )
+
+
+class _Written:
+    """What the text says and cantools forgets: repeated identifiers and names, and multiplexer marks."""
+
+    def __init__(self, text: str) -> None:
+        self.ids: Counter[int] = Counter()
+        self.names: Counter[str] = Counter()
+        self.signals: dict[int, Counter[str]] = {}
+        self.multiplexed: Counter[int] = Counter()  # signals marked m0, m1, ... a message
+        current = -1
+        for match in _WRITTEN.finditer(_QUOTED.sub('""', text)):
+            if match[1]:
+                current = int(match[1])
+                self.ids[current] += 1
+                self.names[match[2]] += 1
+                self.signals.setdefault(current, Counter())
+            elif current >= 0:
+                self.signals[current][match[3]] += 1
+                self.multiplexed[current] += (match[4] or "").startswith("m")
+
+
+def _unsupported(message: RawMessage, written: _Written) -> Iterator[str]:
+    """Every reason not to decode a message, as one clause."""
+    key = message.frame_id | message.is_extended_frame << 31
+    if written.ids[key] > 1:
+        yield f"its identifier {message.frame_id:#x} is used by {written.ids[key]} messages"
+    if written.names[message.name] > 1:
+        yield f"its name is used by {written.names[message.name]} messages"
+    if message.length > (_CLASSIC_BYTES if message.protocol == "j1939" else _FRAME_BYTES):
+        yield f"its {message.length} bytes do not fit one frame (transport protocols are not supported)"
+    if repeated := [name for name, count in written.signals.get(key, Counter()).items() if count > 1]:
+        yield f"the signal name {repeated[0]} is used twice"
+    if written.multiplexed[key] != sum(bool(s.multiplexer_ids) for s in message.signals):
+        yield "a multiplexed signal has no multiplexer (M) it belongs to; extended multiplexing needs SG_MUL_VAL_"
+    for signal in message.signals:
+        yield from _unsupported_signal(message, signal)
+    yield from _overlaps(message)
+
+
+def _unsupported_signal(message: RawMessage, signal: RawSignal) -> Iterator[str]:
+    name, is_float = signal.name, signal.conversion.is_float
+    if is_float and signal.length not in _FLOAT_BITS:
+        yield f"{name} is a float of {signal.length} bits; floats have 16, 32 or 64"
+    if signal.length > _WORD:
+        yield f"{name} has {signal.length} bits; signals of up to 64 are supported"
+    first = _first_bit(signal)
+    if first + signal.length > 8 * message.length:
+        yield f"{name} ends at bit {first + signal.length}, the message at bit {8 * message.length}"
+    if not all(math.isfinite(x) for x in (signal.scale, signal.offset)):
+        yield f"{name} has the factor {signal.scale} and offset {signal.offset}"
+    if signal.is_multiplexer and (is_float or signal.scale != 1 or signal.offset != 0):
+        yield f"the multiplexer {name} is scaled or a float; it must be a plain integer"
+
+
+def _overlaps(message: RawMessage) -> Iterator[str]:
+    """Bits claimed twice by signals that can be in the same frame."""
+    owners: dict[int, list[tuple[str, dict[str, frozenset[int]]]]] = {}
+    selectors = _selectors(message)
+    for signal in message.signals:
+        mine = dict(selectors[signal.name])
+        first = _first_bit(signal)
+        for bit in range(first, first + signal.length):
+            place = bit ^ 7 if signal.byte_order == "big_endian" else bit
+            for other, theirs in owners.setdefault(place, []):
+                if all(mine[m] & theirs[m] for m in mine.keys() & theirs.keys()):
+                    yield f"{signal.name} overlaps {other}"
+                    return
+            owners[place].append((signal.name, mine))
+
+
+def _first_bit(signal: RawSignal) -> int:
+    return signal.start ^ 7 if signal.byte_order == "big_endian" else signal.start
+
+
+def _selectors(message: RawMessage) -> dict[str, tuple[tuple[str, frozenset[int]], ...]]:
+    """Per signal: multiplexers from the outermost inwards, and the values of each at which the signal is there."""
+    by_name = {s.name: s for s in message.signals}
+
+    def of(signal: RawSignal, depth: int = 0) -> tuple[tuple[str, frozenset[int]], ...]:
+        parent = by_name.get(signal.multiplexer_signal or "")
+        if parent is None or depth > len(by_name):
+            return ()
+        return (*of(parent, depth + 1), (parent.name, frozenset(signal.multiplexer_ids or ())))
+
+    return {s.name: of(s) for s in message.signals}
+
+
+def _multiplexers(message: RawMessage) -> dict[str, frozenset[int]]:
+    """Values for which a multiplexer has a layout: its children's, and those its value table names."""
+    known: dict[str, frozenset[int]] = {}
+    for multiplexer in (s for s in message.signals if s.is_multiplexer):
+        children = [s.multiplexer_ids or () for s in message.signals if s.multiplexer_signal == multiplexer.name]
+        values = [int(value) for ids in (multiplexer.choices or {}, *children) for value in ids]
+        if values:
+            known[multiplexer.name] = frozenset(values)
+    return known
+
+
+def _layout(message: RawMessage, data_bitrate: float | None) -> Layout:
+    selectors = _selectors(message)
+    send_type = _text(_of(message, "GenMsgSendType")).lower()
+    cycle = _number(_of(message, "GenMsgCycleTime"))
+    fd = message.is_fd or message.length > _CLASSIC_BYTES or (None if _of(message, "VFrameFormat") is None else False)
+    switch = _text(_of(message, "CANFD_BRS"))
+    return Layout(
+        name=message.name,
+        frame_id=message.frame_id,
+        extended=message.is_extended_frame,
+        fd=fd,
+        bit_rate_switch=(switch not in ("0", "")) if switch else (True if fd and data_bitrate else None),
+        length=message.length,
+        sender=message.senders[0] if message.senders else None,
+        fields=tuple(_field(s, selectors[s.name]) for s in message.signals),
+        bus=_text(_of(message, "Bus")) or None,
+        cyclic=bool(cycle) and send_type in _CYCLIC,
+        cycle_ms=cycle,
+        timeout_ms=_number(_of(message, "TimeoutTime")),
+        inhibit_ms=_number(_of(message, "GenMsgDelayTime")),
+        data_id=_data_id(message),
+        pgn_mask=_pgn_mask(message),
+        multiplexers=_multiplexers(message),
+    )
+
+
+def _data_id(message: RawMessage) -> int | None:
+    """E2E Data ID of a message that carries the Profile 5 header."""
+    data_id = _number(_of(message, "E2EDataId"))
+    header = {s.name: (s.start, s.length) for s in message.signals if s.byte_order == "little_endian"}
+    carries = all(header.get(name) == place for name, place in _E2E_HEADER.items())
+    return int(data_id) if data_id and carries else None
+
+
+def _pgn_mask(message: RawMessage) -> int:
+    if message.protocol != "j1939" or not message.is_extended_frame:
+        return 0x1FFFFFFF
+    return _PGN_PEER if message.frame_id >> 16 & 0xFF < _PDU2 else _PGN_BROADCAST
+
+
+def _field(signal: RawSignal, selectors: tuple[tuple[str, frozenset[int]], ...]) -> Field:
+    is_float = signal.conversion.is_float
+    return Field(
+        name=signal.name,
+        start=signal.start,
+        length=signal.length,
+        big_endian=signal.byte_order == "big_endian",
+        kind="float" if is_float else "signed" if signal.is_signed else "unsigned",
+        factor=signal.scale,
+        offset=signal.offset,
+        minimum=None if signal.minimum is None else float(signal.minimum),
+        maximum=None if signal.maximum is None else float(signal.maximum),
+        unit=signal.unit or "",
+        invalid_raw=_invalid_raw(signal),
+        choices={int(k): str(v) for k, v in (signal.choices or {}).items()},
+        selectors=selectors,
+    )
+
+
+def _invalid_raw(signal: RawSignal) -> int | None:
+    try:
+        value = int(_text(_of(signal, "InvalidRaw")), 0)
+    except ValueError:
+        return None
+    return value if 0 <= value < 1 << signal.length else None
+
+
+def _definitions(database: Database) -> Mapping[str, Any]:
+    return database.dbc.attribute_definitions if database.dbc is not None else {}
+
+
+def _of(item: Any, name: str) -> object:
+    """Attribute of a database, node, message or signal; its default when not set, None when not defined."""
+    if item.dbc is None:
+        return None
+    attributes, definitions = item.dbc.attributes or {}, item.dbc.attribute_definitions or {}
+    definition = definitions.get(name)
+    if definition is None:
+        return None
+    value = attributes[name].value if name in attributes else definition.default_value
+    if definition.choices and isinstance(value, int) and 0 <= value < len(definition.choices):
+        return str(definition.choices[value])
+    found: object = value
+    return found
+
+
+def _number(value: object) -> float | None:
+    """A positive number, None otherwise: 0 in a DBC attribute means "not set"."""
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return None
+    return number if number > 0 and math.isfinite(number) else None
+
+
+def _text(value: object) -> str:
+    return "" if value is None else str(value)
