@@ -1,0 +1,168 @@
+"""The generated C under the sanitizers against the Python codec, and that the comparison can fail."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from binascii import crc_hqx
+from pathlib import Path
+
+import cantools
+import click
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from atalante_dbc import DBC_FILE, load
+from atalante_hal.codec import Codec
+from atalante_tools.cli import cli
+from atalante_tools.dbc.c_code import Build, crc_table, write
+from atalante_tools.dbc.host_test import compile_host_test, run_host_test
+from atalante_tools.outcome import Failed
+
+IMAGES = 10_000
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiler() -> None:
+    assert shutil.which("gcc"), "the tests of the generated C need gcc: apt-get install gcc libc6-dev"
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Build, Path, Path]:
+    """The whole network, generated and compiled once: build, folder, program."""
+    folder = tmp_path_factory.mktemp("c")
+    build = Build.of(DBC_FILE, None)
+    write(build, folder, 0)
+    return build, folder, compile_host_test(build, folder)
+
+
+def test_c_and_python_agree_on_ten_thousand_random_images_of_the_whole_network(whole):
+    build, _, program = whole
+    assert len(build.messages) == len(load().messages)
+    # Every message unpacked and packed.
+    assert run_host_test(build, program, IMAGES, seed=1) == 2 * IMAGES * len(build.messages)
+
+
+def test_the_vector_file_needs_no_python(whole):
+    _, folder, program = whole
+    done = subprocess.run([program, folder / "vectors.bin"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, f"{2 * 100 * len(load().messages)} frames compared\n")
+    assert "test: host_test" in (folder / "Makefile").read_text()
+
+
+@pytest.mark.parametrize("offset", [16 + 8, 16 + 8 + 1, -1], ids=["value range flag", "value", "payload"])
+def test_a_vector_that_is_wrong_by_one_bit_is_found(whole, offset: int, tmp_path: Path):
+    # The first frame is an 8-byte SYNC: payload, range flag, values; the last byte is the end of a payload to be made.
+    _, folder, program = whole
+    content = bytearray((folder / "vectors.bin").read_bytes())
+    content[offset] ^= 1
+    wrong = tmp_path / "wrong.bin"
+    wrong.write_bytes(content)
+    done = subprocess.run([program, wrong], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "not " in done.stdout
+
+
+def test_vectors_of_another_network_are_refused(whole, tmp_path: Path):
+    _, folder, program = whole
+    content = bytearray((folder / "vectors.bin").read_bytes())
+    content[8] ^= 1
+    (tmp_path / "other.bin").write_bytes(content)
+    done = subprocess.run([program, tmp_path / "other.bin"], capture_output=True, text=True, check=False)
+    assert (done.returncode, "another network" in done.stdout) == (2, True)
+
+
+def test_a_wrong_scaling_in_c_is_found(tmp_path: Path):
+    """The smallest mistake an engineer could make by hand: one factor, in its ninth digit."""
+    build = Build.of(DBC_FILE, "LEFT_SK")
+    write(build, tmp_path, 0)
+    code = tmp_path / "atalante.c"
+    factor = "4.7936899621426287e-05"
+    assert factor in code.read_text()
+    code.write_text(code.read_text().replace(factor, "4.7936899721426287e-05"))
+    program = compile_host_test(build, tmp_path)
+    with pytest.raises(Failed, match="test_left_sk_state"):
+        run_host_test(build, program, 100, seed=0)
+
+
+def test_a_warning_in_the_code_is_an_error(tmp_path: Path):
+    build = Build.of(DBC_FILE, "PENDANT")
+    write(build, tmp_path, 0)
+    with (tmp_path / "atalante_e2e.c").open("a") as file:
+        file.write("static int unused(void) { return 0; }\n")
+    with pytest.raises(Failed, match="unused"):
+        compile_host_test(build, tmp_path)
+
+
+def test_the_command_writes_and_checks_one_nodes_share(tmp_path: Path):
+    arguments = ["dbc", "c-code", "-o", str(tmp_path), "--node", "left_sk", "--check", "--images", "500", "--json"]
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 0, result.output
+    files, check = (json.loads(line) for line in result.stdout.splitlines())
+    assert files["messages"] == [
+        "SYNC_LEFT_LEG", "LEFT_SK_EMCY", "COMMAND_LEFT_LEG", "LEFT_SK_STATE", "LEFT_SK_STATUS",
+    ]  # fmt: skip
+    assert check == {"images": 500, "compared": 2500, "equal": True}
+    header = (tmp_path / "atalante_e2e.h").read_text()
+    assert "atalante_left_sk_state_protect" in header
+    assert "atalante_left_sk_state_check" not in header
+    assert "ATALANTE_LEFT_SK_STATE_TORQUE_INVALID (-32768)" in header
+    assert f"{load().hash32:#010x}" in header
+
+
+def test_the_same_network_gives_the_same_bytes(tmp_path: Path):
+    build = Build.of(DBC_FILE, "HAPTICS")
+    first, second = ([path.read_bytes() for path in write(build, tmp_path / name, 0)] for name in "ab")
+    assert first == second
+
+
+def test_a_node_that_does_not_exist_is_answered_with_a_near_one():
+    with pytest.raises(click.UsageError, match="LEFT_SK"):
+        Build.of(DBC_FILE, "LEFT_KS")
+
+
+def test_a_missing_compiler_is_told_with_what_to_install(whole, monkeypatch: pytest.MonkeyPatch):
+    build, folder, _ = whole
+    monkeypatch.setenv("CC", "no-such-cc")
+    with pytest.raises(Failed, match="apt-get install gcc"):
+        compile_host_test(build, folder)
+
+
+def test_the_readable_vectors_are_what_cantools_decodes(whole):
+    """A second witness: the examples are not only our own codec's word."""
+    _, folder, _ = whole
+    oracle = cantools.database.load_file(str(DBC_FILE), strict=False)
+    vectors = json.loads((folder / "vectors.json").read_text())
+    assert len(vectors) == 4 * len(load().messages)
+    for vector in vectors:
+        payload = bytes.fromhex(vector["payload"])
+        decoded = oracle.decode_message(vector["id"], payload, decode_choices=False)
+        assert vector["values"] == pytest.approx(decoded, rel=1e-12)
+        crc = crc_hqx(vector["data_id"].to_bytes(2, "little"), crc_hqx(payload[2:], 0xFFFF))
+        assert crc == int.from_bytes(payload[:2], "little")
+    assert {v["in_range"] for v in vectors if v["what"] in ("minimum", "maximum", "random")} == {True}
+    assert False in {v["in_range"] for v in vectors if v["what"] == "invalid codes"}
+
+
+def test_the_crc_table_is_the_standard_librarys_polynomial():
+    assert crc_table() == [crc_hqx(bytes([byte]), 0) for byte in range(256)]
+
+
+def test_random_payloads_meet_codes_outside_their_range(whole):
+    """Otherwise the comparison of the range checks would prove little."""
+    from atalante_tools.dbc.vectors import Vectors
+
+    build, _, _ = whole
+    vectors = Vectors(build, 0)
+    seen = np.zeros((2, len(build.messages)), bool)
+    for _ in vectors.images(60):
+        for row, inside in enumerate(vectors._in_range):
+            seen[int(inside), row] = True
+    assert seen[1].all()
+    can_be_outside = [
+        any((s.maximum - s.minimum) / s.factor + 1 < 2**s.length - 0.5 for s in m.signals) for m in build.messages
+    ]
+    assert (seen[0] == np.array(can_be_outside)).all()
+    assert Codec(build.messages).size > 500

@@ -1,0 +1,166 @@
+"""`atalante dbc`: look at a network description, compare two, and make C of one. All commands take `--json`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from atalante_tools.options import json_option
+from atalante_tools.outcome import FAILED, Failed
+from atalante_tools.terminal import say, show_json, table
+
+_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+#: A DBC, by default the robot's.
+_file_argument = click.argument("file", type=_FILE, required=False)
+
+
+@click.group()
+def command() -> None:
+    """Check, print and compare DBC files, and make C code of one. FILE is the robot's own network unless given."""
+
+
+@command.command()
+@_file_argument
+@json_option
+def lint(file: Path | None, as_json: bool) -> None:
+    """Everything that keeps the strict loader from trusting FILE, with its line; exit code 1 if there is anything."""
+    from atalante_tools.dbc.lint import findings
+
+    path = file or _own()
+    found = findings(path)
+    for finding in found:
+        if as_json:
+            show_json({"file": str(path), "line": finding.line, "text": finding.text})
+        else:
+            click.echo(f"{path}:{finding.line or ''}{':' if finding.line else ''} {finding.text}")
+    if found:
+        say(f"{path}: {len(found)} finding{'s' * (len(found) > 1)}")
+        raise SystemExit(FAILED)
+    say(f"{path}: the strict loader finds nothing wrong")
+
+
+@command.command("table")
+@_file_argument
+@click.option("--signals", is_flag=True, help="Every signal of every message, with unit, range and invalid code.")
+@json_option
+def print_table(file: Path | None, signals: bool, as_json: bool) -> None:
+    """The messages of FILE, one a line."""
+    import atalante_dbc
+    from atalante_tools.dbc.tables import message_rows, signal_rows
+
+    network = atalante_dbc.load(file)
+    _show(signal_rows(network) if signals else message_rows(network), as_json)
+
+
+@command.command()
+@_file_argument
+@click.option(
+    "--limit", type=click.FloatRange(min=0.0), default=60.0, show_default=True, help="Percent a bus may have."
+)
+@json_option
+def busload(file: Path | None, limit: float, as_json: bool) -> None:
+    """Worst-case load of each bus and what each message has of it; exit code 1 if a bus has more than the limit."""
+    import atalante_dbc
+    from atalante_tools.dbc.tables import load_rows
+
+    network = atalante_dbc.load(file)
+    load = {bus: 100.0 * share for bus, share in network.bus_load().items()}
+    for bus in network.buses:
+        rows = load_rows(network, bus)
+        if as_json:
+            show_json({"bus": bus, "percent": load[bus], "limit_percent": limit, "messages": rows})
+            continue
+        click.echo(f"{bus}: {load[bus]:.1f} % of {limit:g} %")
+        _show([{**row, "us": f"{row['us']:.1f}", "percent": f"{row['percent']:.2f}"} for row in rows], as_json)
+        click.echo()
+    if over := [f"{bus} ({percent:.1f} %)" for bus, percent in load.items() if percent > limit]:
+        raise Failed(f"more than {limit:g} % of the time in the worst case: {', '.join(over)}")
+
+
+@command.command()
+@click.argument("old", type=_FILE)
+@click.argument("new", type=_FILE)
+@json_option
+def diff(old: Path, new: Path, as_json: bool) -> None:
+    """What changes on the wire from OLD to NEW; exit code 1 if a node built for one cannot talk to one built for the other."""
+    import atalante_dbc
+    from atalante_tools.dbc.diff import changes
+
+    found = changes(atalante_dbc.load(old), atalante_dbc.load(new))
+    breaking = [change for change in found if change.breaking]
+    for change in sorted(found, key=lambda change: not change.breaking):
+        kind = "breaking" if change.breaking else "compatible"
+        if as_json:
+            show_json({"kind": kind, "subject": change.subject, "where": change.where, "text": change.text})
+        else:
+            click.echo(f"{kind:<10}  {change.where}: {change.text}")
+    say(f"{len(breaking)} breaking and {len(found) - len(breaking)} compatible changes")
+    if breaking:
+        raise SystemExit(FAILED)
+
+
+@command.command("c-code")
+@_file_argument
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(file_okay=False, path_type=Path),
+    required=True,
+    metavar="DIR",
+    help="Folder of the files; made if it is not there.",
+)
+@click.option("--node", metavar="NODE", help="Only what this node sends and receives.")
+@click.option(
+    "--check", is_flag=True, help="Compile the host test and compare with the Python codec on --images images."
+)
+@click.option(
+    "--images", type=click.IntRange(min=1), default=10_000, show_default=True, help="Random images of --check."
+)
+@click.option("--seed", type=int, default=0, show_default=True, help="Of the random images.")
+@json_option
+def c_code(
+    file: Path | None, output: Path, node: str | None, check: bool, images: int, seed: int, as_json: bool
+) -> None:
+    """C code for FILE: pack, unpack, E2E protect and check, test vectors, and a host test that proves it equal to Python."""
+    from atalante_tools.dbc.c_code import Build, write
+    from atalante_tools.dbc.host_test import compile_host_test, run_host_test
+
+    build = Build.of(file or _own(), node)
+    written = write(build, output, seed)
+    if as_json:
+        show_json(
+            {"files": [str(path) for path in written], "node": node, "messages": [m.name for m in build.messages]}
+        )
+    else:
+        for path in written:
+            click.echo(path)
+    if check:
+        program = compile_host_test(build, output)
+        compared = run_host_test(build, program, images, seed)
+        if as_json:
+            show_json({"images": images, "compared": compared, "equal": True})
+        else:
+            say(f"C and Python agree on {images} images, {compared} frames")
+
+
+def _own() -> Path:
+    from atalante_dbc import DBC_FILE
+
+    return DBC_FILE
+
+
+def _show(rows: list[dict[str, object]], as_json: bool) -> None:
+    if as_json:
+        for row in rows:
+            show_json(row)
+    elif rows:
+        click.echo(table([list(rows[0]), *([_cell(value) for value in row.values()] for row in rows)]))
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, list | tuple):
+        return " ".join(map(str, value))
+    if value is None:
+        return "-"
+    return f"{value:.10g}" if isinstance(value, float) else str(value)

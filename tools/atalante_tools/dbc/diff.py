@@ -1,0 +1,171 @@
+"""Two versions of a network: what a node built for one and a node built for the other would disagree about on the wire.
+
+Breaking is judged by this stack's own receivers, which are strict: they refuse another length, another Data ID, a value outside
+the range, and call a message late after its timeout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from atalante_dbc import Message, Network, Signal
+
+
+@dataclass(frozen=True)
+class Change:
+    """One difference; `subject` is what kind of thing changed, `where` names it."""
+
+    breaking: bool
+    subject: str
+    where: str
+    text: str
+
+
+def changes(old: Network, new: Network) -> list[Change]:
+    """Every difference between two networks, in the order of `new`, what is gone last."""
+    return [*_network(old, new), *_messages(old, new)]
+
+
+def _network(old: Network, new: Network) -> Iterator[Change]:
+    if old.hash32 != new.hash32:
+        text = f"{old.hash32:#010x} -> {new.hash32:#010x}: a HAL stays OFF until every node reports the new one"
+        yield Change(False, "hash", "network", text)
+    for what, before, after in (
+        ("nominal bit rate", old.nominal_bitrate, new.nominal_bitrate),
+        ("data bit rate", old.data_bitrate, new.data_bitrate),
+    ):
+        if before != after:
+            yield Change(True, "bit rate", "network", f"{what} {before} -> {after} bit/s")
+    was, now = ({node.name: node for node in network.nodes} for network in (old, new))
+    for name, node in now.items():
+        known = was.get(name)
+        if known is None:
+            yield Change(False, "node", name, f"new node, a {node.kind}")
+        elif known != node:
+            yield Change(False, "node", name, f"{known.kind} {known.number} -> {node.kind} {node.number}")
+    for name in was.keys() - now.keys():
+        yield Change(False, "node", name, "node is gone")
+
+
+def _messages(old: Network, new: Network) -> Iterator[Change]:
+    was, now = ({m.name: m for m in network.messages} for network in (old, new))
+    # A message under another name is the same to the wire: found by its identifier and Data ID.
+    lost = {(m.frame_id, m.data_id): m for name, m in was.items() if name not in now}
+    for name, message in now.items():
+        before = was.get(name)
+        if before is None:
+            before = lost.pop((message.frame_id, message.data_id), None)
+            if before is None:
+                yield Change(False, "message", name, f"new message {message.frame_id:#x} from {message.sender}")
+                continue
+            yield Change(False, "name", name, f"was called {before.name}; identifier and Data ID are the same")
+        yield from _message(before, message)
+    for message in lost.values():
+        yield Change(True, "message", message.name, f"message {message.frame_id:#x} is gone")
+
+
+def _message(old: Message, new: Message) -> Iterator[Change]:
+    def breaking(subject: str, text: str) -> Change:
+        return Change(True, subject, new.name, text)
+
+    if old.frame_id != new.frame_id:
+        yield breaking("id", f"identifier {old.frame_id:#x} -> {new.frame_id:#x}")
+    if old.length != new.length:
+        yield breaking("length", f"{old.length} -> {new.length} bytes; receivers want the exact length")
+    if old.data_id != new.data_id:
+        yield breaking("data id", f"E2E Data ID {old.data_id:#06x} -> {new.data_id:#06x}: no CRC holds")
+    if old.sender != new.sender:
+        yield breaking("sender", f"sender {old.sender} -> {new.sender}: both would send, or none")
+    if old.bus != new.bus:
+        yield breaking("bus", f"bus {old.bus} -> {new.bus}")
+    yield from _timing(old, new)
+    yield from _signals(old, new)
+
+
+def _timing(old: Message, new: Message) -> Iterator[Change]:
+    if old.send_type != new.send_type:
+        yield Change(True, "timing", new.name, f"{old.send_type} -> {new.send_type}")
+    elif old.cycle_ms != new.cycle_ms:
+        yield Change(True, "timing", new.name, f"cycle {old.cycle_ms} -> {new.cycle_ms} ms")
+    if old.timeout_ms != new.timeout_ms:
+        # How long a receiver waits is its own affair, unless the sender is slower than that.
+        late = 0 < old.timeout_ms <= new.cycle_ms or 0 < new.timeout_ms <= old.cycle_ms
+        yield Change(late, "timing", new.name, f"timeout {old.timeout_ms} -> {new.timeout_ms} ms")
+    if old.inhibit_ms != new.inhibit_ms:
+        yield Change(False, "timing", new.name, f"inhibit time {old.inhibit_ms} -> {new.inhibit_ms} ms")
+
+
+def _signals(old: Message, new: Message) -> Iterator[Change]:
+    was, now = ({s.name: s for s in message.signals} for message in (old, new))
+    # As with messages: another name for the same bits.
+    lost = {(s.start, s.length): s for name, s in was.items() if name not in now}
+    for name, signal in now.items():
+        where = f"{new.name}.{name}"
+        before = was.get(name)
+        if before is None:
+            before = lost.get((signal.start, signal.length))
+            if before is None:
+                yield _new_signal(old, signal, where)
+                continue
+            del lost[signal.start, signal.length]
+            yield Change(False, "name", where, f"was called {before.name}; the bits are the same")
+        yield from _signal(before, signal, where)
+    for signal in lost.values():
+        text = f"signal is gone; bits {signal.start} to {signal.start + signal.length - 1} now say 0"
+        yield Change(True, "signal", f"{new.name}.{signal.name}", text)
+
+
+def _new_signal(old: Message, signal: Signal, where: str) -> Change:
+    bits = set(range(signal.start, signal.start + signal.length))
+    taken = [s.name for s in old.signals if bits & set(range(s.start, s.start + s.length))]
+    if taken:
+        return Change(True, "signal", where, f"new signal in bits that were {', '.join(taken)}")
+    if signal.start + signal.length > 8 * old.length:
+        return Change(True, "signal", where, "new signal behind the old end of the message")
+    zero = signal.minimum <= signal.offset <= signal.maximum
+    text = f"new signal in reserved bits; an old sender says {signal.offset:g} {signal.unit}"
+    return Change(not zero, "signal", where, text if zero else f"{text}, which is outside its range")
+
+
+def _signal(old: Signal, new: Signal, where: str) -> Iterator[Change]:
+    def layout(s: Signal) -> str:
+        return f"{s.start}|{s.length}@1{'-' if s.signed else '+'}"
+
+    if layout(old) != layout(new):
+        yield Change(True, "layout", where, f"{layout(old)} -> {layout(new)}")
+    if (old.factor, old.offset) != (new.factor, new.offset):
+        yield Change(
+            True,
+            "scaling",
+            where,
+            f"({old.factor!r},{old.offset:g}) -> ({new.factor!r},{new.offset:g}) [factor,offset]",
+        )
+    if old.unit != new.unit:
+        yield Change(True, "unit", where, f"{old.unit} -> {new.unit}")
+    if (old.minimum, old.maximum) != (new.minimum, new.maximum):
+        text = f"[{old.minimum:.10g}|{old.maximum:.10g}] -> [{new.minimum:.10g}|{new.maximum:.10g}]"
+        wider = new.minimum < old.minimum or new.maximum > old.maximum
+        narrower = new.minimum > old.minimum or new.maximum < old.maximum
+        who = [who for who, does in (("an old", wider), ("a new", narrower)) if does]
+        yield Change(True, "range", where, f"{text}; {' and '.join(who)} receiver refuses what it does not know")
+    if old.invalid_raw != new.invalid_raw:
+        code = [f"{raw:#x}" if raw is not None else "none" for raw in (old.invalid_raw, new.invalid_raw)]
+        yield Change(True, "invalid code", where, f"{code[0]} -> {code[1]}")
+    yield from _values(old, new, where)
+    if old.receivers != new.receivers:
+        text = f"receivers {' '.join(old.receivers)} -> {' '.join(new.receivers)}"
+        yield Change(False, "receivers", where, text)
+
+
+def _values(old: Signal, new: Signal, where: str) -> Iterator[Change]:
+    for raw in sorted(old.choices.keys() | new.choices.keys()):
+        before, after = old.choices.get(raw), new.choices.get(raw)
+        if before == after:
+            continue
+        if before is None:
+            yield Change(False, "value", where, f"{raw} is now {after}")
+        elif after is None:
+            yield Change(True, "value", where, f"{raw} no longer means {before}")
+        else:
+            yield Change(True, "value", where, f"{raw} meant {before} and now means {after}")

@@ -1,0 +1,134 @@
+"""Test vectors of a network: random images as the Python codec sees them, as a binary stream and as readable examples.
+
+The stream is what the generated host test reads, little endian: 8 bytes magic, u32 network hash, u32 images; then an image after
+the other, and in it the messages of the build in DBC order:
+
+- received: payload, u8 "every signal in range", f64 value of each received signal;
+- sent: f64 of each signal behind the E2E header (NaN: no value), payload they make.
+
+Every other received payload is random bits, valid or not; the rest are what the sender makes. Counters are the image's number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from struct import Struct
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_dbc import Message, Signal
+from atalante_hal.codec import Vector
+from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
+from atalante_hal.frame import FRAME_BYTES
+from atalante_hal.image import TransmitImage
+
+if TYPE_CHECKING:
+    from atalante_tools.dbc.c_code import Build
+
+MAGIC: Final = b"ATVEC\x00\x00\x01"
+HEADER: Final = Struct("<8sII")
+#: Where the payload begins in a frame record.
+_PAYLOAD: Final = 8
+
+
+class Vectors:
+    """Random images of a build; one seed, one sequence."""
+
+    def __init__(self, build: Build, seed: int) -> None:
+        self._build = build
+        self._random = np.random.default_rng(seed)
+        self._sender = TransmitImage(build.messages)
+        self._codec = codec = self._sender.codec
+        self._received = codec.template()
+        self._decoded = np.empty(codec.size)
+        self._in_range = np.ones(len(build.messages), np.uint8)
+        octets = self._received.view(np.uint8).reshape(-1, FRAME_BYTES)
+        self._counters = octets[:, _PAYLOAD + COUNTER_BYTE]
+        self._crcs = octets.view("<u2")[:, _PAYLOAD // 2]
+        self._protected = [
+            (row.data[_PAYLOAD + CRC_BYTES : _PAYLOAD + m.length], data_id_bytes(m.data_id))
+            for row, m in zip(octets, build.messages, strict=True)
+        ]
+        self._minimum = np.array([s.minimum for _, s in codec.signals])
+        self._maximum = np.array([s.maximum for _, s in codec.signals])
+        # NaN is encoded as the invalid code; what has none stays at its minimum.
+        no_code = [s.invalid_raw is None for _, s in codec.signals]
+        self._invalid = np.where(no_code, self._minimum, np.nan)
+        self._order = self._stream_order()
+
+    def _stream_order(self) -> npt.NDArray[np.intp]:
+        """Where each byte of an image of the stream is in `_record`'s parts."""
+        build, codec = self._build, self._codec
+        rows = len(build.messages)
+        parts = (FRAME_BYTES * rows, FRAME_BYTES * rows, 8 * codec.size, 8 * codec.size, rows)
+        received, sent, decoded, wanted, in_range = (sum(parts[:place]) for place in range(len(parts)))
+
+        def values(start: int, message: Message, signals: Iterable[Signal]) -> list[int]:
+            places = [start + 8 * codec.index(message.name, s.name) for s in signals]
+            return [place + byte for place in places for byte in range(8)]
+
+        def payload(start: int, row: int, message: Message) -> range:
+            first = start + FRAME_BYTES * row + _PAYLOAD
+            return range(first, first + message.length)
+
+        order: list[int] = []
+        for row, message in enumerate(build.messages):
+            if heard := build.received(message):
+                order += [*payload(received, row, message), in_range + row, *values(decoded, message, heard)]
+            if build.sends(message):
+                order += [*values(wanted, message, behind_header(message)), *payload(sent, row, message)]
+        return np.array(order, np.intp)
+
+    def header(self, images: int) -> bytes:
+        """What the stream begins with."""
+        return HEADER.pack(MAGIC, self._build.network.hash32, images)
+
+    def images(self, count: int) -> Iterator[bytes]:
+        """The stream, an image at a time; call it once. The first ones are the edges of the ranges and the invalid codes."""
+        for image in range(count):
+            wanted = self._next(image)
+            parts = (self._received, self._sender.frames, self._decoded, wanted, self._in_range)
+            yield np.concatenate([part.view(np.uint8) for part in parts])[self._order].tobytes()
+
+    def examples(self) -> Iterator[dict[str, Any]]:
+        """Readable vectors: the edges and one random image, a message each. Call it once."""
+        for image, what in enumerate(("minimum", "maximum", "invalid codes", "random")):
+            self._next(image)
+            for row, message in enumerate(self._build.messages):
+                values = {
+                    s.name: float(self._decoded[self._codec.index(message.name, s.name)]) for s in message.signals
+                }
+                yield {
+                    "message": message.name,
+                    "what": what,
+                    "id": message.frame_id,
+                    "data_id": message.data_id,
+                    "payload": self._received["data"][row][: message.length].tobytes().hex(),
+                    "in_range": bool(self._in_range[row]),
+                    "values": values,
+                }
+
+    def _next(self, image: int) -> Vector:
+        """Make one image and return the values that were sent."""
+        edges = (self._minimum, self._maximum, self._invalid)
+        wanted = edges[image] if image < len(edges) else self._random.uniform(self._minimum, self._maximum)
+        self._sender.values[:] = wanted
+        self._sender.seal()
+        if image % 2 and image > len(edges):
+            data = self._received["data"]
+            data[:] = self._random.integers(0, 256, data.shape, np.uint8)
+            self._counters.fill(image & 0xFF)
+            self._crcs[:] = [crc(payload, data_id) for payload, data_id in self._protected]
+        else:
+            self._received[:] = self._sender.frames
+        self._in_range.fill(1)
+        if not self._codec.decode(self._received, self._decoded):
+            self._in_range[self._codec.rows_outside()] = 0
+        return wanted
+
+
+def behind_header(message: Message) -> list[Signal]:
+    """The signals that are the sender's business: all but those E2E protect writes."""
+    return [s for s in message.signals if s.name not in ("Crc", "Counter")]
