@@ -1,0 +1,227 @@
+"""`atalante doctor`: every answer on machines of all kinds, and the real one."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from atalante_tools import machine as machine_module
+from atalante_tools.cli import cli
+from atalante_tools.doctor import Check, examine
+from atalante_tools.machine import Interface, ThisMachine
+
+GOOD = Interface("vcan0", virtual=True, up=True, mtu=72, queue=1000)
+
+
+@dataclass
+class AnyMachine:
+    """A machine that lacks nothing, unless told."""
+
+    refusal: str | None = None
+    has_vcan: bool = True
+    there: list[Interface] = field(default_factory=lambda: [GOOD])
+    priority: int = 99
+    memory: int | None = None
+    lacks: tuple[str, ...] = ()
+
+    def can_socket(self) -> str | None:
+        return self.refusal
+
+    def vcan(self) -> bool:
+        return self.has_vcan
+
+    def interfaces(self) -> list[Interface]:
+        return self.there
+
+    def realtime_priority(self) -> int:
+        return self.priority
+
+    def locked_memory(self) -> int | None:
+        return self.memory
+
+    def package(self, name: str) -> bool:
+        return name not in self.lacks
+
+    def program(self, name: str) -> bool:
+        return name not in self.lacks
+
+
+def missing(machine: AnyMachine, interface: str, *channels: str) -> dict[str, Check]:
+    return {check.name: check for check in examine(machine, interface, channels) if not check.ok}
+
+
+def needed(machine: AnyMachine, interface: str, *channels: str) -> list[str]:
+    return [name for name, check in missing(machine, interface, *channels).items() if check.needed]
+
+
+@pytest.mark.parametrize(("interface", "channels"), [("embedded", ()), ("socketcan", ("vcan0",)), ("virtual", ("x",))])
+def test_a_good_machine_lacks_nothing(interface: str, channels: tuple[str, ...]) -> None:
+    assert missing(AnyMachine(), interface, *channels) == {}
+
+
+def test_a_kernel_without_can_matters_to_socketcan_alone() -> None:
+    bare = AnyMachine(refusal="Address family not supported by protocol", there=[])
+    assert needed(bare, "embedded") == []
+    assert needed(bare, "virtual", "x") == []
+    assert needed(bare, "socketcan", "vcan0") == ["AF_CAN", "vcan", "vcan0"]
+    assert needed(bare, "socketcan", "can0") == ["AF_CAN", "can0"]
+    assert "modprobe can-raw" in missing(bare, "socketcan", "can0")["AF_CAN"].fix
+
+
+@pytest.mark.parametrize(
+    ("interface", "fix"),
+    [
+        (Interface("vcan0", True, True, 16, 1000), "ip link set vcan0 down; ip link set vcan0 mtu 72 up"),
+        (
+            Interface("can0", False, True, 16, 1000),
+            "ip link set can0 down; ip link set can0 up type can bitrate 1000000 dbitrate 5000000 fd on",
+        ),
+        (Interface("vcan0", True, False, 72, 1000), "ip link set vcan0 up"),
+    ],
+)
+def test_an_interface_that_cannot_carry_the_robot_says_what_to_type(interface: Interface, fix: str) -> None:
+    found = missing(AnyMachine(there=[interface]), "socketcan", interface.name)
+    assert list(found) == [interface.name]
+    assert found[interface.name].needed
+    assert found[interface.name].fix == fix
+
+
+def test_a_short_queue_is_advice() -> None:
+    found = missing(AnyMachine(there=[Interface("can0", False, True, 72, 10)]), "socketcan", "can0")
+    assert not found["can0"].needed
+    assert found["can0"].fix == "ip link set can0 txqueuelen 1000"
+
+
+def test_a_channel_that_is_not_there_can_be_made() -> None:
+    found = missing(AnyMachine(), "socketcan", "vcan0", "vcan1")
+    assert list(found) == ["vcan1"]
+    assert found["vcan1"].fix == "ip link add vcan1 type vcan && ip link set vcan1 mtu 72 txqueuelen 1000 up"
+
+
+def test_without_a_channel_all_interfaces_are_shown_and_none_is_needed() -> None:
+    machine = AnyMachine(there=[GOOD, Interface("can7", False, False, 72, 1000)])
+    assert needed(machine, "socketcan") == []
+    assert list(missing(machine, "socketcan")) == ["can7"]
+
+
+def test_pybullet_is_for_the_emulated_robot_and_pinocchio_for_everything() -> None:
+    machine = AnyMachine(lacks=("pybullet", "pinocchio", "zenoh", "mcap", "matplotlib", "gcc", "candump"))
+    assert needed(machine, "embedded") == ["pinocchio", "pybullet"]
+    assert needed(machine, "socketcan", "vcan0") == ["pinocchio"]
+    assert set(missing(machine, "embedded")) == set(machine.lacks)
+    assert missing(machine, "embedded")["zenoh"].fix == "pip install 'atalante-hal[telemetry]'"
+
+
+def test_python_can_names_its_interfaces() -> None:
+    found = missing(AnyMachine(), "pigeon", "x")
+    assert found["python-can"].needed
+    assert "virtual" in found["python-can"].fix
+
+
+def test_realtime_rights_are_advice() -> None:
+    machine = AnyMachine(priority=0, memory=8 << 20)
+    assert needed(machine, "socketcan", "vcan0") == []
+    found = missing(machine, "socketcan", "vcan0")
+    assert "no SCHED_FIFO" in found["real-time priority"].text
+    assert "8192 KiB" in found["locked memory"].text
+
+
+def test_what_is_missing_says_what_to_type() -> None:
+    worst = AnyMachine(
+        "no such family", False, [], 0, 0, ("pybullet", "pinocchio", "zenoh", "mcap", "matplotlib", "gcc", "candump")
+    )
+    for interface in ("embedded", "socketcan", "pigeon"):
+        for check in missing(worst, interface).values():
+            assert check.fix, check
+
+
+# -- this machine ----------------------------------------------------------------------------------------------------
+
+
+def sys_tree(root: Path, **interfaces: tuple[int, str, int, int, bool]) -> ThisMachine:
+    for name, (kind, flags, mtu, queue, hardware) in interfaces.items():
+        folder = root / "class/net" / name
+        folder.mkdir(parents=True)
+        for file, value in (("type", kind), ("flags", flags), ("mtu", mtu), ("tx_queue_len", queue)):
+            (folder / file).write_text(f"{value}\n")
+        if hardware:
+            (folder / "device").mkdir()
+    return ThisMachine(root)
+
+
+def test_can_interfaces_are_read_from_sys(tmp_path: Path) -> None:
+    machine = sys_tree(
+        tmp_path,
+        eth0=(1, "0x1003", 1500, 1000, True),
+        can0=(280, "0x40080", 72, 10, True),
+        vcan0=(280, "0xc1", 16, 1000, False),
+    )
+    assert machine.interfaces() == [
+        Interface("can0", virtual=False, up=False, mtu=72, queue=10),
+        Interface("vcan0", virtual=True, up=True, mtu=16, queue=1000),
+    ]
+    assert machine.vcan()
+
+
+def test_vcan_is_a_module_without_interfaces_too(tmp_path: Path) -> None:
+    assert not ThisMachine(tmp_path).vcan()
+    (tmp_path / "module/vcan").mkdir(parents=True)
+    assert ThisMachine(tmp_path).vcan()
+
+
+def test_this_machine_answers_everything() -> None:
+    machine = ThisMachine()
+    assert machine.package("numpy")
+    assert not machine.package("no_such_package_at_all")
+    assert machine.program("sh")
+    assert not machine.program("no-such-program-at-all")
+    assert machine.realtime_priority() >= 0
+    assert (machine.locked_memory() or 0) >= 0
+    assert machine.can_socket() is None or isinstance(machine.can_socket(), str)
+
+
+# -- the command -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def bare(monkeypatch: pytest.MonkeyPatch) -> AnyMachine:
+    machine = AnyMachine(refusal="Address family not supported by protocol", there=[])
+    monkeypatch.setattr(machine_module, "ThisMachine", lambda: machine)
+    return machine
+
+
+def test_it_ends_well_when_nothing_needed_is_missing(bare: AnyMachine) -> None:
+    result = CliRunner().invoke(cli, ["doctor"])
+    assert result.exit_code == 0
+    assert (
+        "no    AF_CAN: no SocketCAN (Address family not supported by protocol)\n       type: modprobe" in result.stdout
+    )
+
+
+def test_it_fails_and_names_what_is_needed(bare: AnyMachine) -> None:
+    result = CliRunner().invoke(
+        cli, ["doctor", "-i", "socketcan", "-c", "left_leg=can0,right_leg=can1,left_sense=can0,right_sense=can1"]
+    )
+    assert result.exit_code == 1
+    assert (
+        result.stderr
+        == "atalante: socketcan left_leg=can0,right_leg=can1,left_sense=can0,right_sense=can1 is not ready: AF_CAN, can0, can1\n"
+    )
+
+
+def test_json_is_one_check_a_line(bare: AnyMachine) -> None:
+    result = CliRunner().invoke(cli, ["doctor", "-i", "socketcan", "-c", "vcan0", "--json"])
+    checks = [json.loads(line) for line in result.stdout.splitlines()]
+    assert {tuple(check) for check in checks} == {("name", "ok", "needed", "text", "fix")}
+    assert [c["name"] for c in checks if c["needed"] and not c["ok"]] == ["AF_CAN", "vcan", "vcan0"]
+    assert all(bool(c["fix"]) is not c["ok"] for c in checks)
+
+
+def test_the_embedded_robot_has_no_channel() -> None:
+    result = CliRunner().invoke(cli, ["doctor", "-c", "vcan0"])
+    assert result.exit_code == 2
+    assert "the embedded robot has no channel; to ask about vcan0 say -i socketcan" in result.stderr

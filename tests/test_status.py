@@ -1,0 +1,296 @@
+"""`atalante status`: what a listener knows, the table, the object, the exit code."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from atalante_dbc import Network, wire_time
+from atalante_hal.cia402 import DriveState
+from atalante_hal.frame import FRAME, Frames, new_frames
+from atalante_hal.robot import JOINTS, Robot
+from atalante_tools import rig as rig_module
+from atalante_tools import status
+from atalante_tools.cli import cli
+from atalante_tools.observer import NodeReport, Observer, Report, as_json
+from atalante_tools.options import Target
+from atalante_tools.status import render
+
+TARGET = Target("virtual", "test", lockstep=False)
+
+
+class Tap:
+    """All frames of the embedded bus, in order."""
+
+    def __init__(self) -> None:
+        self.batches: list[Frames] = []
+
+    def sent(self, frames: Frames) -> None:
+        self.batches.append(frames.copy())
+
+    def received(self, frames: Frames, count: int) -> None:
+        self.batches.append(frames[:count].copy())
+
+    def cycles(self, sync: int) -> list[Frames]:
+        """A block a cycle, each beginning with this identifier."""
+        frames = np.concatenate(self.batches)
+        return np.split(frames, np.flatnonzero(frames["can_id"] == sync))[1:]
+
+
+@pytest.fixture(scope="module")
+def traffic(network: Network, robot: Robot, urdf_text: str) -> list[Frames]:
+    """Every frame of half a second from power-on to ACTIVE, a block a cycle."""
+    from atalante_emulator.body import PyBulletBody
+    from atalante_emulator.emulator import Emulator
+    from atalante_emulator.pendant import Operator
+    from atalante_hal.bus.pair import lockstep_pair
+    from atalante_hal.hal import Hal
+    from atalante_tools.pose_hold import PoseHold
+
+    ours, theirs = lockstep_pair()
+    body = PyBulletBody(urdf_text)
+    emulator = Emulator(network, robot, body, theirs, operator=Operator(0.25))
+    ours.step = emulator.poll
+    tap = Tap()
+    hal = Hal(network, robot, ours, tap=tap)
+    controller = PoseHold(robot)
+    for _ in range(510):
+        state = hal.read()
+        if state.supervisor.name == "ACTIVE":
+            if not controller.elapsed:
+                controller.reset(state)
+            hal.write(controller.update(state))
+        else:
+            hal.hold()
+    body.close()
+    assert hal.state.supervisor.name == "ACTIVE"
+    return tap.cycles(network.message("SYNC_LEFT_LEG").frame_id)[:500]
+
+
+def observe(network: Network, robot: Robot, cycles: list[Frames], start: float = 10.0) -> tuple[Observer, float]:
+    """An observer that heard these cycles, and the time then."""
+    observer = Observer(network, robot, start)
+    block = new_frames(64)
+    for number, frames in enumerate(cycles, 1):
+        block[: len(frames)] = frames
+        observer.take(block, len(frames), start + number * 1e-3)
+    return observer, start + len(cycles) * 1e-3
+
+
+def node(report: Report, name: str) -> NodeReport:
+    return next(n for n in report.nodes if n.node == name)
+
+
+def test_everything_the_nodes_say_is_known(network: Network, robot: Robot, traffic: list[Frames]) -> None:
+    observer, now = observe(network, robot, traffic)
+    report = observer.report(now)
+    assert report.supervisor == "ACTIVE"
+    assert report.assistance_factor == pytest.approx(0.25)
+    assert report.dead_man is True
+    assert report.cycle is not None
+    assert abs(report.cycle - 500) <= 1
+    assert report.crc_errors == 0
+    assert report.foreign == 0
+    assert "DRIVES_ENABLED" in report.conditions
+    assert [n.node for n in report.nodes] == [n.name for n in network.nodes]
+    for n in report.nodes:
+        assert n.age_ms is not None
+        assert n.age_ms <= (10 if n.kind == "haptics" else 1), n
+        assert (n.late, n.dbc_ok) == (False, True), n
+        assert n.kind == "master" or n.supply_v == pytest.approx(48.0)
+    assert node(report, "LEFT_SK").state == "OPERATION_ENABLED"
+    assert node(report, "LEFT_SK").temperature_degc == pytest.approx(25.0)
+    assert node(report, "IMU_TORSO").state == "OK"
+    assert node(report, "PENDANT").state == "OPERATIONAL"
+    assert [j.drive_state for j in report.joints] == ["OPERATION_ENABLED"] * 12
+
+
+def test_joints_are_in_degrees_on_the_joints_side(network: Network, robot: Robot) -> None:
+    from dataclasses import replace
+
+    from atalante_hal.image import TransmitImage
+
+    turned = replace(robot, polarity=np.full(12, -1.0))
+    image = TransmitImage([network.message(f"{joint.upper()}_STATE") for joint in JOINTS])
+    codec = image.codec
+    image.values[codec.slice("DriveState")] = DriveState.FAULT
+    image.values[codec.slice("Position")] = np.radians(30.0) * robot.gear
+    image.values[codec.slice("Velocity")] = np.radians(-5.0) * robot.gear
+    image.values[codec.slice("Torque")] = 12.5
+    for robot_, sign in ((robot, 1.0), (turned, -1.0)):
+        observer = Observer(network, robot_, 0.0)
+        observer.take(image.seal(), 12, 0.001)
+        for joint in observer.report(0.002).joints:
+            assert joint.position_deg == pytest.approx(sign * 30.0, abs=1e-3)
+            assert joint.velocity_deg_s == pytest.approx(sign * -5.0, abs=0.02)
+            assert joint.torque_nm == pytest.approx(sign * 12.5)
+            assert joint.drive_state == "FAULT"
+
+
+def test_a_node_that_falls_silent_grows_old(network: Network, robot: Robot, traffic: list[Frames]) -> None:
+    ids = {m.frame_id for m in network.sent_by("LEFT_SK")}
+    silent = [frames[[i not in ids for i in frames["can_id"].tolist()]] for frames in traffic[400:]]
+    observer, now = observe(network, robot, traffic[:400] + silent)
+    report = observer.report(now)
+    lost = node(report, "LEFT_SK")
+    assert lost.late
+    assert lost.age_ms == pytest.approx(100, abs=1)
+    assert [n.node for n in report.nodes if n.late] == ["LEFT_SK"]
+    assert f"LEFT_SK          {lost.age_ms} ms ago" in render(report, TARGET)
+
+
+def test_what_was_never_heard_is_none_and_not_zero(network: Network, robot: Robot) -> None:
+    report = Observer(network, robot, 0.0).report(1.0)
+    assert report.supervisor is None
+    assert all(n.age_ms is None and n.late and n.state is None and n.dbc_ok is None for n in report.nodes)
+    assert all(j.position_deg is None for j in report.joints)
+    assert "no HAL (no SYNC was heard)" in render(report, TARGET)
+
+
+def test_another_dbc_and_damaged_frames_are_told(network: Network, robot: Robot, traffic: list[Frames]) -> None:
+    from dataclasses import replace
+
+    observer, now = observe(replace(network, hash32=network.hash32 ^ 1), robot, traffic)
+    other = observer.report(now)
+    assert all(n.dbc_ok is False for n in other.nodes)
+    assert "OTHER" in render(other, TARGET)
+
+    damaged = [frames.copy() for frames in traffic[:100]]
+    for frames in damaged:
+        frames["data"][0, 5] ^= 0x10
+    observer, now = observe(network, robot, damaged)
+    assert observer.report(now).crc_errors == 100
+
+
+def test_load_is_the_wire_time_of_what_was_heard(network: Network, robot: Robot, traffic: list[Frames]) -> None:
+    observer, now = observe(network, robot, traffic)
+    load = observer.report(now).load
+    bus_of = {m.frame_id: m.bus for m in network.messages}
+    for bus, (measured, worst) in load.items():
+        frames = np.concatenate(traffic)
+        lengths = [
+            n for i, n in zip(frames["can_id"].tolist(), frames["len"].tolist(), strict=True) if bus_of[i] == bus
+        ]
+        assert measured == pytest.approx(sum(map(wire_time, lengths)) / 0.5)
+        assert worst == pytest.approx(network.bus_load()[bus])
+        assert 0.3 < measured <= worst
+    assert observer.report(now + 1.0).load["left_leg"][0] == 0.0
+
+
+def test_foreign_frames_are_counted(network: Network, robot: Robot) -> None:
+    observer = Observer(network, robot, 0.0)
+    frames = new_frames(3)
+    frames["can_id"] = 0x7FE
+    observer.take(frames, 3, 0.001)
+    report = observer.report(0.01)
+    assert (report.frames, report.foreign) == (3, 3)
+    assert "3 of no message of this network" in render(report, TARGET)
+
+
+def test_an_emergency_is_told(network: Network, robot: Robot) -> None:
+    from atalante_hal.image import TransmitImage
+
+    image = TransmitImage([network.message("LEFT_SK_EMCY")])
+    image.values[image.codec.index("LEFT_SK_EMCY", "ErrorRegister")] = 0x09
+    image.values[image.codec.index("LEFT_SK_EMCY", "ErrorCode")] = 0x4310
+    observer = Observer(network, robot, 0.0)
+    observer.take(image.seal(), 1, 0.001)
+    assert node(observer.report(0.002), "LEFT_SK").emergency == "0x4310 (register 0x09)"
+
+
+def test_the_object_says_all_of_it(network: Network, robot: Robot, traffic: list[Frames]) -> None:
+    observer, now = observe(network, robot, traffic)
+    value = json.loads(json.dumps(as_json(observer.report(now))))
+    assert value["supervisor"] == "ACTIVE"
+    assert set(value["load"]["left_leg"]) == {"measured", "worst_case"}
+    assert value["joints"][3]["joint"] == "left_SK"
+    assert len(value["nodes"]) == len(network.nodes)
+
+
+# -- the command -----------------------------------------------------------------------------------------------------
+
+
+class Recorded:
+    """A bus on which these cycles arrive, one at each `receive`, and on which nothing may be sent."""
+
+    name = "recorded"
+    dropped = 2
+    stamps = np.zeros(256, np.int64)
+
+    def __init__(self, cycles: list[Frames], clock: Callable[[], None]) -> None:
+        self._cycles, self._clock = iter(cycles), clock
+        self.closed = False
+
+    def send(self, frames: Frames) -> None:
+        raise AssertionError("status sends nothing")
+
+    def receive(self, frames: Frames, timeout: float = 0.0) -> int:
+        self._clock()
+        cycle = next(self._cycles, np.zeros(0, FRAME))
+        frames[: len(cycle)] = cycle
+        return len(cycle)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def invoke(monkeypatch: pytest.MonkeyPatch, cycles: list[Frames], *arguments: str) -> Result:
+    now = [100.0]
+
+    def tick() -> None:
+        now[0] += 1e-3
+
+    class Clock:
+        monotonic = staticmethod(lambda: now[0])
+
+    bus = Recorded(cycles, tick)
+    monkeypatch.setattr(status, "time", Clock)
+    monkeypatch.setattr(rig_module, "open_buses", lambda network, target: dict.fromkeys(network.buses, bus))
+    result = CliRunner().invoke(cli, ["status", "-i", "virtual", "-c", "test", *arguments])
+    assert bus.closed
+    return result
+
+
+def test_the_table_is_printed(monkeypatch: pytest.MonkeyPatch, traffic: list[Frames]) -> None:
+    result = invoke(monkeypatch, traffic, "--for", "0.5")
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.startswith("virtual test: HAL ACTIVE, cycle ")
+    assert "assistance factor 0.25" in result.stdout
+    assert "dead-man pressed" in result.stdout
+    assert "2 lost" in result.stdout
+    assert "left_SK" in result.stdout
+    assert result.stderr == ""
+
+
+def test_json_is_one_object(monkeypatch: pytest.MonkeyPatch, traffic: list[Frames]) -> None:
+    result = invoke(monkeypatch, traffic, "--for", "0.5", "--json")
+    assert result.exit_code == 0
+    (line,) = result.stdout.splitlines()
+    assert json.loads(line)["supervisor"] == "ACTIVE"
+
+
+def test_silence_fails_with_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = invoke(monkeypatch, [], "--for", "0.1", "--json")
+    assert result.exit_code == 1
+    assert (
+        "nothing was heard on virtual test for 0.1 s: start a robot (atalante emulator -i virtual -c test)"
+        in result.stderr
+    )
+    assert json.loads(result.stdout)["frames"] == 0
+
+
+def test_a_latched_fault_is_code_4(
+    monkeypatch: pytest.MonkeyPatch, network: Network, robot: Robot, traffic: list[Any]
+) -> None:
+    from atalante_hal.image import TransmitImage
+
+    image = TransmitImage([network.message("LEFT_SK_STATE")])
+    image.values[image.codec.index("LEFT_SK_STATE", "DriveState")] = DriveState.FAULT
+    result = invoke(monkeypatch, [image.seal()], "--for", "0.1")
+    assert result.exit_code == 4
+    assert result.stderr == "atalante: a fault is latched: left_SK\n"

@@ -1,0 +1,201 @@
+"""What somebody who only listens knows of the robot: `frames -> process image of the whole network -> Report`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+from atalante_dbc import Message, Network, Node, wire_time
+from atalante_hal.frame import Frames
+from atalante_hal.image import NEVER, ReceiveImage
+from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.supervisor import Condition
+
+#: Signals that hold a node's own state, in the order in which they tell more.
+_STATES: Final = ("HalState", "DriveState", "ImuState", "FootState", "NodeState")
+MS: Final = 1000.0
+
+
+@dataclass(frozen=True)
+class NodeReport:
+    """One node as its frames describe it; None: it did not say."""
+
+    node: str
+    kind: str
+    age_ms: int | None  # since its fastest message; None: never heard
+    late: bool  # older than the DBC's timeout
+    state: str | None
+    dbc_ok: bool | None
+    supply_v: float | None
+    temperature_degc: float | None
+    error_flags: int | None
+    emergency: str | None  # the last one
+
+
+@dataclass(frozen=True)
+class JointReport:
+    """One joint, on the joint's side of the gear, in the units of the terminal; None: not heard."""
+
+    joint: str
+    position_deg: float | None
+    velocity_deg_s: float | None
+    torque_nm: float | None
+    drive_state: str | None
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything heard so far; load and frame count are of the time since the last report."""
+
+    seconds: float
+    supervisor: str | None
+    cycle: int | None
+    assistance_factor: float | None
+    overruns: int | None
+    conditions: tuple[str, ...]
+    dead_man: bool | None
+    nodes: tuple[NodeReport, ...]
+    joints: tuple[JointReport, ...]
+    load: dict[str, tuple[float, float]]  # bus: measured, the DBC's worst case; shares of its time
+    frames: int
+    foreign: int  # frames that are no message of the network
+    crc_errors: int
+    dropped: int
+
+
+class Observer:
+    """Collects the frames of all nodes."""
+
+    def __init__(self, network: Network, robot: Robot, now: float) -> None:
+        """Begin at `now` [s]."""
+        self._network, self._robot = network, robot
+        self._image = ReceiveImage(network.messages)
+        self._wire_time = {
+            m.frame_id: (m.bus, wire_time(m.length, network.nominal_bitrate, network.data_bitrate))
+            for m in network.messages
+        }
+        self._worst = network.bus_load()
+        self._aged_to = now
+        self._begin(now)
+
+    def _begin(self, now: float) -> None:
+        self._since = now
+        self._busy = dict.fromkeys(self._network.buses, 0.0)
+        self._frames = self._foreign = 0
+
+    def take(self, frames: Frames, count: int, now: float) -> None:
+        """`frames[:count]` have arrived by `now` [s]."""
+        elapsed = int((now - self._aged_to) * MS)
+        self._aged_to += elapsed / MS
+        self._image.new_cycle(elapsed)
+        if not count:
+            return
+        foreign = self._image.accept_each(frames, count)
+        self._frames += count
+        self._foreign += len(foreign)
+        for frame_id in frames["can_id"][:count].tolist():
+            known = self._wire_time.get(frame_id)
+            if known is not None:
+                self._busy[known[0]] += known[1]
+
+    def report(self, now: float, dropped: int = 0) -> Report:
+        """What is known; measuring of load and frames begins anew."""
+        hal = next(node for node in self._network.nodes if node.kind == "master")
+        sync = max(self._fast(hal), key=lambda m: -self._age(m))
+        pendant = self._network.message("PENDANT_STATE")
+        conditions = self._value("HAL_STATUS", "DiagnosticCode")
+        cycle, overruns = self._value(sync.name, "Cycle"), self._value("HAL_STATUS", "Overruns")
+        dead_man = self._value(pendant.name, "DeadMan")
+        seconds = max(now - self._since, 1e-9)
+        report = Report(
+            seconds=seconds,
+            supervisor=self._choice(sync.name, "HalState"),
+            cycle=None if cycle is None else int(cycle),
+            assistance_factor=self._value("HAL_STATUS", "AssistanceFactor"),
+            overruns=None if overruns is None else int(overruns),
+            conditions=tuple(str(c.name) for c in Condition(int(conditions or 0))),
+            dead_man=None if dead_man is None or self._late(pendant) else bool(dead_man),
+            nodes=tuple(self._node(node) for node in self._network.nodes),
+            joints=tuple(self._joint(index) for index in range(len(JOINTS))),
+            load={bus: (self._busy[bus] / seconds, self._worst[bus]) for bus in self._network.buses},
+            frames=self._frames,
+            foreign=self._foreign,
+            crc_errors=self._image.crc_errors,
+            dropped=dropped,
+        )
+        self._begin(now)
+        return report
+
+    def _fast(self, node: Node) -> list[Message]:
+        cyclic = [m for m in self._network.sent_by(node.name) if m.cycle_ms]
+        fastest = min(m.cycle_ms for m in cyclic)
+        if node.kind == "master":  # its commands may fail to come for reasons of their own
+            return [m for m in cyclic if m.name.startswith("SYNC_")]
+        return [m for m in cyclic if m.cycle_ms == fastest]
+
+    def _age(self, message: Message) -> int:
+        return int(self._image.age[self._image.codec.rows[message.name]])
+
+    def _late(self, message: Message) -> bool:
+        return self._age(message) > message.timeout_ms
+
+    def _node(self, node: Node) -> NodeReport:
+        message = min(self._fast(node), key=self._age)
+        age = self._age(message)
+        status = f"{node.name}_STATUS"
+        states = [self._choice(m, s) for s in _STATES for m in (message.name, status)]
+        their_hash = self._value(status, "DbcHash")
+        flags = self._value(status, "ErrorFlags")
+        return NodeReport(
+            node=node.name,
+            kind=node.kind,
+            age_ms=None if age >= NEVER else age,
+            late=self._late(message),
+            state=next((state for state in states if state is not None), None),
+            dbc_ok=None if their_hash is None else their_hash == self._network.hash32,
+            supply_v=self._value(status, "SupplyVoltage"),
+            temperature_degc=self._value(message.name, "Temperature"),
+            error_flags=None if flags is None else int(flags),
+            emergency=self._emergency(node),
+        )
+
+    def _emergency(self, node: Node) -> str | None:
+        register, code = (self._value(f"{node.name}_EMCY", signal) for signal in ("ErrorRegister", "ErrorCode"))
+        return None if register is None or code is None else f"0x{int(code):04X} (register 0x{int(register):02X})"
+
+    def _joint(self, index: int) -> JointReport:
+        message = f"{JOINTS[index].upper()}_STATE"
+        ratio = float(self._robot.polarity[index] / self._robot.gear[index])
+        position, velocity = self._value(message, "Position"), self._value(message, "Velocity")
+        torque = self._value(message, "Torque")
+        return JointReport(
+            joint=JOINTS[index],
+            position_deg=None if position is None else math.degrees(position * ratio),
+            velocity_deg_s=None if velocity is None else math.degrees(velocity * ratio),
+            torque_nm=None if torque is None else torque * float(self._robot.polarity[index]),
+            drive_state=self._choice(message, "DriveState"),
+        )
+
+    def _value(self, message: str, signal: str) -> float | None:
+        """The last good value; None: the message never came, or the network has no such signal."""
+        row = self._image.codec.rows.get(message)
+        if row is None or self._image.age[row] >= NEVER:
+            return None
+        if not any(s.name == signal for s in self._network.message(message).signals):
+            return None
+        return float(self._image.values[self._image.codec.index(message, signal)])
+
+    def _choice(self, message: str, signal: str) -> str | None:
+        value = self._value(message, signal)
+        if value is None:
+            return None
+        choices = self._network.message(message).signal(signal).choices
+        return choices.get(int(value), f"{int(value)}?")
+
+
+def as_json(report: Report) -> dict[str, Any]:
+    """The report as one JSON object."""
+    value = asdict(report)
+    value["load"] = {bus: {"measured": load[0], "worst_case": load[1]} for bus, load in report.load.items()}
+    return value
