@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio
 import pybullet
 import pytest
+
 from atalante_control.model import (
     BASE_LINK,
     ExoskeletonParameters,
@@ -17,7 +18,6 @@ from atalante_control.model import (
     pinocchio_model,
     urdf,
 )
-
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, MIRROR_SIGN, load_robot
 
 ROBOT = load_robot()
