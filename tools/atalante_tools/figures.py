@@ -1,0 +1,84 @@
+"""Figures from a recording, drawn from what was recorded and nothing else."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from mcap.reader import make_reader
+
+from atalante_hal.telemetry.schema import message_class
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+_LEFT_HIP = "left_SH"
+_RIGHT_STANCE = 1
+
+
+def guide_shapes(recording: Path, picture: Path) -> None:
+    """The paper's figure of guide shapes: left hip over the phase, every right-stance step overlaid, one panel a shape."""
+    steps: dict[str, dict[int, list[tuple[float, ...]]]] = defaultdict(lambda: defaultdict(list))
+    for run, guide, upper, lower in _guide_samples(recording):
+        if guide.stance == _RIGHT_STANCE and guide.name and guide.name[0] == _LEFT_HIP:
+            desired = guide.desired_position[2]
+            degrees = np.degrees([desired + guide.error[0], desired, desired + upper, desired - lower])
+            steps[run][guide.step].append((guide.phase, *degrees.tolist()))
+    columns = min(3, max(1, len(steps)))
+    rows = math.ceil(len(steps) / columns) or 1
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(4.4 * columns, 3.2 * rows), sharex=True, sharey=True, squeeze=False
+    )
+    for axis, (run, walked) in zip(axes.flat, steps.items(), strict=False):
+        _panel(axis, run, walked)
+    for axis in axes.flat[len(steps) :]:
+        axis.set_visible(False)
+    for axis in axes[-1]:
+        axis.set_xlabel("phase t / T")
+    for row in axes:
+        row[0].set_ylabel("left hip [deg]")
+    figure.tight_layout()
+    figure.savefig(picture, dpi=110)
+    plt.close(figure)
+
+
+def _panel(axis: Any, run: str, walked: dict[int, list[tuple[float, ...]]]) -> None:
+    for number, samples in sorted(walked.items()):
+        phase, actual, desired, upper, lower = np.array(sorted(samples)).T
+        last = number == max(walked)
+        axis.plot(phase, actual, color="tab:blue", linewidth=0.7, alpha=0.7, label="measured" if last else None)
+        if last:
+            axis.plot(phase, desired, color="black", linewidth=1.0, linestyle="--", label="desired")
+            axis.plot(phase, upper, color="tab:red", linewidth=1.2, label="guide")
+            axis.plot(phase, lower, color="tab:red", linewidth=1.2)
+    axis.set_title(f"{run}: {len(walked)} right-stance steps", fontsize=9)
+    axis.legend(fontsize=7, loc="best")
+    axis.grid(alpha=0.3)
+
+
+def _guide_samples(recording: Path) -> Iterator[tuple[str, Any, float, float]]:
+    """(run, Guide, upper, lower [rad]) of every recorded cycle with a guide in it."""
+    classes = {name: message_class(name) for name in ("SystemState", "Guide", "Controller")}
+    run, edges = "", (0.0, 0.0)
+    pending: Any = None
+    with recording.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages(topics=["/system", "/guide", "/controller"]):
+            del channel
+            kind = schema.name.rsplit(".", 1)[-1] if schema else ""
+            decoded = classes[kind].FromString(message.data)
+            if kind == "SystemState":
+                run = decoded.run_name
+            elif kind == "Guide":
+                pending = decoded
+            else:
+                values = {field.name: field.value for field in decoded.field}
+                edges = tuple(values.get("guide", edges))
+            if pending is not None and kind == "Controller" and pending.cycle == decoded.cycle:
+                if max(edges) > 0.0:
+                    yield run, pending, edges[0], edges[1]
+                pending = None

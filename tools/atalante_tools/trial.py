@@ -1,0 +1,316 @@
+"""The paper's first experiment, behind `atalante demo` and `atalante hang`: steps in the air inside a virtual guide.
+
+guide shape -> certificate (announced) -> steps -> recording, summary.json, figure
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from atalante_tools.options import Target, json_option
+from atalante_tools.signals import stop_requested
+from atalante_tools.terminal import say, show_json, table
+
+if TYPE_CHECKING:
+    from atalante_control.controller import HangController
+    from atalante_dbc import Network
+    from atalante_hal.hal import Hal
+    from atalante_hal.loop import Statistics
+    from atalante_hal.robot import Robot
+    from atalante_hal.telemetry.process import TelemetryProcess
+    from atalante_hal.types import State
+    from atalante_tools.rig import Rig
+
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the user asked for."""
+
+    steps: int  # right-stance steps a shape
+    xi: float  # assistance factor
+    seed: int
+    out: Path  # run folder
+    record_rate: int  # Hz
+    can_log: Path | None
+
+
+@dataclass(frozen=True)
+class Result:
+    """One shape; the keys of `--json` and of summary.json."""
+
+    shape: str
+    certified: bool
+    steps: int  # completed right-stance steps
+    max_ratio: float  # largest |e| / q_bound from the first completed step on
+    inside: float  # share of the time both assisted joints were in the guide
+    filter_active: float  # share of the time the filter acted
+    cycles: int
+    real_time_factor: float
+    frames: int
+    crc_errors: int
+
+
+def trial_options(steps: int, out: str) -> Callable[[_Command], _Command]:
+    """Give a command the options scripts may rely on, handed over as the argument `options`."""
+    options = [
+        click.option("--steps", type=click.IntRange(1), default=steps, show_default=True, metavar="N",
+                     help="Right-stance steps with each shape."),
+        click.option("--xi", type=click.FloatRange(0.0, 1.0), default=0.5, show_default=True, metavar="X",
+                     help="Assistance factor: 0 widest guide (7.5 deg), 1 full assistance. The pendant may change it."),
+        click.option("--seed", type=int, default=0, show_default=True, metavar="N", help="Of the emulated sensors' noise."),
+        click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=out, show_default=True,
+                     metavar="DIR", help="Run folder: recording.mcap, summary.json, figures."),
+        click.option("--record-rate", type=int, default=100, show_default=True, metavar="HZ",
+                     help="Recorded cycles a second; 1000 is every cycle."),
+        click.option("--can-log", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+                     help="Log every frame; format by suffix (.log, .asc, .blf)."),
+    ]  # fmt: skip
+
+    def decorate(command: _Command) -> _Command:
+        @functools.wraps(command)
+        def with_options(
+            steps: int, xi: float, seed: int, out: Path, record_rate: int, can_log: Path | None, **others: Any
+        ) -> Any:
+            return command(options=Options(steps, xi, seed, out, record_rate, can_log), **others)
+
+        wrapped: Any = with_options
+        for option in reversed([*options, json_option]):
+            wrapped = option(wrapped)
+        decorated: _Command = wrapped
+        return decorated
+
+    return decorate
+
+
+def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_json: bool) -> None:
+    """Walk behind each shape in turn, record everything, and say how it went.
+
+    Raises:
+        Failed, FaultLatched: the robot left ACTIVE before the steps were done; what was walked until then is kept.
+        SystemExit: a signal ended it.
+    """
+    import atalante_dbc
+    from atalante_control.controller import HangController
+    from atalante_control.gait import HANG_GAIT, load_gait
+    from atalante_control.guide_shapes import shape_named
+    from atalante_hal.robot import load_robot
+
+    network, robot = atalante_dbc.load(), load_robot()
+    gait = load_gait(HANG_GAIT, robot)
+    controllers = {name: HangController(robot, gait, shape_named(name)) for name in shapes}
+    certified = {name: _announce(controller, options.xi) for name, controller in controllers.items()}
+    options.out.mkdir(parents=True, exist_ok=True)
+    results: list[Result] = []
+    try:
+        with stop_requested() as stop, ExitStack() as stack:
+            telemetry: TelemetryProcess | None = None
+            for name, controller in controllers.items():
+                with _open(target, options, network, robot, controller, gait.hash32) as rig:
+                    if telemetry is None:
+                        telemetry = _telemetry(target, options, rig.hal, network, gait.hash32)
+                        stack.enter_context(telemetry)
+                        _tell_where(telemetry)
+                    telemetry.begin_run(name, {"shape": name, "xi": options.xi, "certified": certified[name]})
+                    walk = _Walk(rig, controller, telemetry, name, options.steps)
+                    statistics = walk.run(stop)
+                    results.append(_result(name, certified[name], controller, rig.hal, statistics))
+                    if as_json:
+                        show_json(asdict(results[-1]))
+                    walk.conclude()
+    finally:
+        if results:
+            _conclude(options, results, as_json=as_json)
+
+
+class _Walk:
+    """One shape: the loop, its telemetry and its progress line."""
+
+    def __init__(
+        self, rig: Rig, controller: HangController, telemetry: TelemetryProcess, name: str, steps: int
+    ) -> None:
+        from atalante_tools.rig import Watch
+
+        self._rig, self._controller, self._telemetry = rig, controller, telemetry
+        self._name, self._steps = name, steps
+        self._told = 0
+        self._watch_of = functools.partial(Watch, rig, done=self._done, describe=self._describe)
+        hal = rig.hal
+        if telemetry.frames is not None:
+            if rig.target.lockstep:
+                hal.tap = telemetry.tap(lambda: hal.state.cycle * 1_000_000)
+            else:
+                hal.tap = telemetry.tap(stamps=lambda: hal.bus.stamps)
+
+    def run(self, stop: Any) -> Statistics:
+        self._watch = self._watch_of(stop)
+        statistics = self._rig.run(self._controller, until=self._watch, record=self._record)
+        self._tell()
+        return statistics
+
+    def conclude(self) -> None:
+        self._watch.conclude()
+
+    def _record(self) -> None:
+        hal = self._rig.hal
+        self._telemetry.write(hal.record)
+        if len(hal.events) != self._told:
+            self._tell()
+
+    def _tell(self) -> None:
+        events = self._rig.hal.events
+        for event in events[self._told :]:
+            self._telemetry.event(event.cycle, event.code, event.text, event.severity, event.node, event.value)
+        self._told = len(events)
+
+    def _done(self, state: State) -> bool:
+        return self._controller.statistics.steps >= self._steps
+
+    def _describe(self, state: State) -> str:
+        statistics = self._controller.statistics
+        return (
+            f"{self._name:<11} step {statistics.steps:3d}/{self._steps}   t {state.time:6.1f} s   "
+            f"Xi {state.assistance_factor:.2f}   largest |e|/q_bound {statistics.max_ratio:.2f}"
+        )
+
+
+def _announce(controller: HangController, xi: float) -> bool:
+    """Say before the run what the guide promises."""
+    certificate = controller.certificate(xi)
+    name = certificate.shape
+    if certificate.certified:
+        admitted = ", ".join(f"{j.joint} {j.u_ext_max[0]:+.0f} to {j.u_ext_max[1]:+.0f} Nm" for j in certificate.joints)
+        say(f"{name}: certified at Xi {xi:g}: {certificate.reason}; admits {admitted}")
+    else:
+        say(f"{name}: NOT CERTIFIED at Xi {xi:g}, the guide may be left: {certificate.reason}")
+    return certificate.certified
+
+
+def _open(
+    target: Target, options: Options, network: Network, robot: Robot, controller: HangController, gait_hash: int
+) -> Any:
+    from atalante_tools.rig import open_hal
+
+    return open_hal(
+        target,
+        network=network,
+        robot=robot,
+        seed=options.seed,
+        assistance_factor=options.xi,
+        controller_fields=controller.telemetry_fields,
+        gait_hash=gait_hash,
+    )
+
+
+def _telemetry(target: Target, options: Options, hal: Hal, network: Network, gait_hash: int) -> TelemetryProcess:
+    from atalante_hal.supervisor import Condition
+    from atalante_hal.telemetry.process import TelemetryConfig, TelemetryProcess
+
+    config = TelemetryConfig(
+        recording=options.out / "recording.mcap",
+        record_rate=options.record_rate,
+        can_log=options.can_log,
+        lock_step=target.lockstep,
+    )
+    return TelemetryProcess(
+        config,
+        hal.layout,
+        bus_of={message.frame_id: message.bus for message in network.messages},
+        buses=network.buses,
+        diagnostics=[str(condition.name) for condition in Condition],
+        about={
+            "version": version("atalante-hal"),
+            "dbc_hash": f"{network.hash32:08x}",
+            "config_hash": f"{hal.robot.hash32:08x}",
+            "gait_hash": f"{gait_hash:08x}",
+            "target": target,
+            "seed": options.seed,
+            "steps": options.steps,
+            "xi": options.xi,
+        },
+    )
+
+
+def _tell_where(telemetry: TelemetryProcess) -> None:
+    for notice in telemetry.notices:
+        say(notice)
+    if telemetry.endpoint:
+        say(f"telemetry on Zenoh at {telemetry.endpoint}, keys atalante/{telemetry.config.robot}/**")
+
+
+def _result(name: str, certified: bool, controller: HangController, hal: Hal, statistics: Statistics) -> Result:
+    walked = controller.statistics
+    counted = max(1, walked.cycles)
+    return Result(
+        shape=name,
+        certified=certified,
+        steps=walked.steps,
+        max_ratio=round(walked.max_ratio, 4),
+        inside=round(walked.inside / counted, 4),
+        filter_active=round(walked.active / counted, 4),
+        cycles=statistics.cycles,
+        real_time_factor=round(statistics.real_time_factor, 2),
+        frames=int(hal.record[hal.layout["frames"]][0]),
+        crc_errors=hal.crc_errors,
+    )
+
+
+def _conclude(options: Options, results: Sequence[Result], *, as_json: bool) -> None:
+    """Summary, figure, table."""
+    summary = {
+        **{
+            key: value
+            for key, value in asdict(replace(options, out=options.out)).items()
+            if key not in ("out", "can_log")
+        },
+        "version": version("atalante-hal"),
+        "shapes": [asdict(result) for result in results],
+    }
+    (options.out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    figure = _figure(options.out)
+    if not as_json:
+        click.echo(_table(results))
+    say(f"in {options.out}: recording.mcap, summary.json{f', {figure}' if figure else ''}")
+
+
+def _figure(out: Path) -> str:
+    try:
+        from atalante_tools.figures import guide_shapes
+    except ModuleNotFoundError as error:
+        say(f"no figure: {error.name} is not installed; type `pip install 'atalante-hal[plot]'`")
+        return ""
+    name = "guide_shapes.png"
+    guide_shapes(out / "recording.mcap", out / name)
+    return name
+
+
+def _table(results: Sequence[Result]) -> str:
+    head = ["shape", "certified", "steps", "max |e|/q_bound", "inside %", "filter active %", "cycles", "x real time",
+            "frames", "CRC errors"]  # fmt: skip
+    rows = [
+        [
+            r.shape,
+            "yes" if r.certified else "NO",
+            str(r.steps),
+            f"{r.max_ratio:.2f}" if math.isfinite(r.max_ratio) else "-",
+            f"{100 * r.inside:.1f}",
+            f"{100 * r.filter_active:.1f}",
+            str(r.cycles),
+            f"{r.real_time_factor:.1f}",
+            str(r.frames),
+            str(r.crc_errors),
+        ]
+        for r in results
+    ]
+    return table([head, *rows])
