@@ -199,8 +199,8 @@ class TestLosses:
             at.service.step()
         assert sink.cycles("joint_states") == [70, 80, 90, 100]
         (event,) = sink.messages("events")
-        assert (event.code, event.value, event.node, event.cycle) == ("TELEMETRY_DROPPED", 68.0, "TELEMETRY", 100)
-        assert sink.messages("loop")[0].telemetry_lost == 68
+        assert (event.code, event.value, event.node, event.cycle) == ("TELEMETRY_DROPPED", 69.0, "TELEMETRY", 100)
+        assert sink.messages("loop")[0].telemetry_lost == 69
         assert at.service.notices == [event.text]
 
     @pytest.mark.parametrize("fails_at", [0, 3, 7])

@@ -1,7 +1,7 @@
 """CAN frames as records of a ring of their own: everything the HAL sends and receives, for a CAN log.
 
 The HAL hands its arrays to a `RingTap`, which copies their bytes (one copy a batch) into a record of up to 64 frames; the
-record goes into the ring once a cycle, or when it is full. Which network bus a frame belongs to is not noted: ids are
+record goes into the ring when it is full, every second or third cycle. Which network bus a frame belongs to is not noted: ids are
 unique network-wide, so the telemetry process looks it up.
 """
 
@@ -81,7 +81,7 @@ class RingTap:
             done += fit
 
     def flush(self) -> None:
-        """Put what has been gathered into the ring; once a cycle."""
+        """Put what has been gathered into the ring."""
         if self._used:
             self._count[0] = self._used
             self._ring.write(self._record)

@@ -145,6 +145,8 @@ class TelemetryProcess:
             patience=config.patience,
             meta=meta,
         )
+        #: One cycle: copies its record, shape (layout.size,), into the ring. About 1 us.
+        self.write: Callable[[npt.NDArray[np.float64]], None] = self.records.write
         self.events = RingWriter(EVENT_BYTES, EVENT_SLOTS)
         self.frames: RingWriter | None = None
         if config.can_log is not None:
@@ -215,12 +217,6 @@ class TelemetryProcess:
         facts = {key: str(value) for key, value in (about or {}).items()}
         self.records.note({"run": self._runs, "name": name, "start_ns": self._start_ns, "about": facts})
         self._runs += 1
-
-    def write(self, record: npt.NDArray[np.float64]) -> None:
-        """One cycle: copy its record, and the frames tapped since the last, into the rings. Shape (layout.size,)."""
-        if self._tap is not None:
-            self._tap.flush()
-        self.records.write(record)
 
     def event(
         self, cycle: int, code: str, text: str, severity: str = "info", node: str = "HAL", value: float = 0.0

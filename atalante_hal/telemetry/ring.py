@@ -1,9 +1,9 @@
 """Shared-memory ring: the loop's process writes fixed-size records, the telemetry process reads them.
 
-One writer, one reader, no lock, no system call in `write`: two integer stores around one copy. `WRITING` is raised before
-the bytes of a record change and `WRITTEN` after, so a reader that copies a batch and then looks at `WRITING` knows which of
-its records were overwritten under its hands (a seqlock for the whole batch). This relies on stores being seen in program
-order, as on x86-64; elsewhere a record could be read before its last bytes arrive.
+One writer, one reader, no lock, no system call in `write`: one copy, then one integer store that says so. The slot after the
+newest record counts as being written at any time. So a reader that copies a batch and then looks at the count again knows
+which of its records were overwritten under its hands (a seqlock for the whole batch). This relies on stores being seen in
+program order, as on x86-64; elsewhere a record could be read before its last bytes arrive.
 
 When the ring is full the oldest record is overwritten and the reader counts the loss. A lossless ring waits for the reader
 instead, in short sleeps, but never for a dead reader and never longer than its patience; then it overwrites like the other.
@@ -34,7 +34,7 @@ VERSION = 1
 
 # The header as 64-bit words; writer and reader have a cache line of their own.
 _MAGIC, _VERSION, _RECORD_SIZE, _STRIDE, _SLOTS, _META_LENGTH, _NOTES_SIZE, _DATA = range(8)
-_WRITING, _WRITTEN, _CLOSED, _WRITER_PID, _NOTES_LENGTH, _LOSSLESS, _OVERRUN = range(8, 15)
+_WRITTEN, _CLOSED, _WRITER_PID, _NOTES_LENGTH, _LOSSLESS = range(8, 13)
 _READ, _LOST, _READER_PID = range(16, 19)
 _HEADER_BYTES = 256
 
@@ -65,7 +65,7 @@ class _Ring:
 
     @property
     def slots(self) -> int:
-        """Records the ring holds."""
+        """Places for records; one of them is always being written."""
         return self._header[_SLOTS]
 
     @property
@@ -133,7 +133,7 @@ class RingWriter(_Ring):
 
     Args:
         record_size: bytes of a record.
-        slots: records the ring holds.
+        slots: places for records; one less can wait for the reader.
         lossless: wait for the reader when the ring is full.
         patience: longest such wait [s]; after it the ring overwrites for good.
         meta: what the reader needs to know, JSON types.
@@ -169,8 +169,10 @@ class RingWriter(_Ring):
         self._patience = patience
         self._count = 0
         self._slots = slots
-        self._places = [slice(data + stride * slot, data + stride * slot + record_size) for slot in range(slots)]
-        self._limit = slots if lossless else sys.maxsize
+        self._size, self._stride = record_size, stride
+        self._begin = self._place = data  # of the next record in the file [bytes]
+        self._end = data + stride * slots
+        self._limit = slots - 1 if lossless else sys.maxsize
 
     def write(self, record: memoryview | npt.NDArray[Any] | bytes) -> None:
         """Copy one record into the ring.
@@ -184,14 +186,15 @@ class RingWriter(_Ring):
         count = self._count
         if count >= self._limit:
             self._wait_for_reader()
-        header = self._header
-        header[_WRITING] = count + 1
-        self._map[self._places[count % self._slots]] = record  # type: ignore[assignment]
-        header[_WRITTEN] = self._count = count + 1
+        place = self._place
+        self._map[place : place + self._size] = record  # type: ignore[assignment]
+        self._header[_WRITTEN] = self._count = count + 1
+        place += self._stride
+        self._place = place if place < self._end else self._begin
 
     def _wait_for_reader(self) -> None:
         """Lossless: come back with room for one record, or with the ring overwriting from here on."""
-        header, oldest = self._header, self._count - self._slots
+        header, oldest = self._header, self._count - self._slots + 1
         give_up = time.monotonic() + self._patience
         while header[_READ] <= oldest:
             if not self.reader_alive or time.monotonic() > give_up:
@@ -199,11 +202,14 @@ class RingWriter(_Ring):
                 self._limit = sys.maxsize
                 return
             time.sleep(_WAIT)
-        self._limit = header[_READ] + self._slots
+        self._limit = header[_READ] + self._slots - 1
 
     def last(self) -> bytes:
         """Bytes of the record written last; empty when there is none."""
-        return bytes(self._map[self._places[(self._count - 1) % self._slots]]) if self._count else b""
+        if not self._count:
+            return b""
+        place = self._begin + (self._count - 1) % self._slots * self._stride
+        return bytes(self._map[place : place + self._size])
 
     def note(self, note: Mapping[str, Any]) -> None:
         """Append a remark (JSON types) that the reader gets together with the next record; rare, not for every cycle.
@@ -277,12 +283,12 @@ class RingReader(_Ring):
         """
         header, slots = self._header, len(self._records)
         written = header[_WRITTEN]
-        first = max(self._next, written - slots)
+        first = max(self._next, written - slots + 1)
         count, at = written - first, first % slots
         before_end = min(count, slots - at)
         self._batch[:before_end] = self._records[at : at + before_end]
         self._batch[before_end:count] = self._records[: count - before_end]
-        intact = min(max(first, header[_WRITING] - slots), written)
+        intact = min(max(first, header[_WRITTEN] - slots + 1), written)
         header[_LOST] += intact - self._next
         header[_READ] = self._next = written
         return self._batch[intact - first : count, : self.record_size]
