@@ -172,7 +172,10 @@ class Watch:
         if self._stop.wanted:
             over = True
         elif active:
-            self._started = True
+            if not self._started:
+                self._started = True
+                self._progress.clear()
+                say(f"ACTIVE on {self._rig.target}; Ctrl-C ends in HOLD")
             over = self._finished = self._done(state)
         else:
             over = self._started or state.supervisor is SupervisorState.FAULT

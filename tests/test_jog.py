@@ -1,0 +1,169 @@
+"""`atalante jog`: the profile, the refusals, a joint moved on the embedded robot, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from atalante_hal.cia402 import DriveState
+from atalante_hal.robot import JOINTS, Robot
+from atalante_tools import rig as rig_module
+from atalante_tools.cli import cli
+from atalante_tools.pose_hold import PEAK, minimum_jerk
+from atalante_tools.rig import Rig
+
+
+def jog(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, ["jog", *arguments])
+
+
+@pytest.fixture
+def prepared(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Rig], None]], list[Rig]]:
+    """Let a test change the rig a command opens, and look at it afterwards."""
+    opened: list[Rig] = []
+    original = rig_module.open_hal
+
+    def prepare(change: Callable[[Rig], None]) -> list[Rig]:
+        @contextmanager
+        def open_hal(*arguments: Any, **options: Any) -> Iterator[Rig]:
+            with original(*arguments, **options) as rig:
+                change(rig)
+                opened.append(rig)
+                yield rig
+
+        monkeypatch.setattr(rig_module, "open_hal", open_hal)
+        return opened
+
+    return prepare
+
+
+# -- the profile -----------------------------------------------------------------------------------------------------
+
+
+def test_the_profile_starts_and_ends_at_rest_and_never_turns_back() -> None:
+    phase = np.linspace(0.0, 1.0, 1001)
+    share, rate = np.array([minimum_jerk(float(x)) for x in phase]).T
+    assert (share[0], share[-1], rate[0], rate[-1]) == (0.0, 1.0, 0.0, 0.0)
+    assert (np.diff(share) >= 0.0).all()
+    assert np.gradient(share, phase, edge_order=2) == pytest.approx(rate, abs=1e-4)
+    assert share + share[::-1] == pytest.approx(1.0)
+    assert rate.max() == pytest.approx(PEAK)
+    assert minimum_jerk(-1.0) == (0.0, 0.0)
+    assert minimum_jerk(2.0) == (1.0, 0.0)
+
+
+# -- the refusals ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("index", range(len(JOINTS)))
+def test_a_target_outside_the_limits_names_them_in_degrees(robot: Robot, index: int) -> None:
+    name = JOINTS[index]
+    low, high = math.degrees(robot.position_min[index]), math.degrees(robot.position_max[index])
+    for target in (low - 0.1, high + 0.1):
+        result = jog(name, "--to", repr(target))
+        assert result.exit_code == 2
+        assert f"{name} goes from {low:.1f} to {high:.1f} degrees, not to {target:g}" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["left_KS", "--to", "1"], r"there is no joint 'left_KS'. Did you mean left_SK"),
+        (["elbow", "--to", "1"], "there is no joint 'elbow'. There are left_FH, left_TH,"),
+        (["left_SK", "--to", "nan"], "left_SK goes from 0.0 to 110.0 degrees, not to nan"),
+        (["left_SK", "--to", "5", "--speed", "0"], "more than 0 and at most 229 degrees a second, not at 0"),
+        (["left_SK", "--to", "5", "--speed", "500"], "at most 229 degrees a second, not at 500"),
+        (["left_SK", "--to", "5", "--speed", "nan"], "at most 229 degrees a second, not at nan"),
+        (["left_SK"], "Missing option '--to'"),
+        (["left_SK", "--to", "5", "-c", "vcan0"], "to use vcan0 say -i socketcan -c vcan0"),
+    ],
+)
+def test_misuse_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
+    result = jog(*arguments)
+    assert result.exit_code == 2
+    assert sentence in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert result.stdout == ""
+
+
+# -- the move --------------------------------------------------------------------------------------------------------
+
+
+def test_one_joint_moves_and_the_others_stay(prepared: Callable[[Callable[[Rig], None]], list[Rig]]) -> None:
+    track: list[np.ndarray] = []
+
+    def follow(rig: Rig) -> None:
+        assert rig.emulator is not None
+        rig.emulator.before_send.append(lambda now, values: track.append(rig.hal.state.position.copy()))
+
+    rigs = prepared(follow)
+    result = jog("LEFT_sk", "--to", "20", "--speed", "60", "--json")
+    assert result.exit_code == 0, result.stderr
+    said = json.loads(result.stdout)
+    assert said["joint"] == "left_SK"
+    assert said["to_deg"] == 20.0
+    assert abs(said["error_deg"]) < 0.1
+    assert said["reached_deg"] == pytest.approx(20.0, abs=0.1)
+    assert rigs[0].hal.state.supervisor.name == "HOLD"
+    positions = np.degrees(track[-1000:])
+    speed = np.abs(np.diff(positions[:, JOINTS.index("left_SK")])).max() * 1e3
+    assert speed < 1.2 * 60.0
+    others = np.delete(positions, JOINTS.index("left_SK"), axis=1)
+    assert np.ptp(others[-500:], axis=0).max() < 1.0
+
+
+def test_the_sentence_names_the_angle_reached() -> None:
+    result = jog("right_SH", "--to", "-5", "--speed", "60")
+    assert result.exit_code == 0
+    assert result.stdout.startswith("right_SH: ")
+    assert "deg off -5 deg" in result.stdout
+    assert result.stderr.splitlines() == ["ACTIVE on embedded; Ctrl-C ends in HOLD", "the robot is in HOLD"]
+
+
+def test_a_joint_that_does_not_get_there_fails(prepared: Callable[[Callable[[Rig], None]], list[Rig]]) -> None:
+    def jam(rig: Rig) -> None:
+        assert rig.emulator is not None
+        place = rig.emulator.signals.index("LEFT_SK_STATE", "Position")
+        rig.emulator.before_send.append(lambda now, values: values.__setitem__(place, 0.0))
+
+    prepared(jam)
+    result = jog("left_SK", "--to", "2", "--speed", "60", "--json")
+    assert result.exit_code == 1
+    assert "left_SK did not reach 2 degrees: something is in its way" in result.stderr
+    assert json.loads(result.stdout)["reached_deg"] == 0.0
+
+
+def test_a_drive_fault_ends_it_with_code_4(prepared: Callable[[Callable[[Rig], None]], list[Rig]]) -> None:
+    def fail(rig: Rig) -> None:
+        assert rig.emulator is not None
+        place = rig.emulator.signals.index("RIGHT_HA_STATE", "DriveState")
+
+        def rewrite(now: int, values: Any) -> None:
+            if now > 500:
+                values[place] = DriveState.FAULT
+
+        rig.emulator.before_send.append(rewrite)
+
+    prepared(fail)
+    result = jog("left_SK", "--to", "60", "--json")
+    assert result.exit_code == 4
+    assert "the robot is in FAULT: the drive of right_HA reports a fault" in result.stderr
+    assert result.stdout == ""
+
+
+def test_an_operator_who_stops_ends_it_as_failed(prepared: Callable[[Callable[[Rig], None]], list[Rig]]) -> None:
+    def stop(rig: Rig) -> None:
+        assert rig.emulator is not None
+        rig.emulator.before_send.append(lambda now, values: rig.operator.stop() if now == 500 else None)  # type: ignore[union-attr]
+
+    prepared(stop)
+    result = jog("left_SK", "--to", "60")
+    assert result.exit_code == 1
+    assert "the robot went to HOLD: the operator asked to stop" in result.stderr

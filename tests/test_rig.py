@@ -1,0 +1,245 @@
+"""The rig: one HAL on any bus, taken apart in order, and how a run ends."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any
+
+import numpy as np
+import pytest
+
+from atalante_dbc import Network
+from atalante_emulator.pendant import Operator
+from atalante_hal.bus import BusAbsent, BusDown
+from atalante_hal.bus.joined import JoinedBus
+from atalante_hal.cia402 import DriveState
+from atalante_hal.frame import Frames, new_frames
+from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.types import Command, State, SupervisorState
+from atalante_tools.options import Target
+from atalante_tools.outcome import Failed, FaultLatched
+from atalante_tools.pose_hold import PoseHold
+from atalante_tools.rig import (
+    LOCKSTEP_PATIENCE,
+    PATIENCE,
+    Rig,
+    Watch,
+    join,
+    open_body,
+    open_buses,
+    open_hal,
+    waiting_for,
+)
+from atalante_tools.signals import StopRequest
+
+EMBEDDED = Target("embedded", "", lockstep=True)
+ACTIVE, HOLD, FAULT = SupervisorState.ACTIVE, SupervisorState.HOLD, SupervisorState.FAULT
+
+
+class Tap:
+    def __init__(self) -> None:
+        self.frames = bytearray()
+
+    def sent(self, frames: Frames) -> None:
+        self.frames += frames.tobytes()
+
+    def received(self, frames: Frames, count: int) -> None:
+        self.frames += frames[:count].tobytes()
+
+
+def embedded(network: Network, robot: Robot, **options: Any) -> AbstractContextManager[Rig]:
+    """A rig for `PoseHold`."""
+    return open_hal(EMBEDDED, network=network, robot=robot, controller_fields=PoseHold.telemetry_fields, **options)
+
+
+def watched(
+    rig: Rig,
+    *,
+    seconds: float = 0.05,
+    each: Callable[[State], None] = lambda state: None,
+    stop: StopRequest | None = None,
+) -> Watch:
+    """A finished run of a pose hold: `seconds` of ACTIVE, `each` asked before every judgement."""
+    controller = PoseHold(rig.hal.robot)
+    watch = Watch(rig, stop or StopRequest(), lambda state: controller.elapsed >= seconds, lambda state: "moving")
+
+    def until(state: State) -> bool:
+        each(state)
+        return watch(state) or state.cycle > 2000
+
+    rig.run(controller, until=until)
+    return watch
+
+
+def test_the_embedded_rig_becomes_active_and_ends_in_hold(network: Network, robot: Robot) -> None:
+    with embedded(network, robot) as rig:
+        assert rig.emulator is not None
+        assert rig.operator is not None
+        watched(rig).conclude()
+        assert rig.hal.state.supervisor is HOLD
+        assert rig.emulator.drives.state == [DriveState.QUICK_STOP_ACTIVE] * 12
+        bus = rig.hal.bus
+    with pytest.raises(BusDown):
+        bus.receive(new_frames(1))
+
+
+def test_one_seed_is_one_sequence_of_bytes(network: Network, robot: Robot) -> None:
+    def run(seed: int) -> bytes:
+        tap = Tap()
+        with embedded(network, robot, seed=seed, tap=tap) as rig:
+            watched(rig)
+        return bytes(tap.frames)
+
+    first = run(3)
+    assert run(3) == first
+    assert run(4) != first
+
+
+def test_pose_operator_and_record_are_the_callers(network: Network, robot: Robot) -> None:
+    pose = [0.0] * 12
+    pose[JOINTS.index("left_SK")] = 0.5
+    mine = Operator(0.25, starts=False)
+    fields = [("height", 3)]
+    with open_hal(
+        EMBEDDED, network=network, robot=robot, pose=pose, operator=mine, controller_fields=fields, gait_hash=7
+    ) as rig:
+        state = rig.hal.read()
+        assert state.position[JOINTS.index("left_SK")] == pytest.approx(0.5, abs=1e-4)
+        for _ in range(400):
+            rig.hal.hold()
+            rig.hal.read()
+        assert state.supervisor is SupervisorState.READY
+        assert state.assistance_factor == pytest.approx(0.25, abs=1e-4)
+        assert rig.hal.layout["controller.height"].stop - rig.hal.layout["controller.height"].start == 3
+        assert rig.operator is mine
+
+
+@pytest.mark.parametrize(("lockstep", "patience"), [(False, PATIENCE), (True, LOCKSTEP_PATIENCE)])
+def test_a_bus_waits_for_the_nodes_by_its_clock(
+    network: Network, robot: Robot, lockstep: bool, patience: float
+) -> None:
+    with open_hal(Target("virtual", "rig-clock", lockstep), network=network, robot=robot) as rig:
+        assert rig.hal.patience == patience
+        assert rig.emulator is None
+        assert rig.operator is None
+
+
+def test_several_channels_become_one_bus_and_one_stays_itself(network: Network) -> None:
+    channels = "left_leg=rig-a,right_leg=rig-b,left_sense=rig-a,right_sense=rig-b"
+    buses = open_buses(network, Target("virtual", channels, lockstep=False))
+    joined = join(network, buses)
+    assert isinstance(joined, JoinedBus)
+    assert joined.name == "virtual:rig-a + virtual:rig-b"
+    joined.close()
+    buses = open_buses(network, Target("virtual", "rig-c", lockstep=False))
+    assert join(network, buses) is buses["left_leg"]
+    buses["left_leg"].close()
+
+
+def test_a_bus_that_is_not_there_is_refused(network: Network, robot: Robot) -> None:
+    with pytest.raises(BusAbsent, match="pigeon"), open_hal(Target("pigeon", "x", False), network=network, robot=robot):
+        raise AssertionError("opened")
+
+
+def test_without_pybullet_it_says_what_to_install(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    monkeypatch.delitem(sys.modules, "atalante_emulator.body", raising=False)
+    with pytest.raises(Failed, match=r"pip install 'atalante-hal\[emulator\]'"), open_body(robot):
+        raise AssertionError("opened")
+
+
+# -- how a run ends --------------------------------------------------------------------------------------------------
+
+
+def test_a_signal_ends_the_run_in_hold_with_its_code(network: Network, robot: Robot) -> None:
+    stop = StopRequest()
+    with embedded(network, robot) as rig:
+        watch = watched(
+            rig, seconds=1.0, stop=stop, each=lambda state: stop.ask(15) if state.supervisor is ACTIVE else None
+        )
+        assert rig.hal.state.supervisor is HOLD
+    with pytest.raises(SystemExit) as end:
+        watch.conclude()
+    assert end.value.code == 143
+
+
+def test_an_operator_who_stops_ends_the_run_as_failed(network: Network, robot: Robot) -> None:
+    with embedded(network, robot) as rig:
+        assert rig.operator is not None
+        watch = watched(rig, seconds=1.0, each=lambda state: rig.operator.stop() if state.cycle == 400 else None)  # type: ignore[union-attr]
+        assert rig.hal.state.cycle < 430
+    with pytest.raises(Failed, match="went to HOLD: the operator asked to stop") as end:
+        watch.conclude()
+    assert end.value.exit_code == 1
+
+
+@pytest.mark.parametrize("cycle", [150, 400])  # before and in ACTIVE
+def test_a_drive_fault_is_code_4(network: Network, robot: Robot, cycle: int) -> None:
+    with embedded(network, robot) as rig:
+        assert rig.emulator is not None
+        place = rig.emulator.signals.index("LEFT_SK_STATE", "DriveState")
+
+        def break_drive(now: int, values: Any) -> None:
+            if now >= cycle:
+                values[place] = DriveState.FAULT
+
+        rig.emulator.before_send.append(break_drive)
+        watch = watched(rig, seconds=1.0)
+    with pytest.raises(FaultLatched, match="FAULT: the drive of left_SK reports a fault") as end:
+        watch.conclude()
+    assert end.value.exit_code == 4
+
+
+def test_a_controller_that_raises_ends_as_failed_with_its_error(network: Network, robot: Robot) -> None:
+    class Broken(PoseHold):
+        def update(self, state: State) -> Command:
+            if self.elapsed > 0.01:
+                raise ZeroDivisionError("no")
+            return super().update(state)
+
+    with embedded(network, robot) as rig:
+        watch = Watch(rig, StopRequest(), lambda state: False, lambda state: "")
+        rig.run(Broken(robot), until=watch)
+    with pytest.raises(Failed, match="the controller raised ZeroDivisionError: no"):
+        watch.conclude()
+
+
+def test_what_a_run_waits_for_is_said_with_what_to_type(network: Network, robot: Robot) -> None:
+    target = Target("virtual", "rig-alone", lockstep=False)
+    with open_hal(target, network=network, robot=robot) as rig:
+        rig.hal.read()
+        assert waiting_for(rig) == (
+            "no node answers on virtual rig-alone; an emulated robot is `atalante emulator -i virtual -c rig-alone`"
+        )
+    with embedded(network, robot, operator=Operator(starts=False)) as rig:
+        rig.hal.read()
+        assert waiting_for(rig).startswith("waiting for LEFT_")
+        for _ in range(150):
+            rig.hal.hold()
+            rig.hal.read()
+        assert waiting_for(rig).startswith("READY: waiting for the operator, who is `atalante pendant start ")
+
+
+def test_the_wall_clock_asks_for_real_time_rights_and_runs(
+    network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("atalante_tools.rig.realtime", lambda: ["memory is not locked"])
+    wall, fields = Target("embedded", "", lockstep=False), PoseHold.telemetry_fields
+    with open_hal(wall, network=network, robot=robot, controller_fields=fields) as rig:
+        statistics = rig.run(PoseHold(robot), until=lambda state: state.cycle >= 5)
+    assert statistics.cycles == 5
+    assert "memory is not locked" in capsys.readouterr().err
+
+
+# -- the controller --------------------------------------------------------------------------------------------------
+
+
+def test_pose_hold_catches_every_joint_where_it_was(network: Network, robot: Robot) -> None:
+    with embedded(network, robot) as rig:
+        # Limp until ACTIVE, the legs are still falling when they are caught.
+        watched(rig, seconds=0.5).conclude()
+        caught = rig.hal.record[rig.hal.layout["controller.reference"]]
+        assert np.abs(rig.hal.state.position - caught).max() < math.radians(0.1)

@@ -1,0 +1,61 @@
+"""Ctrl-C and SIGTERM as a flag."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from atalante_tools.signals import stop_requested
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_is_a_wish_with_an_exit_code(number: signal.Signals, code: int) -> None:
+    before = signal.getsignal(number)
+    with stop_requested() as stop:
+        assert (stop.wanted, stop.exit_code) == (False, 0)
+        signal.raise_signal(number)
+        assert (stop.wanted, stop.exit_code) == (True, code)
+    assert signal.getsignal(number) is before
+
+
+def test_the_handlers_come_back_after_an_error() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(ZeroDivisionError), stop_requested():
+        raise ZeroDivisionError
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize("numbers", [("SIGINT", "SIGINT"), ("SIGTERM", "SIGINT"), ("SIGINT", "SIGTERM")])
+def test_the_second_ends_the_process_at_once(numbers: tuple[str, str]) -> None:
+    first, second = numbers
+    program = f"""
+import signal
+from atalante_tools.signals import stop_requested
+try:
+    with stop_requested() as stop:
+        signal.raise_signal(signal.{first})
+        assert stop.wanted
+        signal.raise_signal(signal.{second})
+finally:
+    print("still here")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == -signal.Signals[second]
+    assert done.stdout == ""
+
+
+def test_another_thread_has_no_signals_and_no_error() -> None:
+    seen = []
+
+    def work() -> None:
+        with stop_requested() as stop:
+            seen.append(stop.wanted)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert seen == [False]

@@ -1,0 +1,65 @@
+"""What commands print: log lines, progress, tables, JSON."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+
+import pytest
+
+from atalante_tools.terminal import LIVE, LOGGED, Progress, say, show_json, table
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_log_lines_go_to_stderr_and_objects_to_stdout(capsys: pytest.CaptureFixture[str]) -> None:
+    say("hello")
+    show_json({"a": 1.5, "b": math.nan, "c": [math.inf, {"d": -math.inf}], "e": None})
+    captured = capsys.readouterr()
+    assert captured.err == "hello\n"
+    assert json.loads(captured.out) == {"a": 1.5, "b": None, "c": [None, {"d": None}], "e": None}
+    assert captured.out.count("\n") == 1
+
+
+def test_a_table_aligns_numbers_right_and_words_left() -> None:
+    rows = [("node", "V", "degC"), ("LEFT_FH", "48.0", "-"), ("HAL", "-", "-5")]
+    assert table(rows).splitlines() == ["node        V  degC", "LEFT_FH  48.0     -", "HAL         -    -5"]
+
+
+def test_progress_is_rewritten_on_a_terminal() -> None:
+    now = [0.0]
+    terminal = Terminal()
+    progress = Progress(stream=terminal, now=lambda: now[0])
+    assert not progress.due()
+    now[0] = LIVE
+    assert progress.due()
+    progress.show("a long line")
+    assert not progress.due()
+    progress.show("short")
+    progress.clear()
+    progress.clear()
+    assert terminal.getvalue() == "\ra long line\rshort      \r     \r"
+
+
+def test_progress_is_lines_now_and_then_in_a_log() -> None:
+    now = [0.0]
+    log = io.StringIO()
+    progress = Progress(stream=log, now=lambda: now[0])
+    now[0] = LIVE
+    assert not progress.due()
+    now[0] = LOGGED
+    assert progress.due()
+    progress.show("one")
+    progress.clear()
+    assert log.getvalue() == "one\n"
+
+
+def test_a_period_of_ones_own_replaces_both() -> None:
+    now = [0.0]
+    progress = Progress(period=1.0, stream=io.StringIO(), now=lambda: now[0])
+    now[0] = 1.0
+    assert progress.due()

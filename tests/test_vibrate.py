@@ -1,0 +1,72 @@
+"""`atalante vibrate`: one motor runs, the others are still."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from atalante_hal.robot import MOTORS
+from atalante_tools import rig as rig_module
+from atalante_tools.cli import cli
+from atalante_tools.rig import Rig
+
+
+def vibrate(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, ["vibrate", *arguments])
+
+
+@pytest.mark.parametrize("index", [0, 5])
+def test_the_motor_runs_alone_and_is_still_afterwards(monkeypatch: pytest.MonkeyPatch, index: int) -> None:
+    felt: list[np.ndarray] = []
+    original = rig_module.open_hal
+
+    @contextmanager
+    def open_hal(*arguments: Any, **options: Any) -> Iterator[Rig]:
+        with original(*arguments, **options) as rig:
+            assert rig.emulator is not None
+            rig.emulator.before_send.append(lambda now, values: felt.append(rig.hal.state.vibration.copy()))
+            yield rig
+            for _ in range(300):
+                rig.hal.read()
+                rig.hal.hold()
+
+    monkeypatch.setattr(rig_module, "open_hal", open_hal)
+    result = vibrate(MOTORS[index].upper(), "0.6", "--for", "0.4", "--json")
+    assert result.exit_code == 0, result.stderr
+    said = json.loads(result.stdout)
+    assert said["motor"] == MOTORS[index]
+    assert said["measured"] == pytest.approx(0.6, abs=0.02)
+    strongest = np.max(felt, axis=0)
+    assert strongest[index] == pytest.approx(0.6, abs=0.02)
+    assert np.delete(strongest, index).max() == 0.0
+    assert felt[-1].max() < 0.02
+
+
+def test_the_sentence_says_what_was_measured() -> None:
+    result = vibrate("left_thigh_front", "0.5", "--for", "0.4")
+    assert result.exit_code == 0
+    assert result.stdout == "left_thigh_front: asked for 0.50, measured 0.50 at most, 0.4 s\n"
+    assert result.stderr.endswith("the robot is in HOLD\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["left_thigh_fron", "0.5"], "there is no motor 'left_thigh_fron'. Did you mean left_thigh_front"),
+        (["nose", "0.5"], f"There are {', '.join(MOTORS)}"),
+        (["left_thigh_front", "50"], "50.0 is not in the range 0.0<=x<=1.0"),
+        (["left_thigh_front", "0.5", "--for", "0"], "0.0 is not in the range"),
+        (["left_thigh_front"], "Missing argument 'LEVEL'"),
+    ],
+)
+def test_misuse_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
+    result = vibrate(*arguments)
+    assert result.exit_code == 2
+    assert sentence in result.stderr
+    assert result.stderr.count("\n") == 1
