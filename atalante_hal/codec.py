@@ -7,7 +7,7 @@ of the payload: a signal is one gather, two shifts, one multiply and one add, fo
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -16,10 +16,16 @@ from atalante_dbc import Message, Signal
 from atalante_hal.frame import FLAG_BRS, FLAG_FDF, WORDS, Frames, new_frames
 
 Vector = npt.NDArray[np.float64]
+Words = npt.NDArray[np.uint64]
 
 #: Adding this to a float rounds it to an integer that then stands in the low bits of the mantissa.
 _ROUND = 1.5 * 2.0**52
 _LONGEST = 51  # bits such an integer can have
+
+
+def _words(numbers: Iterable[int]) -> Words:
+    """Numbers as 64-bit words, negative ones wrapped."""
+    return np.array([number % (1 << 64) for number in numbers], np.uint64)
 
 
 def group_of(signal: str) -> str:
@@ -55,30 +61,34 @@ class Codec:
         self._compile([s for _, _, s in entries])
 
     def _compile(self, signals: list[Signal]) -> None:
-        self._signed = sum(s.signed for s in signals)
-        shift_left = [64 - s.start % 64 - s.length for s in signals]
+        limits = [sorted(round((x - s.offset) / s.factor) for x in (s.minimum, s.maximum)) for s in signals]
+        place = [s.start % 64 for s in signals]
         self._word = np.array(
             [r * WORDS + 1 + s.start // 64 for r, s in zip(self.row_of, signals, strict=True)], np.intp
         )
-        self._left = np.array(shift_left, np.uint64)
-        right = [64 - s.length for s in signals]
-        self._right_signed = np.array(right[: self._signed], np.int64)
-        self._right_unsigned = np.array(right[self._signed :], np.uint64)
         self._factor = np.array([s.factor for s in signals])
         self._offset = np.array([s.offset for s in signals])
         self._has_offset = bool(self._offset.any())
-        limits = [sorted(round((x - s.offset) / s.factor) for x in (s.minimum, s.maximum)) for s in signals]
-        self._raw_min = np.array([float(low) for low, _ in limits])
-        self._raw_max = np.array([float(high) for _, high in limits])
-        self._low = np.array([low for low, _ in limits], np.int64).view(np.uint64)
-        self._span = np.array([high - low for low, high in limits], np.uint64)
+        # Decoding happens in place: the code of a signal stays at its bits of a word, counted from the signal's minimum.
+        # That needs no shifts, is one comparison for both ends of the range, and is exact in a float.
+        at_place = [2.0**p for p in place]
+        self._low = _words(low << p for (low, _), p in zip(limits, place, strict=True))
+        self._mask_at = _words((1 << s.length) - 1 << p for s, p in zip(signals, place, strict=True))
+        self._span = _words(high - low << p for (low, high), p in zip(limits, place, strict=True))
+        largest = [(1 << s.length - s.signed) - 1 for s in signals]
+        self._top = _words(end - low << p for end, (low, _), p in zip(largest, limits, place, strict=True))
+        self._turn = np.array([float(1 << s.length) for s in signals]) * at_place
+        in_codes = [s.offset / s.factor for s in signals]
+        exact = all(c == round(c) and round(c) * s.factor == s.offset for c, s in zip(in_codes, signals, strict=True))
+        self._base = np.array([low + exact * c for (low, _), c in zip(limits, in_codes, strict=True)]) * at_place
+        self._weight = self._factor / at_place
+        self._add_offset = self._has_offset and not exact
         self._raw = np.empty(self.size, np.uint64)
-        self._raw_signed = self._raw[: self._signed].view(np.int64)
-        self._raw_unsigned = self._raw[self._signed :]
-        self._raw_int = self._raw.view(np.int64)
-        self._distance = np.empty(self.size, np.uint64)
         self._outside = np.empty(self.size, np.bool_)
         self._all_inside = bytes(self.size)
+        self._inside = True
+        self._raw_min = np.array([float(low) for low, _ in limits])
+        self._raw_max = np.array([float(high) for _, high in limits])
         # Encoding: scaled values to masked raw bits, in word order, or-ed together word by word.
         by_word = np.argsort(self._word, kind="stable")
         self._by_word = by_word
@@ -125,8 +135,8 @@ class Codec:
             frames[row]["flags"] = FLAG_FDF | FLAG_BRS
         return frames
 
-    def extract(self, words: npt.NDArray[np.uint64]) -> bool:
-        """First half of decoding: raw codes out of the payload words.
+    def extract(self, words: Words) -> bool:
+        """First half of decoding: codes out of the payload words, counted from each signal's minimum.
 
         Args:
             words: flat view of the frames, shape (rows * 9,).
@@ -134,25 +144,30 @@ class Codec:
         Returns:
             Whether every signal is inside its DBC range (an invalid code is outside it).
         """
+        # Results as positional arguments: a fifth faster than `out=`.
         raw = self._raw
-        words.take(self._word, out=raw, mode="clip")
-        np.left_shift(raw, self._left, out=raw)
-        np.right_shift(self._raw_signed, self._right_signed, out=self._raw_signed)
-        np.right_shift(self._raw_unsigned, self._right_unsigned, out=self._raw_unsigned)
-        # One comparison for both ends: below the minimum wraps around to a huge distance.
-        np.subtract(raw, self._low, out=self._distance)
-        np.greater(self._distance, self._span, out=self._outside)
-        return self._outside.tobytes() == self._all_inside
+        words.take(self._word, None, raw, "clip")
+        np.subtract(raw, self._low, raw)
+        np.bitwise_and(raw, self._mask_at, raw)
+        # One comparison for both ends: below the minimum has wrapped around to beyond the maximum.
+        np.greater(raw, self._span, self._outside)
+        self._inside = self._outside.tobytes() == self._all_inside
+        return self._inside
 
     def rows_outside(self) -> list[int]:
         """Rows with a signal outside its range, of the last `extract`."""
         return sorted(set(self.row_of[self._outside].tolist()))
 
     def scale(self, out: Vector) -> None:
-        """Second half of decoding: raw codes of the last `extract` to physical values. Shape (size,)."""
-        np.multiply(self._raw_int, self._factor, out=out)
-        if self._has_offset:
-            np.add(out, self._offset, out=out)
+        """Second half of decoding: codes of the last `extract` to physical values. Shape (size,)."""
+        out[...] = self._raw
+        np.add(out, self._base, out)
+        if not self._inside:
+            wrapped = self._raw > self._top
+            out[wrapped] -= self._turn[wrapped]
+        np.multiply(out, self._weight, out)
+        if self._add_offset:
+            np.add(out, self._offset, out)
 
     def decode(self, frames: Frames, out: Vector) -> bool:
         """Physical values of all signals of the rows. Shape (size,), DBC units.
@@ -174,21 +189,21 @@ class Codec:
         """
         self.pack(values, frames.view(np.uint64))
 
-    def pack(self, values: Vector, words: npt.NDArray[np.uint64]) -> None:
+    def pack(self, values: Vector, words: Words) -> None:
         """As `encode`, into a flat view of the frames made beforehand. Shape (rows * 9,)."""
-        scaled = self._scaled
+        scaled, bits = self._scaled, self._bits
         if self._has_offset:
-            values = np.subtract(values, self._offset, out=scaled)
-        np.divide(values, self._factor, out=scaled)
+            values = np.subtract(values, self._offset, scaled)
+        np.divide(values, self._factor, scaled)
         np.maximum(scaled, self._raw_min, out=scaled)
         np.minimum(scaled, self._raw_max, out=scaled)
         no_value = np.isnan(scaled) if math.isnan(scaled.dot(self._ones)) else None
-        np.add(scaled, self._round, out=scaled)
+        np.add(scaled, self._round, scaled)
         if no_value is not None:
             self._encode_invalid(no_value)
-        np.bitwise_and(self._bits, self._mask, out=self._bits)
-        self._bits.take(self._by_word, out=self._sorted, mode="clip")
-        np.left_shift(self._sorted, self._place, out=self._sorted)
+        np.bitwise_and(bits, self._mask, bits)
+        bits.take(self._by_word, None, self._sorted, "clip")
+        np.left_shift(self._sorted, self._place, self._sorted)
         words[self._word_target] = np.bitwise_or.reduceat(self._sorted, self._word_start)
 
     def _encode_invalid(self, no_value: npt.NDArray[np.bool_]) -> None:
