@@ -265,8 +265,10 @@ def _multiplexers(message: RawMessage) -> dict[str, frozenset[int]]:
     """Values for which a multiplexer has a layout: its children's, and those its value table names."""
     known: dict[str, frozenset[int]] = {}
     for multiplexer in (s for s in message.signals if s.is_multiplexer):
-        children = [s.multiplexer_ids or () for s in message.signals if s.multiplexer_signal == multiplexer.name]
-        values = [int(value) for ids in (multiplexer.choices or {}, *children) for value in ids]
+        values = {int(value) for value in multiplexer.choices or {}}
+        for signal in message.signals:
+            if signal.multiplexer_signal == multiplexer.name:
+                values.update(signal.multiplexer_ids or ())
         if values:
             known[multiplexer.name] = frozenset(values)
     return known
