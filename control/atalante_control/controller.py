@@ -19,7 +19,7 @@ assistive torque, every other joint the baseline torque. What the paper leaves o
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from struct import Struct
 
 import numpy as np
@@ -29,7 +29,7 @@ from atalante_control.backup import BackupPolicy
 from atalante_control.certificate import Certificate, HandOver, certify
 from atalante_control.deadbeat import Deadbeat
 from atalante_control.flat_foot import flat_feet
-from atalante_control.gait import PERIOD, Gait
+from atalante_control.gait import PERIOD, Gait, bezier
 from atalante_control.guide import GuideConfig, GuideFilter
 from atalante_control.guide_shapes import GuideShape
 from atalante_control.haptics import intensity, levels
@@ -64,10 +64,10 @@ class HangConfig:
     alpha: float = 0.4  # of a step, until the deadbeat has met the nominal
     guide_rate: Pair = (28.0, 44.0)  # rad/s, natural frequency of the backup policy on SH and SK
     guide_damping: float = 1.05  # damping ratio; 1 and above is monotone
-    disturbance: tuple[Pair, Pair] = ((-40.0, 40.0), (-20.0, 20.0))  # Nm, u_ext of SH and SK
+    disturbance: tuple[Pair, Pair] = ((-30.0, 30.0), (-20.0, 20.0))  # Nm, u_ext of SH and SK
     points: int = 100  # intervals of the horizon grid
     overlap: float = 0.1  # s, horizon past the step's end
-    zeta: float = 0.03  # s, derivative gain of the guide
+    zeta: float = 0.015  # s, derivative gain of the guide
     hand_over: HandOver = field(default_factory=HandOver)
     decoupled: bool = True  # SH and SK through their common mass matrix; False: u_v on its own joint, as printed
     feedforward: bool = False  # u_f of the gait on the assisted joints; off in the air
@@ -99,6 +99,16 @@ class HangStatistics:
     max_ratio: float = 0.0  # largest |e| / q_bound
     min_h_at_start: float = 1.0  # smallest h at a step's first cycle
     hand_overs_exceeded: int = 0  # step changes with a deviation beyond the certified hand-over
+
+    @property
+    def inside_fraction(self) -> float:
+        """Part of the time with both joints in the guide; 1 before anything is counted."""
+        return self.inside / self.cycles if self.cycles else 1.0
+
+    @property
+    def active_fraction(self) -> float:
+        """Part of the time the filter acts."""
+        return self.active / self.cycles if self.cycles else 0.0
 
 
 def baseline_share(xi: float, fade: float) -> float:
@@ -149,11 +159,11 @@ class HangController:
         self.config = config = config or HangConfig()
         exoskeleton = exoskeleton or ExoskeletonParameters()
         articulated = pinocchio_model(urdf(exoskeleton, robot))
-        self._gait, self._cycles = gait, gait.cycles
+        self._cycles = gait.cycles
         self._deadbeat = Deadbeat(gait.duration, config.alpha)
         self._gravity = Gravity(articulated)
         self._pid = Pid(config.gains)
-        self._flat = flat_feet(exoskeleton) if config.flat_foot else None
+        self._feet = flat_feet(exoskeleton)
         self._ankle_low, self._ankle_high = robot.position_min.tolist(), robot.position_max.tolist()
 
         gaits = {RIGHT: gait, LEFT: gait.mirrored()}
@@ -166,7 +176,6 @@ class HangController:
             rows[:, ankles] += config.ankle_offset
             self._nominal[stance] = rows
         self._reference = {stance: rows.copy() for stance, rows in self._nominal.items()}
-        self._uf = {stance: table.uf for stance, table in tables.items()}
         time: Vector = np.arange(self._cycles + 1, dtype=np.float64) * PERIOD
         (c0, c1), (c0d, c1d), _ = self._deadbeat.basis(time)
         self._fading = int(np.searchsorted(time, self._deadbeat.end))
@@ -177,6 +186,10 @@ class HangController:
         self._basis[1, :, :n], self._basis[1, :, n:] = c1[: self._fading, None], c1d[: self._fading, None]
 
         self._inertia = AssistedInertia(articulated, tables[RIGHT].q)
+        feedforward = self._ideal_feedforward(gait) if config.feedforward else None
+        self._uf: list[list[float]] | None = None
+        if feedforward is not None:
+            self._uf = bezier(feedforward, time / gait.duration).tolist()
         swing = [_SH, _SK]
         self.guide = GuideFilter(
             self._guide_config(robot, tables[RIGHT].q),
@@ -184,7 +197,7 @@ class HangController:
             self._deadbeat,
             gait.coefficients[swing],
             gaits[LEFT].coefficients[swing],
-            gait.feedforward[swing] if config.feedforward and gait.feedforward is not None else None,
+            feedforward,
         )
 
         ramp = np.arange(round(config.blend / PERIOD)) * (PERIOD / config.blend)
@@ -202,8 +215,13 @@ class HangController:
         self._forget()
 
     def certificate(self, xi: float) -> Certificate:
-        """What this controller's guide promises at an assistance factor."""
-        return certify(self.guide, xi, self.config.hand_over)
+        """What this controller's guide promises at an assistance factor; nothing at Xi = 1, where no guide acts."""
+        certificate = certify(self.guide, xi, self.config.hand_over)
+        if baseline_share(xi, self.config.fade) < 1.0:
+            return certificate
+        return replace(
+            certificate, certified=False, reason="at Xi = 1 the baseline controller drives every joint alone"
+        )
 
     def reset(self, state: State) -> None:
         """Start from where the joints are, and from the torque they have."""
@@ -218,6 +236,7 @@ class HangController:
         self._intensity, self._changed_at, self._carry = 0.0, 0, False
         self._pid.reset()
         self._share.fill(1.0)
+        self._pid.start_step(RIGHT, self._share)
         self._command.vibration.fill(0.0)
         self.telemetry.fill(0.0)
         self._flat_deviation = self._flat_rate = (0.0, 0.0)
@@ -234,6 +253,23 @@ class HangController:
             limit = float(robot.torque_max[joint] - weight[joint]) - friction
             policies.append(BackupPolicy(j * rate**2, 2.0 * config.guide_damping * j * rate, j, limit))
         return GuideConfig((policies[0], policies[1]), config.disturbance, config.points, config.overlap, config.zeta)
+
+    def _ideal_feedforward(self, gait: Gait) -> Vector | None:
+        """u_f of the swing leg's SH and SK, meant for the separate inertias: Bezier control points (2, 8) [Nm].
+
+        The gait's own is meant for the coupled pair: it is taken through the mass matrix along the nominal and fitted.
+        """
+        swing = [_SH, _SK]
+        if gait.feedforward is None or not self.config.decoupled:
+            return None if gait.feedforward is None else gait.feedforward[swing]
+        table = gait.tables()
+        ideal = [
+            self._inertia.ideal(float(q[_SK]), float(qd[_SH]), float(qd[_SK]), (float(uf[_SH]), float(uf[_SK])))
+            for q, qd, uf in zip(table.q, table.qd, table.uf, strict=True)
+        ]
+        degree = gait.feedforward.shape[1] - 1
+        basis = bezier(np.eye(degree + 1), np.arange(self._cycles + 1) / self._cycles)
+        return np.asarray(np.linalg.lstsq(basis, np.array(ideal), rcond=None)[0].T)
 
     # -- one cycle ---------------------------------------------------------------------------------------------------
 
@@ -254,7 +290,7 @@ class HangController:
             cycle = 0
         row = self._reference[self._stance][cycle]
         leg = _LEG if self._stance == LEFT else 0  # first joint of the swing leg
-        if self._flat is not None:
+        if self.config.flat_foot:
             self._level_foot(state, row, cycle, leg)
         gravity = self._baseline(state, row)
         self._assist(state, row, cycle, leg, gravity)
@@ -262,12 +298,14 @@ class HangController:
         return self._command
 
     def _move_to_start(self, state: State, cycle: int) -> Command:
-        """Minimum-jerk move from the pose at `reset` to the first of the gait, by the baseline alone."""
-        x = cycle / self._startup_cycles
+        """Quintic from rest at the pose of `reset` to the gait's first pose and speed, by the baseline alone."""
+        x, duration = cycle / self._startup_cycles, self.config.startup
         row, n = self._start_row, len(JOINTS)
-        way = self._nominal[RIGHT][0, :n] - self._start_pose
-        row[:n] = self._start_pose + way * (x * x * x * (10.0 + x * (6.0 * x - 15.0)))
-        row[n:] = way * (30.0 * x * x * (1.0 - x) * (1.0 - x) / self.config.startup)
+        first = self._nominal[RIGHT][0]
+        way, speed = first[:n] - self._start_pose, first[n:]
+        row[:n] = self._start_pose + way * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x))
+        row[:n] += speed * (duration * x**3 * (-4.0 + 7.0 * x - 3.0 * x * x))
+        row[n:] = way * (30.0 * x * x * (1.0 - x) ** 2 / duration) + speed * (x * x * (-12.0 + 28.0 * x - 15.0 * x * x))
         self._baseline(state, row)
         self._hand_over(cycle)
         self._q_des_out[:] = row[:n]
@@ -281,6 +319,7 @@ class HangController:
         leg = _LEG if stance == LEFT else 0
         self._share.fill(1.0)
         self._share[[leg + _SH, leg + _SK]] = self._w
+        self._pid.start_step(stance, self._share)
 
         nominal, deviation, rate = self._nominal[stance], self._deviation, self._rate
         np.subtract(state.position, nominal[0, :n], out=deviation[:n])
@@ -297,7 +336,7 @@ class HangController:
         largest = config.hand_over
         if max(map(abs, deviations)) > largest.deviation or max(map(abs, rates)) > largest.rate:
             self.statistics.hand_overs_exceeded += 1
-        if self._flat is not None:
+        if config.flat_foot:
             angles, speeds = self._flat_target(state, leg)
             q, qd = state.position, state.velocity
             self._flat_deviation = (float(q[leg + _SA]) - angles[0], float(q[leg + _HA]) - angles[1])
@@ -306,11 +345,8 @@ class HangController:
 
     def _flat_target(self, state: State, leg: int) -> tuple[Pair, Pair]:
         """Angles and speeds of SA and HA that hold the swing sole level, within the joints' limits."""
-        feet, low, high = self._flat, self._ankle_low, self._ankle_high
-        assert feet is not None  # asked for only where flat foot is on
-        imu, foot = _TIBIAE[leg > 0], feet[leg > 0]
-        w, x, y, z = state.imu_quaternion[imu].tolist()
-        angles, speeds = foot.angles((w, x, y, z)), foot.rates(*state.imu_gyro[imu].tolist())
+        low, high, imu, foot = self._ankle_low, self._ankle_high, _TIBIAE[leg > 0], self._feet[leg > 0]
+        angles, speeds = foot.level(state.imu_quaternion[imu].tolist(), state.imu_gyro[imu].tolist())
         sagittal, henke = angles[0] + self.config.ankle_offset, angles[1]
         sa, ha = leg + _SA, leg + _HA
         sagittal, sagittal_rate = _within(sagittal, speeds[0], low[sa], high[sa])
@@ -331,9 +367,8 @@ class HangController:
 
     def _baseline(self, state: State, row: Vector) -> Vector:
         """u_t into the command: PID and the gravity of the empty exoskeleton. Returns u_g."""
-        n = len(JOINTS)
         gravity = self._gravity.torque(state.position, state.imu_quaternion[_PELVIS].tolist())
-        torque = self._pid.update(self._stance, row[:n], row[n:], state.position, state.velocity, self._share)
+        torque = self._pid.update(row, state.position, state.velocity)
         np.add(torque, gravity, out=torque)
         return gravity
 
@@ -346,14 +381,14 @@ class HangController:
         guide, w, config = self.guide, self._w, self.config
         v_hip, v_knee = guide.tick(cycle, e_hip, qd[hip] - desired[n + hip], e_knee, qd[knee] - desired[n + knee])
         if w < 1.0:
+            if self._uf is not None:
+                uf_hip, uf_knee = self._uf[cycle]
+                v_hip, v_knee = v_hip + uf_hip, v_knee + uf_knee
             if config.decoupled:
                 v_hip, v_knee = self._inertia.torques(q[knee], qd[hip], qd[knee], (v_hip, v_knee))
             friction, torque = config.friction, self._pid.torque
             u_hip = float(gravity[hip]) + friction.torque(_SH, qd[hip]) + v_hip
             u_knee = float(gravity[knee]) + friction.torque(_SK, qd[knee]) + v_knee
-            if config.feedforward:
-                uf = self._uf[self._stance][cycle]
-                u_hip, u_knee = u_hip + float(uf[hip]), u_knee + float(uf[knee])
             torque[hip] = w * float(torque[hip]) + (1.0 - w) * u_hip
             torque[knee] = w * float(torque[knee]) + (1.0 - w) * u_knee
 

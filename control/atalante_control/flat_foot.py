@@ -29,32 +29,39 @@ class FlatFoot:
         if self.axis[1] != 0.0 or self.axis[0] == 0.0:
             raise ValueError(f"the henke axis lies in the foot's x-z plane and is not vertical, not {self.axis!r}")
 
-    def angles(self, tibia: tuple[float, float, float, float]) -> tuple[float, float]:
-        """SA and HA [rad] that level the sole, or the nearest HA where the tibia leans too far sideways for it.
+    def level(
+        self, tibia: tuple[float, float, float, float], gyro: tuple[float, float, float]
+    ) -> tuple[tuple[float, float], tuple[float, float]]:
+        """SA and HA that level the sole, or the nearest HA where the tibia leans too far sideways for it.
 
         Args:
             tibia: attitude of the tibia IMU, unit quaternion wxyz, tibia to world; its heading does not matter.
+            gyro: angular velocity of the tibia in its own frame [rad/s].
+
+        Returns:
+            Angles [rad] and their rates [rad/s], SA then HA.
         """
         w, x, y, z = tibia
         tx, ty, tz = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+        p, q, r = gyro
+        txd, tyd, tzd = ty * r - tz * q, tz * p - tx * r, tx * q - ty * p  # the vertical, seen from a turning tibia
         c, s = math.cos(self.toe_out), math.sin(self.toe_out)
-        gx, gy = c * tx + s * ty, c * ty - s * tx
+        gx, gy, gxd, gyd = c * tx + s * ty, c * ty - s * tx, c * txd + s * tyd, c * tyd - s * txd
         ax, _, az = self.axis
         norm = math.hypot(ax, az)
         ax, az = ax / norm, az / norm
-        henke = -math.asin(min(1.0, max(-1.0, gy / ax)))
-        versine = 1.0 - math.cos(henke)
-        sagittal = math.atan2(gx, tz) - math.atan2(versine * ax * az, 1.0 - versine * ax * ax)
-        return math.remainder(sagittal, 2.0 * math.pi), henke
 
-    def rates(self, x: float, y: float, z: float) -> tuple[float, float]:
-        """Speeds of SA and HA [rad/s] that keep the sole level, to first order in the tilt.
-
-        Args:
-            x, y, z: angular velocity of the tibia in its own frame [rad/s].
-        """
-        c, s = math.cos(self.toe_out), math.sin(self.toe_out)
-        return s * x - c * y, -(c * x + s * y) * math.hypot(self.axis[0], self.axis[2]) / self.axis[0]
+        sine = -gy / ax
+        sine, henke_rate = (math.copysign(1.0, sine), 0.0) if abs(sine) >= 1.0 else (sine, -gyd / ax)
+        cosine = math.sqrt(1.0 - sine * sine)
+        henke_rate = henke_rate / cosine if cosine else 0.0
+        versine, versine_rate = 1.0 - cosine, sine * henke_rate
+        nx, nz = versine * ax * az, 1.0 - versine * ax * ax
+        sagittal = math.remainder(math.atan2(gx, tz) - math.atan2(nx, nz), 2.0 * math.pi)
+        leaning = gx * gx + tz * tz
+        sagittal_rate = (tz * gxd - gx * tzd) / leaning if leaning else 0.0
+        sagittal_rate -= versine_rate * ax * (nz * az + nx * ax) / (nx * nx + nz * nz)
+        return (sagittal, math.asin(sine)), (sagittal_rate, henke_rate)
 
 
 def flat_feet(parameters: ExoskeletonParameters) -> tuple[FlatFoot, FlatFoot]:

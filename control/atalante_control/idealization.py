@@ -155,3 +155,13 @@ class AssistedInertia:
             + (a22 + b22 * c + c22 * s) * knee_acceleration
             - 0.5 * m11_slope * hip_rate * hip_rate,
         )
+
+    def ideal(self, knee: float, hip_rate: float, knee_rate: float, tau: Pair) -> Pair:
+        """Inverse of `torques`: what real torques `tau` without gravity are to the separate inertias [Nm]."""
+        c1, c2 = self.torques(knee, hip_rate, knee_rate, (0.0, 0.0))
+        m11, m12, m22 = self.block(knee)
+        r1, r2, determinant = tau[0] - c1, tau[1] - c2, m11 * m22 - m12 * m12
+        return (
+            self.inertias[0] * (m22 * r1 - m12 * r2) / determinant,
+            self.inertias[1] * (m11 * r2 - m12 * r1) / determinant,
+        )

@@ -73,54 +73,62 @@ AIR_GAINS = PidGains(
 
 
 class Pid:
-    """The twelve PIDs.
+    """The twelve PIDs. Call `start_step` at each step change, then `update` once a cycle.
 
     Attributes:
         torque: last result, shape (12,) [Nm], overwritten by the next `update`.
     """
 
     def __init__(self, gains: PidGains) -> None:
-        self._limit = np.full(len(JOINTS), gains.integral_limit)
         stance, swing = gains.stance, gains.swing
         roles = {LEFT: (stance, swing), RIGHT: (swing, stance)}  # left leg, right leg
-        self._proportional = {s: _row(left.kp, right.kp) for s, (left, right) in roles.items()}
-        self._derivative = {s: _row(left.kd, right.kd) for s, (left, right) in roles.items()}
-        self._integral_gain = {s: _row(left.ki, right.ki) * PERIOD for s, (left, right) in roles.items()}
-        self._integral = np.zeros(len(JOINTS))
-        self._error, self._term = np.empty(len(JOINTS)), np.empty(len(JOINTS))
-        self._lower = -self._limit
-        self.torque = np.zeros(len(JOINTS))
+        self._gains_of = {s: _row(left.kp, right.kp, left.kd, right.kd) for s, (left, right) in roles.items()}
+        self._integral_of = {s: _row(left.ki, right.ki) * PERIOD for s, (left, right) in roles.items()}
+        n = len(JOINTS)
+        self._upper = np.full(n, gains.integral_limit)
+        self._lower, self._integral, self._term = -self._upper, np.zeros(n), np.empty(n)
+        self._error = np.empty(2 * n)
+        self._position_error, self._velocity_error = self._error[:n], self._error[n:]
+        self.torque = np.zeros(n)
+        self.start_step(RIGHT, np.ones(n))
 
     def reset(self) -> None:
         """Empty the integrals."""
         self._integral[:] = 0.0
 
-    def update(
-        self, stance: int, q_des: Vector, qd_des: Vector, q: Vector, qd: Vector, share: Vector | None = None
-    ) -> Vector:
-        """u_t of one cycle.
+    def start_step(self, stance: int, share: Vector) -> None:
+        """Give each leg the gains of its role.
 
         Args:
             stance: LEFT or RIGHT.
-            q_des, q: shape (12,) [rad].
-            qd_des, qd: shape (12,) [rad/s].
             share: how far the baseline acts on each joint, shape (12,) in [0, 1]; scales what is integrated.
         """
-        error, term, integral, torque = self._error, self._term, self._integral, self.torque
-        np.subtract(q_des, q, out=error)
-        np.multiply(error, self._integral_gain[stance], out=term)
-        if share is not None:
-            np.multiply(term, share, out=term)
-        np.add(integral, term, out=integral)
+        self._gains = self._gains_of[stance]
+        self._integral_gain = self._integral_of[stance] * share
+
+    def update(self, desired: Vector, q: Vector, qd: Vector) -> Vector:
+        """u_t of one cycle.
+
+        Args:
+            desired: q_des [rad], then q_des' [rad/s], shape (24,).
+            q: shape (12,) [rad].
+            qd: shape (12,) [rad/s].
+
+        Returns:
+            `torque`.
+        """
+        error, integral, torque, n = self._error, self._integral, self.torque, len(JOINTS)
+        np.subtract(desired[:n], q, out=self._position_error)
+        np.subtract(desired[n:], qd, out=self._velocity_error)
+        np.multiply(self._position_error, self._integral_gain, out=self._term)
+        np.add(integral, self._term, out=integral)
         np.maximum(integral, self._lower, out=integral)
-        np.minimum(integral, self._limit, out=integral)
-        np.multiply(error, self._proportional[stance], out=torque)
-        np.subtract(qd_des, qd, out=error)
-        np.multiply(error, self._derivative[stance], out=error)
-        np.add(torque, error, out=torque)
+        np.minimum(integral, self._upper, out=integral)
+        np.multiply(error, self._gains, out=error)
+        np.add(self._position_error, self._velocity_error, out=torque)
         np.add(torque, integral, out=torque)
         return torque
 
 
-def _row(left: Sequence[float], right: Sequence[float]) -> Vector:
-    return np.array([*left, *right], dtype=np.float64)
+def _row(*columns: Sequence[float]) -> Vector:
+    return np.concatenate([np.array(column, dtype=np.float64) for column in columns])

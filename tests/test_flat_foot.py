@@ -1,0 +1,93 @@
+"""Flat foot against rotation matrices written out here: the sole's normal must come out vertical."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from atalante_control.flat_foot import FlatFoot, flat_feet
+from atalante_control.model import ExoskeletonParameters
+
+ANGLES = st.floats(-0.6, 0.6)
+STILL = (0.0, 0.0, 0.0)
+HEADING = st.floats(-math.pi, math.pi)
+LEFT, RIGHT = flat_feet(ExoskeletonParameters())
+
+
+def rotation(axis: tuple[float, float, float], angle: float) -> np.ndarray:
+    a = np.array(axis) / np.linalg.norm(axis)
+    k = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
+    return np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * k @ k
+
+
+def rotation_vector(v: np.ndarray) -> np.ndarray:
+    angle = float(np.linalg.norm(v))
+    return rotation(tuple(v), angle) if angle else np.eye(3)
+
+
+def quaternion(r: np.ndarray) -> tuple[float, float, float, float]:
+    w = 0.5 * math.sqrt(max(0.0, 1.0 + np.trace(r)))
+    return w, (r[2, 1] - r[1, 2]) / (4 * w), (r[0, 2] - r[2, 0]) / (4 * w), (r[1, 0] - r[0, 1]) / (4 * w)
+
+
+def tibia(heading: float, roll: float, pitch: float) -> np.ndarray:
+    return rotation((0, 0, 1), heading) @ rotation((1, 0, 0), roll) @ rotation((0, 1, 0), pitch)
+
+
+def sole_normal(foot: FlatFoot, shank: np.ndarray, sagittal: float, henke: float) -> np.ndarray:
+    r = shank @ rotation((0, 0, 1), foot.toe_out) @ rotation((0, 1, 0), sagittal) @ rotation(foot.axis, henke)
+    return r @ np.array([0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("foot", [LEFT, RIGHT], ids=["left", "right"])
+@given(heading=HEADING, roll=ANGLES, pitch=ANGLES)
+def test_the_sole_is_level(foot: FlatFoot, heading: float, roll: float, pitch: float):
+    r = tibia(heading, roll, pitch)
+    assume(np.trace(r) > -0.9)
+    angles = foot.level(quaternion(r), STILL)[0]
+    np.testing.assert_allclose(sole_normal(foot, r, *angles), [0.0, 0.0, 1.0], atol=1e-9)
+
+
+@given(HEADING, ANGLES)
+def test_heading_does_not_matter(heading: float, pitch: float):
+    assume(abs(heading) < 3.0)
+    turned, ahead = (LEFT.level(quaternion(tibia(h, 0.1, pitch)), STILL)[0] for h in (heading, 0.0))
+    np.testing.assert_allclose(turned, ahead, atol=1e-9)
+
+
+def test_an_upright_tibia_needs_nothing_and_a_pitched_one_its_pitch():
+    np.testing.assert_allclose(LEFT.level((1.0, 0.0, 0.0, 0.0), STILL)[0], (0.0, 0.0), atol=1e-15)
+    straight = FlatFoot(0.0, (0.788, 0.0, 0.616))
+    np.testing.assert_allclose(straight.level(quaternion(tibia(0.0, 0.0, 0.3)), STILL)[0], (-0.3, 0.0), atol=1e-12)
+
+
+def test_left_and_right_are_mirror_images():
+    left = LEFT.level(quaternion(tibia(0.0, 0.1, 0.2)), STILL)[0]
+    right = RIGHT.level(quaternion(tibia(0.0, -0.1, 0.2)), STILL)[0]
+    np.testing.assert_allclose(right, (left[0], -left[1]), atol=1e-12)
+
+
+def test_a_tibia_leaning_too_far_gets_the_nearest_angle():
+    angles = LEFT.level(quaternion(tibia(0.0, 1.3, 0.0)), (1.0, 2.0, 3.0))[0]
+    assert all(math.isfinite(a) for a in angles)
+    assert abs(angles[1]) == pytest.approx(math.pi / 2)
+
+
+@given(HEADING, ANGLES, ANGLES, *[st.floats(-3.0, 3.0)] * 3)
+def test_rates_are_those_of_the_angles(heading: float, roll: float, pitch: float, p: float, q: float, r: float):
+    assume(abs(heading) < 3.0)
+    gyro, shank, step = (p, q, r), tibia(heading, 0.5 * roll, 0.5 * pitch), 1e-6
+    later, before = (shank @ rotation_vector(np.array(gyro) * s) for s in (step, -step))
+    for foot in (LEFT, RIGHT):
+        ahead, behind = (np.array(foot.level(quaternion(m), STILL)[0]) for m in (later, before))
+        np.testing.assert_allclose(foot.level(quaternion(shank), gyro)[1], (ahead - behind) / (2 * step), atol=1e-6)
+
+
+def test_refuses_an_axis_it_has_no_solution_for():
+    for axis in ((0.7, 0.1, 0.7), (0.0, 0.0, 1.0)):
+        with pytest.raises(ValueError, match="henke axis"):
+            FlatFoot(0.0, axis)

@@ -1,0 +1,180 @@
+"""Gaits: Bezier arithmetic, the mirrored step, and a loader that names what is wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from atalante_control.gait import (
+    HANG_GAIT,
+    PERIOD,
+    SIGN,
+    SWAP,
+    Gait,
+    GaitError,
+    bezier,
+    derivative,
+    load_gait,
+    power_basis,
+)
+from atalante_hal.robot import JOINTS, load_robot
+
+ROBOT = load_robot()
+HANG = load_gait(HANG_GAIT, ROBOT)
+
+
+def document() -> dict[str, Any]:
+    return json.loads(HANG_GAIT.read_text())
+
+
+def refused(tmp_path: Path, content: Any) -> str:
+    path = tmp_path / "gait.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(GaitError) as error:
+        load_gait(path, ROBOT)
+    message = str(error.value)
+    assert message.startswith(str(path))
+    assert "\n" not in message
+    return message
+
+
+def test_bezier_derivative_and_power_basis_agree():
+    rng = np.random.default_rng(1)
+    control_points = rng.normal(size=(5, 8))
+    phase = np.linspace(0.0, 1.0, 37)
+    values = bezier(control_points, phase)
+    np.testing.assert_allclose(values[[0, -1]], control_points[:, [0, -1]].T, atol=1e-14)
+    powers = np.array([np.polynomial.polynomial.polyval(phase, c) for c in power_basis(control_points)]).T
+    np.testing.assert_allclose(powers, values, atol=1e-11)
+    slope = np.array(
+        [
+            np.polynomial.polynomial.polyval(phase, np.polynomial.polynomial.polyder(c))
+            for c in power_basis(control_points)
+        ]
+    ).T
+    np.testing.assert_allclose(bezier(derivative(control_points), phase), slope, atol=1e-10)
+
+
+def test_tables_are_their_own_derivatives():
+    tables = HANG.tables()
+    assert tables.q.shape == (HANG.cycles + 1, len(JOINTS))
+    np.testing.assert_allclose(np.gradient(tables.q, PERIOD, axis=0)[1:-1], tables.qd[1:-1], atol=1e-4)
+    np.testing.assert_allclose(np.gradient(tables.qd, PERIOD, axis=0)[1:-1], tables.qdd[1:-1], atol=2e-2)
+    assert not tables.uf.any()
+    with pytest.raises(ValueError, match="read-only"):
+        tables.q[0, 0] = 1.0
+
+
+def test_mirroring_swaps_legs_and_signs_and_is_its_own_inverse():
+    left = HANG.mirrored()
+    np.testing.assert_array_equal(left.tables().q, HANG.tables().q[:, SWAP] * SIGN)
+    np.testing.assert_array_equal(left.mirrored().coefficients, HANG.coefficients)
+
+
+def test_hang_gait_is_periodic_through_the_leg_swap_within_limits_and_slow():
+    right, left = HANG.tables(), HANG.mirrored().tables()
+    assert HANG.duration == 0.8
+    np.testing.assert_allclose(right.q[-1], left.q[0], atol=1e-12)
+    np.testing.assert_allclose(right.qd[-1], left.qd[0], atol=1e-10)
+    assert np.abs(right.qd).max() < 3.0
+    margin = math.radians(1.0)
+    assert (right.q > ROBOT.position_min + margin).all()
+    assert (right.q < ROBOT.position_max - margin).all()
+    knee = np.degrees(right.q[:, JOINTS.index("left_SK")])
+    assert 45.0 < knee.max() < 55.0
+    assert knee[0] < 25.0
+    assert knee[-1] < 25.0
+
+
+def test_hash_follows_what_is_walked_and_nothing_else():
+    other = HANG.coefficients.copy()
+    other[3, 4] += 1e-6
+    assert Gait("renamed", HANG.duration, HANG.coefficients).hash32 == HANG.hash32
+    assert Gait("hang", HANG.duration, other).hash32 != HANG.hash32
+    assert Gait("hang", 0.81, HANG.coefficients).hash32 != HANG.hash32
+
+
+def test_what_the_library_will_need_is_kept(tmp_path: Path):
+    raw = document()
+    raw["feedforward"] = {joint: [1.0 * i] * 8 for i, joint in enumerate(JOINTS)}
+    raw["parameters"] = {"patient_mass": 75.0, "step_length": 0.16}
+    raw["solver"] = {"name": "IPOPT", "iterations": 42, "history": [1, 2]}
+    path = tmp_path / "gait.json"
+    path.write_text(json.dumps(raw))
+    gait = load_gait(path, ROBOT)
+    assert gait.parameters["patient_mass"] == 75.0
+    assert gait.solver["history"] == [1, 2]
+    np.testing.assert_allclose(gait.tables().uf[17], np.arange(12.0), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda d: d.update(speed=1), "speed is unknown; valid keys are format, name, duration, joints"),
+        (lambda d: d.pop("duration"), "duration is missing"),
+        (lambda d: d.update(format="atalante-gait/9"), "format is 'atalante-gait/1'"),
+        (lambda d: d.update(duration="0.8"), "duration is a number of seconds"),
+        (lambda d: d.update(duration=True), "duration is a number of seconds"),
+        (lambda d: d.update(duration=30.0), "duration is a number of seconds from 0.3 to 3.0"),
+        (lambda d: d.update(duration=0.8004), "whole number of milliseconds"),
+        (lambda d: d.update(name=""), "name is a text"),
+        (lambda d: d.update(parameters={"mass": "75"}), "parameters is an object of finite numbers"),
+        (lambda d: d.update(solver=3), "solver is an object"),
+        (lambda d: d.update(joints=[1]), "joints is an object with one list for each of left_FH"),
+        (lambda d: d["joints"].update(left_XX=[0] * 8), "joints.left_XX is unknown; valid joints are left_FH"),
+        (lambda d: d["joints"].pop("right_SA"), "joints.right_SA is a list of 8 finite numbers, not None"),
+        (lambda d: d["joints"].update(left_SK=[0.3] * 7), "joints.left_SK is a list of 8 finite numbers"),
+        (lambda d: d["joints"].update(left_SK=[0.3] * 7 + ["x"]), "joints.left_SK is a list of 8 finite numbers"),
+        (lambda d: d.update(feedforward={"left_FH": [0] * 8}), "feedforward.left_TH is a list of 8 finite numbers"),
+    ],
+)
+def test_loader_names_the_key_and_what_is_valid(tmp_path: Path, change: Any, said: str):
+    raw = document()
+    change(raw)
+    assert said in refused(tmp_path, raw)
+
+
+def test_loader_refuses_what_is_not_a_number(tmp_path: Path):
+    text = HANG_GAIT.read_text()
+    assert "NaN is not allowed" in refused(tmp_path, text.replace("0.384", "NaN", 1))
+    assert "Infinity is not allowed" in refused(tmp_path, text.replace("0.384", "Infinity", 1))
+    assert "finite" in refused(tmp_path, text.replace("0.384", "1e999", 1))
+
+
+def test_loader_refuses_a_file_that_is_none(tmp_path: Path):
+    refused(tmp_path, "{")
+    refused(tmp_path, "[]")
+    with pytest.raises(GaitError):
+        load_gait(tmp_path / "missing.json", ROBOT)
+
+
+def shift(raw: dict[str, Any], joint: str, points: tuple[int, ...], by: float) -> dict[str, Any]:
+    for point in points:
+        raw["joints"][joint][point] += by
+    return raw
+
+
+def test_loader_refuses_a_jump_at_the_step_change(tmp_path: Path):
+    said = refused(tmp_path, shift(document(), "left_SK", (6, 7), math.radians(0.11)))
+    assert "SK jumps by" in said
+    assert "rad at the step change" in said
+    path = tmp_path / "gait.json"
+    path.write_text(json.dumps(shift(document(), "left_SK", (6, 7), math.radians(0.09))))
+    load_gait(path, ROBOT)
+    said = refused(tmp_path, shift(document(), "left_SH", (6,), 0.01))
+    assert "SH jumps by" in said
+    assert "rad/s at the step change" in said
+
+
+def test_loader_refuses_what_the_robot_cannot_do(tmp_path: Path):
+    said = refused(tmp_path, shift(document(), "left_SA", (3, 4), -0.2))
+    assert "joints.left_SA leaves its range" in said
+    assert "[-0.279, 0.157] rad" in said
+    fast = document()
+    fast["duration"] = 0.3  # the same way in less than half the time
+    assert "joints.left_SK leaves its range" in refused(tmp_path, fast)

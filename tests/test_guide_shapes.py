@@ -1,0 +1,84 @@
+"""Guide shapes: what each is along a step, and the width the assistance factor gives it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from atalante_control.guide_shapes import SHAPES, GuideShape, half_width, shape_named
+
+PHASE = np.linspace(0.0, 1.0, 801)
+ALL = list(SHAPES.values())
+NAMES = list(SHAPES)
+
+
+@given(st.floats(0.0, 1.0))
+def test_half_width_is_the_papers(xi: float):
+    assert half_width(xi) == pytest.approx(math.radians(0.5 + 7.0 * (1.0 - xi)))
+
+
+def test_half_width_at_half_assistance_is_four_degrees():
+    assert math.degrees(half_width(0.5)) == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize("bad", [-0.01, 1.01, float("nan")])
+def test_half_width_refuses_what_is_no_factor(bad: float):
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        half_width(bad)
+
+
+@pytest.mark.parametrize("shape", ALL, ids=NAMES)
+@given(xi=st.floats(0.0, 1.0))
+def test_every_shape_is_open_and_no_wider_than_the_factor_allows(shape: GuideShape, xi: float):
+    bounds = shape.bounds(PHASE, xi)
+    assert bounds.shape == (len(PHASE), 2)
+    assert (bounds > 0.0).all()
+    assert (bounds <= half_width(xi) * (1 + 1e-12)).all()
+
+
+@pytest.mark.parametrize("shape", ALL, ids=NAMES)
+def test_every_shape_shrinks_with_the_factor_and_keeps_its_last_width(shape: GuideShape):
+    widths = np.stack([shape.bounds(PHASE, xi) for xi in (0.0, 0.25, 0.5, 0.75, 1.0)])
+    assert (np.diff(widths, axis=0) <= 1e-12).all()
+    np.testing.assert_array_equal(
+        shape.bounds(np.array([1.0, 1.2]), 0.5)[0], shape.bounds(np.array([1.0, 1.2]), 0.5)[1]
+    )
+
+
+@pytest.mark.parametrize("name", ["constant", "widening", "narrowing", "pinched", "asymmetric"])
+def test_certifiable_shapes_have_no_step(name: str):
+    bounds = SHAPES[name].bounds(PHASE, 0.5)
+    assert np.abs(np.diff(bounds, axis=0)).max() < 0.02 * half_width(0.5)
+
+
+def test_shapes_do_what_their_names_say():
+    def at(name: str, phase: float) -> np.ndarray:
+        return np.degrees(SHAPES[name].bounds(np.array([phase]), 0.5)[0])
+
+    for phase in (0.0, 0.3, 1.0):
+        np.testing.assert_allclose(at("constant", phase), [4.0, 4.0])
+    np.testing.assert_allclose(at("widening", 0.0), [2.0, 2.0])
+    np.testing.assert_allclose(at("widening", 1.0), [4.0, 4.0])
+    np.testing.assert_allclose(at("narrowing", 0.0), [4.0, 4.0])
+    np.testing.assert_allclose(at("narrowing", 1.0), [2.0, 2.0])
+    np.testing.assert_allclose(at("pinched", 0.4), [4.0, 4.0])
+    np.testing.assert_allclose(at("pinched", 0.6), [2.5, 2.5])
+    np.testing.assert_allclose(at("pinched", 0.8), [1.0, 1.0])
+    np.testing.assert_allclose(at("pinched", 1.0), [1.0, 1.0])
+    np.testing.assert_allclose(at("asymmetric", 0.5), [4.0, 2.4])
+    np.testing.assert_allclose(at("snap", 0.3), [4.0, 4.0])
+    np.testing.assert_allclose(at("snap", 0.5), [0.1, 0.1])
+
+
+def test_a_guide_already_narrower_than_the_pinch_stays_as_it_is():
+    np.testing.assert_allclose(SHAPES["pinched"].bounds(PHASE, 1.0), half_width(1.0))
+
+
+def test_an_unknown_name_is_answered_with_the_names():
+    assert shape_named("pinched") is SHAPES["pinched"]
+    with pytest.raises(ValueError, match="'square' is unknown; the shapes are constant, widening"):
+        shape_named("square")

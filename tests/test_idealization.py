@@ -1,0 +1,127 @@
+"""Idealization: friction, gravity and the coupled pair, each against Pinocchio asked another way."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pinocchio
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from atalante_control.gait import HANG_GAIT, load_gait
+from atalante_control.idealization import AssistedInertia, Friction, Gravity
+from atalante_control.model import ArticulatedModel, ExoskeletonParameters, pinocchio_model, urdf
+from atalante_hal.robot import JOINTS, load_robot
+
+ROBOT = load_robot()
+URDF = urdf(ExoskeletonParameters(), ROBOT)
+MODEL = pinocchio_model(URDF)
+SWING = load_gait(HANG_GAIT, ROBOT).tables().q
+HIP, KNEE = JOINTS.index("left_SH"), JOINTS.index("left_SK")
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+
+
+@given(st.integers(0, 5), st.floats(-10.0, 10.0))
+def test_friction_is_odd_smooth_and_tends_to_the_paper(joint: int, velocity: float):
+    friction = Friction()
+    torque = friction.torque(joint, velocity)
+    assert torque == pytest.approx(-friction.torque(joint, -velocity), abs=1e-12)
+    paper = friction.coulomb[joint] * math.copysign(1.0, velocity) + friction.viscous[joint] * velocity
+    assert abs(torque) <= abs(paper) + 1e-12
+    if abs(velocity) > 5 * friction.smoothing:
+        assert torque == pytest.approx(paper, rel=1e-3, abs=1e-3)
+
+
+def test_friction_at_rest_is_nothing_and_has_no_step():
+    friction = Friction()
+    assert friction.torque(2, 0.0) == 0.0
+    assert abs(friction.torque(2, 1e-6) - friction.torque(2, -1e-6)) < 1e-3
+
+
+@pytest.mark.parametrize("bad", [{"coulomb": (1.0,)}, {"viscous": (-1.0,) * 6}, {"smoothing": 0.0}])
+def test_friction_refuses_what_is_none(bad: dict[str, object]):
+    with pytest.raises(ValueError, match=r"finite|positive"):
+        Friction(**bad)  # type: ignore[arg-type]
+
+
+def test_gravity_of_a_level_pelvis_is_pinocchios():
+    rng, gravity, data = np.random.default_rng(5), Gravity(MODEL), MODEL.model.createData()
+    for _ in range(20):
+        q = rng.uniform(ROBOT.position_min, ROBOT.position_max)
+        pin = np.empty(12)
+        pin[MODEL.q] = q
+        np.testing.assert_allclose(
+            gravity.torque(q, LEVEL), pinocchio.computeGeneralizedGravity(MODEL.model, data, pin)[MODEL.v], atol=1e-12
+        )
+
+
+def test_gravity_of_a_tilted_pelvis_is_that_of_a_floating_base():
+    rng, gravity = np.random.default_rng(6), Gravity(MODEL)
+    floating = pinocchio_model(URDF, fixed_base=False)
+    data = floating.model.createData()
+    for _ in range(20):
+        q, attitude = rng.uniform(ROBOT.position_min, ROBOT.position_max), rng.normal(size=4)
+        attitude /= np.linalg.norm(attitude)
+        full = pinocchio.neutral(floating.model)
+        full[3:7] = attitude[[1, 2, 3, 0]]
+        full[floating.q] = q
+        expected = pinocchio.computeGeneralizedGravity(floating.model, data, full)[floating.v]
+        np.testing.assert_allclose(gravity.torque(q, tuple(attitude)), expected, atol=1e-9)
+
+
+def test_gravity_goes_by_the_joint_map():
+    order = np.random.default_rng(7).permutation(12)
+    reordered = ArticulatedModel(MODEL.model, MODEL.q[order], MODEL.v[order])
+    q = np.random.default_rng(8).uniform(ROBOT.position_min, ROBOT.position_max)
+    expected = Gravity(MODEL).torque(q, LEVEL).copy()
+    np.testing.assert_allclose(Gravity(reordered).torque(q[order], LEVEL), expected[order], atol=1e-12)
+
+
+def test_gravity_leaves_the_model_it_was_given_alone():
+    gravity = Gravity(MODEL)
+    gravity.torque(np.zeros(12), (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0))
+    np.testing.assert_allclose(MODEL.model.gravity.linear, [0.0, 0.0, -9.81])
+
+
+def mass_matrix(q: np.ndarray) -> np.ndarray:
+    pin = np.empty(12)
+    pin[MODEL.q] = q
+    upper = np.triu(pinocchio.crba(MODEL.model, MODEL.model.createData(), pin))
+    return (upper + np.triu(upper, 1).T)[np.ix_(MODEL.v, MODEL.v)]
+
+
+def test_assisted_inertia_is_the_block_of_the_mass_matrix_along_the_step():
+    inertia = AssistedInertia(MODEL, SWING)
+    for pose in SWING[::50]:
+        m = mass_matrix(pose)
+        m11, m12, m22 = inertia.block(float(pose[KNEE]))
+        np.testing.assert_allclose([m11, m12, m22], [m[HIP, HIP], m[HIP, KNEE], m[KNEE, KNEE]], rtol=0.02)
+    diagonal = np.array([[mass_matrix(p)[HIP, HIP], mass_matrix(p)[KNEE, KNEE]] for p in SWING[::50]])
+    np.testing.assert_allclose(inertia.inertias, diagonal.max(axis=0), rtol=0.02)
+
+
+def test_torques_give_the_accelerations_of_separate_inertias():
+    inertia, rng = AssistedInertia(MODEL, SWING), np.random.default_rng(9)
+    for pose in SWING[::100]:
+        v = np.zeros(12)
+        v[[HIP, KNEE]] = rng.normal(size=2) * 2.0
+        u = rng.normal(size=2) * 50.0
+        tau = inertia.torques(float(pose[KNEE]), float(v[HIP]), float(v[KNEE]), (float(u[0]), float(u[1])))
+        # The other joints held still: inverse dynamics with only these two accelerating must ask for tau.
+        a = np.zeros(12)
+        a[[HIP, KNEE]] = u / np.array(inertia.inertias)
+        pin_q, pin_v, pin_a = np.empty(12), np.empty(12), np.empty(12)
+        pin_q[MODEL.q], pin_v[MODEL.v], pin_a[MODEL.v] = pose, v, a
+        data = MODEL.model.createData()
+        asked = pinocchio.rnea(MODEL.model, data, pin_q, pin_v, pin_a)
+        asked -= pinocchio.computeGeneralizedGravity(MODEL.model, data, pin_q)
+        np.testing.assert_allclose(tau, asked[MODEL.v][[HIP, KNEE]], atol=0.02 * np.abs(u).max() + 0.2)
+
+
+@given(st.floats(0.0, 1.9), *[st.floats(-3.0, 3.0)] * 2, *[st.floats(-100.0, 100.0)] * 2)
+def test_ideal_is_the_inverse_of_torques(knee: float, hip_rate: float, knee_rate: float, u1: float, u2: float):
+    inertia = AssistedInertia(MODEL, SWING)
+    tau = inertia.torques(knee, hip_rate, knee_rate, (u1, u2))
+    np.testing.assert_allclose(inertia.ideal(knee, hip_rate, knee_rate, tau), (u1, u2), atol=1e-8)

@@ -1,0 +1,104 @@
+"""PID of the twelve joints against the formula written out joint by joint."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from atalante_control.pid import AIR_GAINS, LEFT, RIGHT, LegGains, Pid, PidGains
+
+RNG = np.random.default_rng(3)
+GAINS = PidGains()
+ALL = np.ones(12)
+
+
+def desired(q: np.ndarray, qd: np.ndarray) -> np.ndarray:
+    return np.concatenate([q, qd])
+
+
+@pytest.mark.parametrize("stance", [LEFT, RIGHT])
+def test_each_leg_has_the_gains_of_its_role(stance: int):
+    pid = Pid(GAINS)
+    pid.start_step(stance, ALL)
+    q_des, qd_des, q, qd = RNG.normal(size=(4, 12)) * 0.01
+    torque = pid.update(desired(q_des, qd_des), q, qd)
+    for joint in range(12):
+        leg = LEFT if joint < 6 else RIGHT
+        gains = GAINS.stance if leg == stance else GAINS.swing
+        i = joint % 6
+        e = q_des[joint] - q[joint]
+        expected = gains.kp[i] * e + gains.kd[i] * (qd_des[joint] - qd[joint]) + gains.ki[i] * e * 1e-3
+        assert torque[joint] == pytest.approx(expected, abs=1e-12)
+
+
+def test_integral_grows_with_the_error_and_stops_at_its_limit():
+    pid = Pid(GAINS)
+    pid.start_step(RIGHT, ALL)
+    row, zero = desired(np.full(12, 0.1), np.zeros(12)), np.zeros(12)
+    first = pid.update(row, zero, zero).copy()
+    second = pid.update(row, zero, zero).copy()
+    assert (second > first).all()
+    for _ in range(6000):
+        last = pid.update(row, zero, zero)
+    ki = np.array([*GAINS.swing.ki, *GAINS.stance.ki]) * 1e-4
+    np.testing.assert_allclose(last - (first - ki), GAINS.integral_limit, rtol=1e-9)
+
+
+def test_integral_does_not_wind_up_past_its_limit():
+    pid = Pid(GAINS)
+    pid.start_step(RIGHT, ALL)
+    zero = np.zeros(12)
+    for _ in range(20000):
+        pid.update(desired(np.full(12, 0.1), zero), zero, zero)
+    cycles = 0
+    while (
+        pid.update(desired(np.full(12, -0.1), zero), zero, zero) + 0.1 * np.array([*GAINS.swing.kp, *GAINS.stance.kp])
+        > 0
+    ).any():
+        cycles += 1
+    slowest = min(GAINS.swing.ki) * 0.1 * 1e-3  # Nm a cycle
+    assert cycles <= GAINS.integral_limit / slowest + 1
+
+
+def test_a_joint_with_no_share_does_not_integrate():
+    pid, share = Pid(GAINS), np.ones(12)
+    share[2] = 0.0
+    pid.start_step(RIGHT, share)
+    zero, row = np.zeros(12), desired(np.full(12, 0.1), np.zeros(12))
+    first = pid.update(row, zero, zero).copy()
+    second = pid.update(row, zero, zero)
+    assert second[2] == first[2]
+    assert (np.delete(second, 2) > np.delete(first, 2)).all()
+
+
+def test_a_full_share_is_no_share_to_the_last_bit():
+    one, other = Pid(GAINS), Pid(GAINS)
+    one.start_step(LEFT, np.ones(12))
+    other.start_step(LEFT, np.full(12, 1.0))
+    for _ in range(100):
+        q_des, qd_des, q, qd = RNG.normal(size=(4, 12))
+        assert (
+            one.update(desired(q_des, qd_des), q, qd).tobytes() == other.update(desired(q_des, qd_des), q, qd).tobytes()
+        )
+
+
+def test_reset_empties_the_integral():
+    pid = Pid(GAINS)
+    zero, row = np.zeros(12), desired(np.full(12, 0.1), np.zeros(12))
+    first = pid.update(row, zero, zero).copy()
+    for _ in range(100):
+        pid.update(row, zero, zero)
+    pid.reset()
+    np.testing.assert_array_equal(pid.update(row, zero, zero), first)
+
+
+def test_gains_in_the_air_free_knee_and_ankle_of_the_stance_leg():
+    for row in ("kp", "ki", "kd"):
+        assert getattr(AIR_GAINS.stance, row)[3:] == getattr(AIR_GAINS.swing, row)[3:]
+
+
+def test_refuses_gains_that_are_none():
+    good = (1.0,) * 6
+    for bad in ((1.0,) * 5, (1.0,) * 5 + (-1.0,), (1.0,) * 5 + (float("nan"),)):
+        with pytest.raises(ValueError, match="kd is 6 finite numbers"):
+            LegGains(good, good, bad)  # type: ignore[arg-type]
