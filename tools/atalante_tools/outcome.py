@@ -55,7 +55,6 @@ KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_hal.bus.channel_map", "ChannelMapError", Misused),
     ("atalante_dbc", "DbcError", Failed),
     ("atalante_hal.robot", "RobotError", Failed),
-    ("atalante_hal.telemetry.can_log", "CanLogError", Failed),
     ("atalante_hal.telemetry.process", "TelemetryError", Failed),
     ("atalante_hal.telemetry.ring", "RingError", Failed),
     ("atalante_hal.telemetry.sink", "SinkError", Failed),

@@ -17,7 +17,12 @@ _file_argument = click.argument("file", type=_FILE, required=False)
 
 @click.group()
 def command() -> None:
-    """Check, print and compare DBC files, and make C code of one. FILE is the robot's own network unless given."""
+    """Check, print and compare DBC files, and make C code of one. FILE is the robot's own network unless given.
+
+    \b
+    Example: atalante dbc lint
+             atalante dbc diff old.dbc new.dbc
+    """
 
 
 @command.command()

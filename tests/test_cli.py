@@ -1,0 +1,252 @@
+"""The command line as a whole: help, version, exit codes, one sentence for an error, JSON alone on stdout, start-up."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from atalante_control.gait import GaitError
+from atalante_dbc import DbcError
+from atalante_hal.bus import BusAbsent, BusDown, BusError, BusFull
+from atalante_hal.bus.channel_map import ChannelMapError
+from atalante_hal.bus.replay import LogUnreadable
+from atalante_hal.robot import RobotError
+from atalante_hal.telemetry.process import TelemetryError
+from atalante_hal.telemetry.ring import RingError
+from atalante_hal.telemetry.sink import SinkError
+from atalante_tools import cli as cli_module
+from atalante_tools.cli import COMMANDS, Commands, cli
+from atalante_tools.outcome import KNOWN, Failed, FaultLatched
+
+#: What a command loads that takes long, and --help must not.
+SLOW = {"numpy", "can", "cantools", "pybullet", "pinocchio", "zenoh", "mcap", "matplotlib", "atalante_dbc"}
+
+
+def atalante(*arguments: str) -> list[str]:
+    return [sys.executable, "-c", "from atalante_tools.cli import main; main()", *arguments]
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(atalante(*arguments), capture_output=True, text=True, timeout=120, check=False)
+
+
+# -- help ------------------------------------------------------------------------------------------------------------
+
+
+def helps(command: click.Command, path: list[str]) -> Iterator[str]:
+    """The help of a command and of every command below it."""
+    result = CliRunner().invoke(cli, [*path, "--help"])
+    assert (result.exit_code, result.stderr) == (0, "")
+    yield result.stdout
+    if isinstance(command, click.Group):
+        context = click.Context(command)
+        for name in command.list_commands(context):
+            child = command.get_command(context, name)
+            assert child is not None
+            yield from helps(child, [*path, name])
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help_with_an_example(name: str) -> None:
+    command = cli.get_command(click.Context(cli), name)
+    assert command is not None
+    first, *others = helps(command, [name])
+    assert f"Example: atalante {name}" in first
+    assert all(len(text.split("Options:")[0].splitlines()) > 2 for text in others)
+
+
+def test_the_list_of_commands_is_complete_and_in_order() -> None:
+    result = CliRunner().invoke(cli, ["--help"])
+    assert result.exit_code == 0
+    listed = [line.split()[0] for line in result.stdout.split("Commands:\n")[1].splitlines() if line[2:3] != " "]
+    assert listed == list(COMMANDS)
+    assert "0 ok, 1 failed, 2 usage, 3 no device, 4 fault latched, 130" in result.stdout
+
+
+def test_help_and_version_load_nothing_slow() -> None:
+    program = """
+import sys
+from atalante_tools.cli import cli
+cli(["--help"], standalone_mode=False)
+cli(["jog", "--help"], standalone_mode=False)
+cli(["--version"], standalone_mode=False)
+print(sorted(sys.modules), file=sys.stderr)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    assert not SLOW & set(eval(done.stderr))
+    assert done.stdout.splitlines()[-1].startswith("atalante ")
+
+
+def test_angles_say_their_unit() -> None:
+    text = CliRunner().invoke(cli, ["jog", "--help"]).stdout
+    assert "degrees" in text
+    assert "deg/s" in text
+
+
+# -- errors ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def failing(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Let the command `jog` raise."""
+
+    def fail(error: BaseException) -> Any:
+        @click.command()
+        def command() -> None:
+            raise error
+
+        monkeypatch.setattr(Commands, "get_command", lambda *_: command)
+        return CliRunner().invoke(cli, ["jog"])
+
+    return fail
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (BusAbsent("there is no interface can7"), 3),
+        (BusDown("can0 is down"), 3),
+        (BusFull("can0 took 1 of 4 frames", 1), 1),
+        (BusError("can0 cannot send"), 1),
+        (LogUnreadable("run.log is empty"), 1),
+        (ChannelMapError("channel map 'a,b' is not one"), 2),
+        (DbcError("atalante.dbc:14: no unit"), 1),
+        (RobotError("robot.toml: joints.FH is missing"), 1),
+        (GaitError("hang.json: duration is missing"), 1),
+        (TelemetryError("the recorder is gone"), 1),
+        (RingError("no such ring"), 1),
+        (SinkError("RECORD_STOPPED", "the disk is full"), 1),
+        (Failed("it did not work"), 1),
+        (FaultLatched("left_SK is in FAULT"), 4),
+        (click.UsageError("no such thing"), 2),
+        (KeyboardInterrupt(), 130),
+        (SystemExit(143), 143),
+    ],
+)
+def test_a_known_error_is_one_sentence_and_its_code(failing: Any, error: BaseException, code: int) -> None:
+    result = failing(error)
+    assert result.exit_code == code
+    assert result.stdout == ""
+    if str(error) and not isinstance(error, SystemExit):
+        assert result.stderr.startswith(f"atalante: {error}")
+        assert result.stderr.count("\n") == 1
+    assert "Traceback" not in result.stderr
+
+
+def test_a_sentence_of_several_lines_becomes_one(failing: Any) -> None:
+    assert failing(BusError("first\n  second\tthird")).stderr == "atalante: first second third\n"
+
+
+def test_a_defect_keeps_its_traceback(failing: Any) -> None:
+    error = ZeroDivisionError("a defect")
+    assert failing(error).exception is error
+
+
+def test_every_known_error_exists() -> None:
+    import importlib
+
+    for module, name, _ in KNOWN:
+        kind = getattr(importlib.import_module(module), name)
+        assert issubclass(kind, Exception)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "sentence"),
+    [
+        (["nonsense"], 2, "No such command 'nonsense'"),
+        (["jog", "left_SK", "--to", "5", "--fast"], 2, "No such option '--fast'"),
+        (
+            ["jog", "left_SK", "--to", "5", "-i", "pigeon", "-c", "x"],
+            3,
+            "there is no CAN interface 'pigeon'; use one of",
+        ),
+        (
+            ["jog", "left_SK", "--to", "5", "-i", "socketcan", "-c", "a,b"],
+            2,
+            "does not say which bus is on which channel",
+        ),
+        (["jog", "left_SK", "--to", "5", "-i", "socketcan"], 2, "socketcan needs a channel: -c vcan0"),
+        (["status", "-i", "socketcan", "-c", "nocan7"], 3, "atalante doctor"),
+        (["emulator", "-i", "socketcan", "-c", "nocan7"], 3, "atalante doctor"),
+        (["pendant", "stop", "-i", "socketcan", "-c", "nocan7"], 3, "atalante doctor"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_its_code(arguments: list[str], code: int, sentence: str) -> None:
+    result = CliRunner().invoke(cli, arguments)
+    assert (result.exit_code, result.stdout) == (code, "")
+    assert sentence in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+# -- processes -------------------------------------------------------------------------------------------------------
+
+
+def test_version_and_codes_reach_the_shell() -> None:
+    version, unknown = run("--version"), run("status", "-i", "pigeon", "-c", "x")
+    assert (version.returncode, version.stdout.split()[0]) == (0, "atalante")
+    assert unknown.returncode == 3
+    assert unknown.stderr.startswith("atalante: there is no CAN interface 'pigeon'")
+
+
+def test_json_is_alone_on_stdout_whatever_libraries_print() -> None:
+    done = run("jog", "left_SK", "--to", "2", "--speed", "60", "--json")
+    assert done.returncode == 0
+    (line,) = done.stdout.splitlines()
+    assert json.loads(line)["joint"] == "left_SK"
+    assert "pybullet" not in done.stderr
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_a_running_command_in_hold(number: signal.Signals, code: int) -> None:
+    process = subprocess.Popen(
+        atalante("jog", "left_SK", "--to", "100", "--speed", "1", "--json"),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    assert process.stderr.readline() == "ACTIVE on embedded; Ctrl-C ends in HOLD\n"
+    process.send_signal(number)
+    out, rest = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert out == ""
+    assert rest.endswith("stopped, the robot is in HOLD\n")
+
+
+def test_sigterm_outside_a_run_is_143_too() -> None:
+    program = """
+import os, signal
+from atalante_tools import cli
+cli.cli = lambda **_: os.kill(os.getpid(), signal.SIGTERM)
+cli.main()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 143
+    assert "Traceback" not in done.stderr
+
+
+def test_a_reader_that_goes_away_is_no_traceback() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(
+        atalante("doctor"), stdout=writing, stderr=subprocess.PIPE, text=True, timeout=60, check=False
+    )
+    os.close(writing)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+
+
+def test_main_is_the_installed_command() -> None:
+    from importlib.metadata import entry_points
+
+    (entry,) = [e for e in entry_points(group="console_scripts") if e.name == "atalante"]
+    assert entry.load() is cli_module.main

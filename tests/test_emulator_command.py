@@ -1,0 +1,169 @@
+"""`atalante emulator`: the robot answers on a bus until Ctrl-C, says how it is, and gives its pendant away."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from atalante_dbc import Network
+from atalante_hal.bus import BusDown
+from atalante_hal.bus.pair import PairBus, lockstep_pair
+from atalante_hal.frame import FRAME, Frames, new_frames
+from atalante_hal.hal import Hal
+from atalante_hal.robot import Robot
+from atalante_hal.types import SupervisorState
+from atalante_tools import emulator as emulator_module
+from atalante_tools import rig as rig_module
+from atalante_tools.cli import cli
+from atalante_tools.emulator import Line
+from atalante_tools.signals import StopRequest
+
+
+class OtherProcess:
+    """A HAL at the far end, one cycle at each look of the emulator; after `cycles` somebody presses Ctrl-C."""
+
+    def __init__(self, network: Network, robot: Robot, cycles: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        ours, self.bus = lockstep_pair()
+        self.hal = Hal(network, robot, ours)
+        self.stop = StopRequest()
+        self.tap: list[Frames] = []
+        self.pendant_bus: PairBus | None = None
+        self._cycles = cycles
+        self.bus.step = self.cycle
+        self.active_at: int | None = None
+        monkeypatch.setattr(rig_module, "open_buses", lambda network, target: dict.fromkeys(network.buses, self.bus))
+
+        @contextmanager
+        def stop_requested() -> Iterator[StopRequest]:
+            yield self.stop
+
+        monkeypatch.setattr(emulator_module, "stop_requested", stop_requested)
+
+    def cycle(self) -> None:
+        if self.stop.wanted:
+            return
+        state = self.hal.read()
+        self.hal.hold()
+        if self.hal.state.supervisor is SupervisorState.ACTIVE and self.active_at is None:
+            self.active_at = state.cycle
+        if state.cycle >= self._cycles:
+            self.stop.ask(2)
+
+    def run(self, *arguments: str) -> Result:
+        return CliRunner().invoke(cli, ["emulator", "-i", "virtual", "-c", "test", "--lockstep", *arguments])
+
+
+def test_a_hal_at_the_other_end_finds_every_node_and_an_operator(
+    network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = OtherProcess(network, robot, 400, monkeypatch)
+    result = other.run("--xi", "0.3")
+    assert result.exit_code == 130, result.stderr
+    assert result.stdout == ""
+    assert result.stderr.startswith(
+        "the robot is on virtual test; now, in another terminal: atalante hang -i virtual -c test\n"
+    )
+    assert other.active_at is not None
+    assert other.hal.missing() == []
+    assert other.hal.state.assistance_factor == pytest.approx(0.3, abs=1e-4)
+    with pytest.raises(BusDown):
+        other.bus.receive(new_frames(1))
+
+
+def test_without_an_operator_the_pendant_is_somebody_elses(
+    network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = OtherProcess(network, robot, 500, monkeypatch)
+    result = other.run("--no-operator")
+    assert "its operator is you: atalante pendant start -i virtual -c test" in result.stderr
+    assert other.active_at is None
+    assert other.hal.state.supervisor is SupervisorState.READY
+
+
+def test_one_seed_is_one_robot(network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    def measured(seed: str) -> bytes:
+        other = OtherProcess(network, robot, 50, monkeypatch)
+        assert other.run("--seed", seed).exit_code == 130
+        return other.hal.state.imu_accel.tobytes()
+
+    assert measured("1") == measured("1")
+    assert measured("1") != measured("2")
+
+
+def test_the_status_line_counts_cycles_frames_and_drives(
+    network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(emulator_module, "STATUS_PERIOD", 1e-9)
+    result = OtherProcess(network, robot, 20, monkeypatch).run()
+    lines = [line for line in result.stderr.splitlines() if "cycles" in line]
+    assert lines[0] == "0 cycles, 0 frames in, 0 out; drives: 12 SWITCH_ON_DISABLED"
+    # Every cycle seven frames come; nineteen go, and now and then one more.
+    cycles, came, went = (int(word) for word in lines[-1].split() if word.isdigit() and word != "12")
+    assert came == 7 * cycles
+    assert 19 * cycles < went < 21 * cycles
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["-i", "virtual", "-c", "x", "--no-operator", "--xi", "0.5"], "--xi is what the operator sets"),
+        (["-i", "virtual", "-c", "x", "--xi", "2"], "2.0 is not in the range"),
+        (["-i", "embedded"], "this needs a bus that other processes are on"),
+        ([], "socketcan needs a channel: -c vcan0"),
+    ],
+)
+def test_misuse_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
+    result = CliRunner().invoke(cli, ["emulator", *arguments])
+    assert result.exit_code == 2
+    assert sentence in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+# -- the line --------------------------------------------------------------------------------------------------------
+
+
+def frames_with(ids: list[int]) -> Frames:
+    frames = new_frames(len(ids))
+    frames["can_id"], frames["len"], frames["flags"] = ids, 8, 4
+    return frames
+
+
+def received(bus: PairBus) -> list[int]:
+    block = new_frames(32)
+    ids: list[int] = block["can_id"][: bus.receive(block)].tolist()
+    return ids
+
+
+def test_the_line_counts_and_keeps_the_pendant_back_once_another_speaks() -> None:
+    near, far = lockstep_pair()
+    line = Line(near, pendant_id=0x194)
+    batch, alone, none = frames_with([0x181, 0x194]), frames_with([0x194]), new_frames(0)
+    line.send(batch)
+    assert received(far) == [0x181, 0x194]
+    far.send(frames_with([0x10, 0x100]))
+    assert line.receive(new_frames(8)) == 2
+    assert not line.pendant_given_away
+    far.send(frames_with([0x10, 0x194]))
+    line.receive(new_frames(8))
+    assert line.pendant_given_away
+    for _ in range(3):
+        line.send(batch)
+        line.send(alone)
+        line.send(none)
+        assert received(far) == [0x181]
+    assert (line.sent, line.received) == (5, 4)
+
+
+def test_what_lies_behind_the_received_frames_is_not_heard() -> None:
+    near, far = lockstep_pair()
+    line = Line(near, pendant_id=0x194)
+    block = frames_with([0x194] * 8)
+    far.send(frames_with([0x10]))
+    assert line.receive(block) == 1
+    assert not line.pendant_given_away
+    assert line.stamps.dtype == np.int64
+    assert (line.dropped, line.name, block.dtype) == (0, near.name, FRAME)
