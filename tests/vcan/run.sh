@@ -76,10 +76,20 @@ bootable_kernel() {
 inside() {
     local result=$1 code=0
     shift
-    { make_vcan_ready || fail "the guest kernel could not make $channel"; } && run_tests "$@" || code=$?
+    if make_vcan_ready; then
+        run_tests "$@" || code=$?
+    else
+        say "the guest kernel $(uname -r) could not make $channel"
+        code=1
+    fi
     echo "$code" >"$result/exit-code"
     sync
     return "$code"
+}
+
+stop_guest() {
+    kill "$guest" 2>/dev/null # timeout passes it on to vng and QEMU
+    wait "$guest" || true
 }
 
 in_guest() {
@@ -100,7 +110,8 @@ in_guest() {
     timeout -k 10 "$boot_limit" vng --disable-kvm -r "$kernel" --cpus 2 --memory 4G --user root --rw \
         --rwdir="$result" --cwd "$PWD" -- "$command" </dev/null >&"$show" 2>&1 &
     guest=$!
-    trap 'kill "$guest"; wait "$guest"; exit 130' INT TERM
+    trap 'stop_guest; exit 130' INT
+    trap 'stop_guest; exit 143' TERM
     wait "$guest" || code=$?
     trap - INT TERM
     exec {show}>&-
@@ -113,18 +124,24 @@ in_guest() {
     return "$code"
 }
 
-cd "$(dirname "${BASH_SOURCE[0]}")/../.."
-python=${PYTHON:-.venv/bin/python}
-[ -n "${PYTHON:-}" ] || [ -x "$python" ] || python=$(command -v python3)
-python=$(cd "$(dirname "$(command -v "$python")")" && pwd)/$(basename "$python") # not resolved: a venv is its path
-[ -x "$python" ] || fail "there is no Python at ${PYTHON:-.venv/bin/python}; type: make install"
+main() {
+    cd "$(dirname "${BASH_SOURCE[0]}")/../.."
+    python=${PYTHON:-.venv/bin/python}
+    [ -n "${PYTHON:-}" ] || [ -x "$python" ] || python=$(command -v python3)
+    python=$(cd "$(dirname "$(command -v "$python")")" && pwd)/$(basename "$python") # not resolved: a venv is its path
+    [ -x "$python" ] || fail "there is no Python at ${PYTHON:-.venv/bin/python}; type: python3 -m venv .venv and" \
+        ".venv/bin/pip install -e '.[dev]'"
 
-if [ "${1:-}" = --inside ]; then
-    shift
-    inside "$@"
-elif has_socketcan && make_vcan_ready; then
-    command -v candump >/dev/null || install_missing can-utils
-    run_tests "$@"
-else
-    in_guest "$@"
-fi
+    if [ "${1:-}" = --inside ]; then
+        shift
+        inside "$@"
+    elif has_socketcan && make_vcan_ready; then
+        command -v candump >/dev/null || install_missing can-utils
+        run_tests "$@"
+    else
+        in_guest "$@"
+    fi
+}
+
+main "$@"
+exit
