@@ -176,7 +176,7 @@ class TelemetryProcess:
                 raise TelemetryError(f"the telemetry process was not ready within {timeout:.0f} s")
             if "error" in told:
                 raise TelemetryError(told["error"])
-        except TelemetryError:
+        except BaseException:  # Ctrl-C while it waits, too
             self.close(0.0)
             raise
         self.endpoint, self.notices = told["endpoint"], tuple(told["notices"])
