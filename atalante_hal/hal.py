@@ -144,7 +144,8 @@ class Hal:
         self._joint_side = joint
         self._motor_side = record[layout["motor_position"].start : layout["motor_torque"].stop]
         per_turn = robot.polarity / robot.gear
-        self._to_joint = np.concatenate([per_turn, per_turn, robot.polarity])
+        # Torque is at the joint on the wire, in both directions.
+        self._to_joint = np.concatenate([per_turn, per_turn, np.ones(_JOINT_COUNT)])
         self._header = record[: len(HEADER_FIELDS)]
         self.state = State(
             cycle=0,

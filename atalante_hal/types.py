@@ -67,8 +67,13 @@ class Command:
 class Controller(Protocol):
     """What the loop runs: any object with these members."""
 
-    telemetry: Vector  # what the controller wants recorded, rewritten every update
-    telemetry_fields: Sequence[tuple[str, int]]  # (name, length) of each piece of `telemetry`
+    @property
+    def telemetry(self) -> Vector:
+        """What the controller wants recorded: always the same array, rewritten every update."""
+
+    @property
+    def telemetry_fields(self) -> Sequence[tuple[str, int]]:
+        """(name, length) of each piece of `telemetry`."""
 
     def reset(self, state: State) -> None:
         """Called when the supervisor enters ACTIVE, before the first `update`."""
