@@ -117,6 +117,7 @@ class TestSubscribers:
             "mode": "client",
             "connect": {"endpoints": [publisher.endpoint]},
             "scouting": {"multicast": {"enabled": False}},
+            "transport": {"shared_memory": {"enabled": False}},  # it will be killed
         }
         with subprocess.Popen([sys.executable, "-c", program, json.dumps(config)], stdout=subprocess.PIPE) as child:
             assert child.stdout is not None
@@ -237,11 +238,14 @@ class TestEndpoint:
                 Publisher("exo", STREAMS)
 
 
-def test_a_process_that_crashes_with_a_session_open_is_gone() -> None:
+def test_a_process_that_crashes_with_a_session_open_is_gone_and_leaves_nothing() -> None:
     program = (
         "from atalante_hal.telemetry.publisher import Publisher\n"
         f"with Publisher('exo', [('imu', 'ImuStates')], 'tcp/127.0.0.1:{free_port()}') as publisher:\n"
         "    publisher.put('imu', b'x', 0, 0)\n"
+        "    print([line for line in open('/proc/self/maps') if '/dev/shm/' in line])\n"
         "    raise SystemExit(7)\n"
     )
-    assert subprocess.run([sys.executable, "-c", program], timeout=60, check=False).returncode == 7
+    done = subprocess.run([sys.executable, "-c", program], timeout=60, check=False, capture_output=True, text=True)
+    assert done.returncode == 7
+    assert done.stdout == "[]\n"

@@ -114,6 +114,7 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
         "listen": {"endpoints": [listen]},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
+            "shared_memory": {"enabled": False},  # a killed process would leave its segments in /dev/shm
             "link": {
                 "tx": {
                     "queue": {

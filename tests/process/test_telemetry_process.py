@@ -135,6 +135,7 @@ for file in descriptor_pb2.FileDescriptorSet.FromString(open(sys.argv[2], "rb").
     pool.Add(file)
 config = zenoh.Config.from_json5('{mode: "client", connect: {endpoints: ["%s"]}}' % sys.argv[1])
 config.insert_json5("scouting/multicast/enabled", "false")
+config.insert_json5("transport/shared_memory/enabled", "false")  # it will be killed
 with zenoh.open(config) as session, session.declare_subscriber("atalante/*/*") as subscriber:
     for sample in subscriber:
         name = str(sample.encoding).split(";")[1]
