@@ -63,8 +63,8 @@ class JointCertificate:
     u_ext: tuple[float, float]  # Nm, the disturbance bounds asked for
     u_ext_max: tuple[float, float]  # Nm, the same bounds scaled to where the margin is zero; (0, 0): none is admitted
     torque: float  # Nm, largest |u_b| along the way
-    torque_limit: float  # Nm
-    image_empty_at: float  # first phase at which no state at all is safe; infinity: none
+    torque_limit: float  # Nm, what the filter counts on
+    image_empty_at: float  # first phase at which no state at all is safe; infinity where there is always one
     hand_over_max: float  # the hand-over box may be this much larger before the margin is zero
 
 
@@ -121,6 +121,9 @@ def _joint(guide: GuideFilter, bounds: Vector, joint: int, hand_over: HandOver) 
     ratios = 1.0 - (rooms - moved[:, None] - np.stack([up, -down], axis=1)) / bounds
     at, side = np.unravel_index(int(ratios.argmax()), ratios.shape)
 
+    margin = 1.0 - float(ratios[at, side])
+
+    limit = (1.0 - guide.config.reserve) * policy.torque_limit
     step = policy.step_response(time)
     unit = np.abs(policy.kp * step[:, 0] + policy.kd * step[:, 1]).max()
     asked = [
@@ -134,18 +137,18 @@ def _joint(guide: GuideFilter, bounds: Vector, joint: int, hand_over: HandOver) 
     left = rooms - moved[:, None]
     scale = _smallest_ratio(left, np.stack([up, -down], axis=1))
     if per_disturbance > 0.0:
-        scale = min(scale, (policy.torque_limit - undisturbed) / per_disturbance)
+        scale = min(scale, (limit - undisturbed) / per_disturbance)
     scale = max(0.0, scale)
     return JointCertificate(
         _JOINTS[joint],
-        1.0 - float(ratios[at, side]),
+        margin,
         float(time[at]) / guide.deadbeat.duration,
         ("upper", "lower")[int(side)],
         (low, high),
         (low * scale if low else 0.0, high * scale if high else 0.0),
         undisturbed + per_disturbance,
-        policy.torque_limit,
-        _empty_from(guide, bounds, joint),
+        limit,
+        math.inf if margin >= 0.0 else _empty_from(guide, bounds, joint),
         _smallest_ratio(rooms - np.stack([up, -down], axis=1), np.repeat(moved[:, None], 2, axis=1)),
     )
 
@@ -191,21 +194,19 @@ def _image(guide: GuideFilter, bounds: Vector, joint: int, cycle: int) -> tuple[
         e, lowest and highest e', each shape (m,); lowest > highest where no e' is safe.
     """
     policy, (low, high) = guide.config.policies[joint], guide.config.disturbance[joint]
-    p = guide.forced[joint].nominal[cycle:]
-    tau = guide.time[: len(p)]
+    points = np.concatenate([[cycle], guide.grid[guide.grid > cycle]])
+    p, bounds = guide.forced[joint].nominal[points], bounds[points]
+    tau = guide.time[points] - guide.time[cycle]
     up, down = policy.disturbance(tau, low, high)
     phi = policy.transition(tau)
     free = p[:, 0] - phi[:, 0] @ p[0]
-    e = np.linspace(-bounds[cycle, 1], bounds[cycle, 0], _STATES)
-    room_up = (bounds[cycle:, 0] - up - free)[:, None] - np.outer(phi[:, 0, 0], e)
-    room_down = (-bounds[cycle:, 1] - down - free)[:, None] - np.outer(phi[:, 0, 0], e)
+    e = np.linspace(-bounds[0, 1], bounds[0, 0], _STATES)
+    room_up = (bounds[:, 0] - up - free)[:, None] - np.outer(phi[:, 0, 0], e)
+    room_down = (-bounds[:, 1] - down - free)[:, None] - np.outer(phi[:, 0, 0], e)
     gain = phi[1:, 0, 1, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        one, other = room_up[1:] / gain, room_down[1:] / gain
-    one = np.where(gain == 0.0, np.inf, one)
-    other = np.where(gain == 0.0, -np.inf, other)
     if len(tau) == 1:
         return e, np.full_like(e, -np.inf), np.full_like(e, np.inf)
+    one, other = room_up[1:] / gain, room_down[1:] / gain
     positive = gain > 0.0
     return e, np.where(positive, other, one).max(axis=0), np.where(positive, one, other).min(axis=0)
 

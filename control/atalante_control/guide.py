@@ -47,6 +47,7 @@ class GuideConfig:
     overlap: float = 0.1  # s, horizon beyond the step's end
     zeta: float = 0.03  # s, gain of the derivative term lambda_d
     derivative_time: float = 0.005  # s, time constant of the low pass on dh/dt
+    reserve: float = 0.1  # part of the torque limit the rollouts do not count on: it corrects what a cycle is late
 
     def __post_init__(self) -> None:
         for low, high in self.disturbance:
@@ -54,6 +55,8 @@ class GuideConfig:
                 raise ValueError(f"a disturbance bound is (min <= 0, max >= 0) in Nm, not {(low, high)!r}")
         if self.points < 2:
             raise ValueError(f"points is at least 2, not {self.points!r}")
+        if not 0.0 <= self.reserve < 1.0:
+            raise ValueError(f"reserve is a part of the torque limit in [0, 1), not {self.reserve!r}")
         for name in ("overlap", "zeta", "derivative_time"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
                 raise ValueError(f"{name} is not negative and finite, in s, not {getattr(self, name)!r}")
@@ -137,8 +140,8 @@ class GuideFilter:
         self._packed_p, self._packed_scale = np.empty(len(self._blocks)), np.empty(len(self._blocks))
         self._bounds = np.empty((self.horizon + 1, 2))
         self._rows_p, self._rows_scale = np.empty((_ROWS, lags)), np.empty((_ROWS, lags))
-        limits = [policy.torque_limit for policy in config.policies]
-        self._rows_scale[4:] = np.repeat(1.0 / np.array(limits), 2)[:, None]
+        self._limits = [(1.0 - config.reserve) * policy.torque_limit for policy in config.policies]
+        self._rows_scale[4:] = np.repeat(1.0 / np.array(self._limits), 2)[:, None]
         self._out = np.empty(_ROWS * lags)
         self._views = [self._view(cycle) for cycle in range(self.horizon + 1)]
         # Kp e + Kd e' along a rollout, in terms of Phi11 and Phi12: e' of the state y is e of the state A y.
@@ -264,10 +267,10 @@ class GuideFilter:
             np.abs(out[4:], out=out[4:])
             i4, i5, i6, i7 = out[4:].argmax(1).tolist()
         hip_torques, knee_torques = (float(out[4, i4]), float(out[5, i5])), (float(out[6, i6]), float(out[7, i7]))
-        now = (hip.kp * e_hip + hip.kd * ed_hip) / hip.torque_limit
+        now = (hip.kp * e_hip + hip.kd * ed_hip) / self._limits[0]
         if hip_torques[0] > 1.0 or hip_torques[1] > 1.0 or now > 1.0 or now < -1.0:
             self._ratio[0] = self._limited(0, cycle, e_hip, ed_hip, now, (a, b), hip_torques)
-        now = (knee.kp * e_knee + knee.kd * ed_knee) / knee.torque_limit
+        now = (knee.kp * e_knee + knee.kd * ed_knee) / self._limits[1]
         if knee_torques[0] > 1.0 or knee_torques[1] > 1.0 or now > 1.0 or now < -1.0:
             self._ratio[1] = self._limited(1, cycle, e_knee, ed_knee, now, (c, d), knee_torques)
 
@@ -307,7 +310,7 @@ class GuideFilter:
             self._drift_known = True
         self.stepped += 1
         policy, columns = self.config.policies[joint], slice(2 * joint, 2 * joint + 2)
-        kp, kd, limit = policy.kp, policy.kd, policy.torque_limit
+        kp, kd, limit = policy.kp, policy.kd, self._limits[joint]
         phi00, phi01, phi10, phi11, s0, s1 = self._cycle_flow[joint]
         external, allowance = self.config.disturbance[joint][1 - side], self._allowance[joint][side]
         sign, start, worst, linear = (-1.0 if side else 1.0), cycle, 0.0, False
@@ -343,7 +346,7 @@ class GuideFilter:
             e, e', cycle there, and the largest ratio where the error turns in between (0: it does not).
         """
         policy, column = self.config.policies[joint], 2 * joint
-        kp, kd, limit, a = policy.kp, policy.kd, policy.torque_limit, force / policy.inertia
+        kp, kd, limit, a = policy.kp, policy.kd, self._limits[joint], force / policy.inertia
         drift, (z, zd) = self._drift, self._drift[cycle, column : column + 2].tolist()
         e0, ed0 = e - z, ed - zd
         way = 1.0 if kp * e + kd * ed > 0.0 else -1.0

@@ -1,0 +1,167 @@
+"""Guide certificate: its numbers against brute force, and what it says of guides that hold and that do not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from atalante_control.backup import BackupPolicy
+from atalante_control.certificate import Certificate, HandOver, certify
+from atalante_control.deadbeat import Deadbeat
+from atalante_control.gait import HANG_GAIT, load_gait
+from atalante_control.guide import GuideConfig, GuideFilter
+from atalante_control.guide_shapes import SHAPES, half_width
+from atalante_hal.robot import load_robot
+
+GAIT = load_gait(HANG_GAIT, load_robot())
+DEADBEAT = Deadbeat(GAIT.duration, 0.4)
+POLICIES = (BackupPolicy(6300.0, 473.0, 8.0, 165.0), BackupPolicy(3600.0, 173.0, 1.9, 180.0))
+CONFIG = GuideConfig(POLICIES, ((-30.0, 30.0), (-20.0, 20.0)))
+BOX = HandOver()
+UNLIMITED = replace(
+    CONFIG, policies=(replace(POLICIES[0], torque_limit=math.inf), replace(POLICIES[1], torque_limit=math.inf))
+)
+
+
+def guide(shape: str, config: GuideConfig = CONFIG) -> GuideFilter:
+    return GuideFilter(config, SHAPES[shape], DEADBEAT, GAIT.coefficients[2:4], GAIT.mirrored().coefficients[2:4])
+
+
+def scaled(factor: float, config: GuideConfig = CONFIG) -> GuideConfig:
+    low_high = [(low * factor, high * factor) for low, high in config.disturbance]
+    return replace(config, disturbance=(low_high[0], low_high[1]))
+
+
+@pytest.mark.parametrize("shape", ["constant", "widening", "narrowing", "pinched", "asymmetric"])
+def test_the_five_guides_of_the_demonstration_are_certified(shape: str):
+    certificate = certify(guide(shape), 0.5, BOX)
+    assert certificate.certified
+    assert certificate.margin > 0.2
+    assert certificate.reason.endswith("side)")
+    for joint in certificate.joints:
+        assert joint.u_ext_max[1] > joint.u_ext[1]
+        assert joint.u_ext_max[0] < joint.u_ext[0]
+        assert joint.hand_over_max > 1.0
+        assert joint.image_empty_at == math.inf
+        assert 0.0 <= joint.tightest_phase <= 1.2
+
+
+def brute_force_margin(certificate: Certificate, f: GuideFilter, xi: float, box: HandOver) -> list[float]:
+    """The filter's own h at the first cycle, from the re-centred state, over the corners of the hand-over box."""
+    worst = [1.0, 1.0]
+    for d in (-box.deviation, box.deviation):
+        for r in (-box.rate, box.rate):
+            f.start_step(xi, (d, d), (r, r))
+            f.tick(0, 0.0, 0.0, 0.0, 0.0)
+            worst = [min(w, 1.0 - math.sqrt(1.0 - h)) for w, h in zip(worst, f.h, strict=True)]
+    return worst
+
+
+@pytest.mark.parametrize("shape", ["constant", "widening", "narrowing", "pinched", "asymmetric"])
+@pytest.mark.parametrize("xi", [0.0, 0.5, 0.8])
+def test_margin_is_the_filters_own_at_the_start_of_the_worst_step(shape: str, xi: float):
+    f = guide(shape, UNLIMITED)
+    certificate = certify(f, xi, BOX)
+    margins = brute_force_margin(certificate, f, xi, BOX)
+    for joint, margin in zip(certificate.joints, margins, strict=True):
+        assert joint.margin <= margin + 1e-9
+        assert joint.margin == pytest.approx(margin, abs=0.01)  # every cycle here, every eighth there
+
+
+@pytest.mark.parametrize("shape", ["constant", "pinched", "asymmetric", "snap"])
+def test_the_largest_disturbance_is_where_the_margin_ends(shape: str):
+    for index, joint in enumerate(certify(guide(shape, UNLIMITED), 0.5, BOX).joints):
+        factor = joint.u_ext_max[1] / joint.u_ext[1]
+        if factor == 0.0:
+            assert joint.margin < 0.0
+            continue
+        at = certify(guide(shape, scaled(factor, UNLIMITED)), 0.5, BOX).joints[index]
+        assert at.margin == pytest.approx(0.0, abs=1e-9)
+        assert at.u_ext_max[1] == pytest.approx(joint.u_ext_max[1])
+        inside, outside = (
+            certify(guide(shape, scaled(factor * s, UNLIMITED)), 0.5, BOX).joints[index] for s in (0.99, 1.01)
+        )
+        assert inside.margin > 0.0 > outside.margin
+
+
+def test_the_largest_hand_over_is_where_the_margin_ends():
+    f = guide("widening", UNLIMITED)
+    for index, joint in enumerate(certify(f, 0.5, BOX).joints):
+        box = HandOver(BOX.deviation * joint.hand_over_max, BOX.rate * joint.hand_over_max)
+        assert certify(f, 0.5, box).joints[index].margin == pytest.approx(0.0, abs=1e-9)
+
+
+def test_margin_falls_with_disturbance_assistance_and_hand_over():
+    by_disturbance = [certify(guide("constant", scaled(s)), 0.5, BOX).margin for s in (0.0, 0.5, 1.0, 1.5)]
+    by_xi = [certify(guide("constant"), xi, BOX).margin for xi in (0.0, 0.3, 0.6, 0.9)]
+    by_box = [certify(guide("constant"), 0.5, HandOver(d, 10 * d)).margin for d in (0.0, 0.02, 0.05)]
+    for margins in (by_disturbance, by_xi, by_box):
+        assert margins == sorted(margins, reverse=True)
+        assert len(set(margins)) > 1
+
+
+def test_a_guide_that_snaps_shut_has_no_safe_state_and_says_where():
+    certificate = certify(guide("snap"), 0.5, BOX)
+    assert not certificate.certified
+    assert "no state of SH is safe at" in certificate.reason
+    assert math.isfinite(certificate.joints[0].image_empty_at)
+    assert certificate.joints[0].u_ext_max == (0.0, 0.0)
+
+
+def test_a_guide_narrower_than_the_stiffness_holds_is_told_with_what_it_holds():
+    soft = replace(CONFIG, policies=(BackupPolicy(1500.0, 250.0, 8.0), POLICIES[1]))
+    certificate = certify(guide("narrowing", soft), 0.75, BOX)
+    assert not certificate.certified
+    assert "SH" in certificate.reason
+    assert "Nm" in certificate.reason
+
+
+def test_a_hand_over_that_is_too_rough_is_told():
+    certificate = certify(guide("widening", UNLIMITED), 0.5, HandOver(0.15, 4.0))
+    assert not certificate.certified
+    assert "may leave the guide by" in certificate.reason
+    assert certificate.joints[0].image_empty_at == math.inf
+    assert certificate.joints[0].hand_over_max < 1.0
+
+
+def test_a_drive_too_weak_is_told():
+    weak = replace(CONFIG, policies=(replace(POLICIES[0], torque_limit=60.0), POLICIES[1]))
+    certificate = certify(guide("constant", weak), 0.5, BOX)
+    assert not certificate.certified
+    assert "the drive gives 54 Nm" in certificate.reason
+
+
+def test_an_underdamped_policy_pays_for_its_ringing():
+    ringing = replace(CONFIG, policies=(BackupPolicy(6300.0, 60.0, 8.0), POLICIES[1]))
+    assert (
+        certify(guide("constant", ringing), 0.5, BOX).joints[0].margin
+        < certify(guide("constant"), 0.5, BOX).joints[0].margin
+    )
+
+
+def test_the_overlap_takes_speed_out_of_the_end_of_a_step():
+    """Without it a joint about to leave the guide is admitted at T; with it, it is not."""
+    short, long = (guide("constant", replace(CONFIG, overlap=o)) for o in (0.0, 0.1))
+    about_to_leave = (0.9 * half_width(0.5), 1.5, 0.0, 0.0)
+    for f in (short, long):
+        f.start_step(0.5, (0.0, 0.0), (0.0, 0.0))
+        f.tick(800, *about_to_leave)
+    assert short.h[0] > 0.0 > long.h[0]
+
+
+def test_the_image_is_not_empty_along_a_certified_step():
+    """The state the backup policy itself reaches from the re-centred start is safe at every cycle, with the margin."""
+    for shape in ("constant", "pinched"):
+        f = guide(shape)
+        margin = certify(f, 0.5, HandOver(0.0, 0.0)).margin
+        f.start_step(0.5, (0.0, 0.0), (0.0, 0.0))
+        p = f.solution()
+        for cycle in range(0, 801, 20):
+            start = np.repeat(p[0], 1)
+            phi = [policy.transition(np.array([cycle * 1e-3]))[0] for policy in POLICIES]
+            hip, knee = p[cycle, :2] - phi[0] @ start[:2], p[cycle, 2:] - phi[1] @ start[2:]
+            f.tick(cycle, *hip.tolist(), *knee.tolist())
+            assert min(f.h) >= 1.0 - (1.0 - margin) ** 2 - 1e-9
