@@ -22,6 +22,7 @@ COMMANDS = {
     "pendant": "Be the operator: start, stop, hold, assistance factor.",
     "status": "Listen to a bus and say what every node says.",
     "doctor": "Is this machine ready, and what to type if not.",
+    "conform": "An acceptance test of one node, with this computer in the place of the HAL.",
     "dbc": "Check, print and compare network descriptions, and make C code of one.",
     "bench": "How fast the stack is, with the baseline beside each figure.",
 }

@@ -1,0 +1,138 @@
+"""`atalante conform`: one node, real or emulated, through an acceptance test in which this computer plays the HAL."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import click
+
+from atalante_tools.options import Target, json_option, target_options
+from atalante_tools.outcome import FAILED
+from atalante_tools.terminal import say, show_json
+
+if TYPE_CHECKING:
+    from atalante_tools.conform.bench import Bench
+    from atalante_tools.conform.requirement import Requirement
+
+
+@click.command()
+@click.argument("node")
+@target_options(embedded=True, clock=False)
+@click.option("--only", multiple=True, metavar="ID", help="Test this requirement alone; may be repeated.")
+@click.option("--without", multiple=True, metavar="ID", help="Leave this requirement out; may be repeated.")
+@click.option(
+    "--torque",
+    type=click.FloatRange(0.5, 20.0),
+    default=3.0,
+    show_default=True,
+    metavar="NM",
+    help="Largest torque a drive is let make.",
+)
+@click.option(
+    "--patience",
+    type=click.FloatRange(0.5),
+    default=30.0,
+    show_default=True,
+    metavar="S",
+    help="How long to wait for what a person has to do at the bench.",
+)
+@json_option
+def command(
+    node: str,
+    target: Target,
+    only: tuple[str, ...],
+    without: tuple[str, ...],
+    torque: float,
+    patience: float,
+    as_json: bool,
+) -> None:
+    """Play the HAL for one NODE (LEFT_SK, IMU_TORSO, FOOT_LEFT, HAPTICS, PENDANT, ...) and print an acceptance protocol.
+
+    The joint of a drive must be free to move by hand's breadths and nobody in the exoskeleton. Exit code 1 if a requirement
+    failed or could not be tested.
+
+    \b
+    Examples: atalante conform LEFT_SK
+              atalante conform LEFT_SK -i socketcan -c can0 --torque 1
+    """
+    from datetime import datetime
+
+    from atalante_tools.conform.examination import make_safe, requirements_of
+    from atalante_tools.conform.report import as_object, conclusion, entry, heading
+    from atalante_tools.conform.requirement import Verdict, examine
+
+    with _bench(node, target, torque, patience) as bench:
+        wanted = _chosen(requirements_of(bench), only, without)
+        if not as_json:
+            click.echo(heading(bench, str(target), f"{datetime.now():%Y-%m-%d %H:%M}"))
+        results = []
+        try:
+            for result in examine(bench, wanted):
+                results.append(result)
+                if as_json:
+                    show_json(as_object(bench, result))
+                else:
+                    click.echo(entry(result))
+        finally:
+            make_safe(bench)
+    for left_out in without:
+        say(f"left out on request: {left_out.upper()}")
+    say(conclusion(bench, results))
+    if any(result.verdict is not Verdict.PASSED for result in results):
+        raise SystemExit(FAILED)
+
+
+def _chosen(requirements: list[Requirement], only: tuple[str, ...], without: tuple[str, ...]) -> list[Requirement]:
+    from atalante_tools.names import find
+
+    ids = [requirement.id for requirement in requirements]
+    places = sorted({find(name, ids, "requirement") for name in only}) if only else range(len(ids))
+    left_out = {find(name, ids, "requirement") for name in without}
+    return [requirements[place] for place in places if place not in left_out]
+
+
+@contextmanager
+def _bench(name: str, target: Target, torque: float, patience: float) -> Iterator[Bench]:
+    import atalante_dbc
+    from atalante_hal.robot import load_robot
+    from atalante_tools.conform.bench import Bench, Limits, LockStep, WallClock
+    from atalante_tools.conform.technician import EmulatorTechnician, Person
+    from atalante_tools.names import find
+
+    network, robot, limits = atalante_dbc.load(), load_robot(), Limits(torque)
+    nodes = [node for node in network.nodes if node.kind != "master"]
+    node = nodes[find(name, [node.name for node in nodes], "node")]
+    if target.embedded:
+        from atalante_hal.bus.pair import lockstep_pair
+        from atalante_tools.rig import open_body
+
+        with open_body(robot) as body:
+            from atalante_emulator.emulator import Emulator
+            from atalante_emulator.pendant import Operator
+
+            ours, theirs = lockstep_pair()
+            operator = Operator(starts=False)
+            emulator = Emulator(network, robot, body, theirs, operator=operator)
+            ours.step = emulator.poll
+            yield Bench(network, robot, node, ours, LockStep(emulator), EmulatorTechnician(emulator, operator), limits)
+        return
+    from atalante_hal.bus import open_bus
+    from atalante_hal.bus.channel_map import parse_channel_map
+    from atalante_hal.loop import realtime
+
+    # The one bus the node is on.
+    bus_name = network.message(f"{node.name}_STATE").bus
+    channel = (
+        target.channel if "=" not in target.channel else parse_channel_map(target.channel, network.buses)[bus_name]
+    )
+    bus = open_bus(target.interface, channel)
+    try:
+        bench = Bench(network, robot, node, bus, WallClock(), Person(patience), limits)
+        bench.make_sure_to_be_alone()
+        for refused in realtime():
+            say(refused)
+        yield bench
+    finally:
+        bus.close()
