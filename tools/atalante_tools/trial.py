@@ -222,6 +222,7 @@ def _telemetry(target: Target, options: Options, hal: Hal, network: Network, gai
         record_rate=options.record_rate,
         can_log=options.can_log,
         lock_step=target.lockstep,
+        slots=8192,  # 8 s: a demo runs many times faster than real time, and a recorder may pause
     )
     return TelemetryProcess(
         config,
