@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from atalante_tools.names import find
 from atalante_tools.options import Target, json_option
 from atalante_tools.signals import stop_requested
 from atalante_tools.terminal import say, show_json, table
@@ -104,12 +105,13 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
     import atalante_dbc
     from atalante_control.controller import HangController
     from atalante_control.gait import HANG_GAIT, load_gait
-    from atalante_control.guide_shapes import shape_named
+    from atalante_control.guide_shapes import SHAPES
     from atalante_hal.robot import load_robot
 
+    shapes = [tuple(SHAPES)[find(name, tuple(SHAPES), "guide shape")] for name in shapes]
     network, robot = atalante_dbc.load(), load_robot()
     gait = load_gait(HANG_GAIT, robot)
-    controllers = {name: HangController(robot, gait, shape_named(name)) for name in shapes}
+    controllers = {name: HangController(robot, gait, SHAPES[name]) for name in shapes}
     certified = {name: _announce(controller, options.xi) for name, controller in controllers.items()}
     options.out.mkdir(parents=True, exist_ok=True)
     results: list[Result] = []

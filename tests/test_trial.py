@@ -1,0 +1,193 @@
+"""`atalante demo` and `hang`: what scripts may rely on, and the promises of the paper's first experiment."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from atalante_control.controller import HangConfig, HangController
+from atalante_control.gait import HANG_GAIT, load_gait
+from atalante_control.guide_shapes import SHAPES
+from atalante_emulator.body import PyBulletBody
+from atalante_emulator.emulator import Emulator
+from atalante_emulator.pendant import Operator
+from atalante_hal.bus.pair import lockstep_pair
+from atalante_hal.frame import Frames
+from atalante_hal.hal import Hal
+from atalante_hal.loop import LockStep, run
+from atalante_hal.robot import JOINTS
+from atalante_hal.telemetry.schema import message_class
+
+ATALANTE = str(Path(sys.executable).with_name("atalante"))
+KEYS = [
+    "shape", "certified", "steps", "max_ratio", "inside", "filter_active", "cycles", "real_time_factor", "frames", "crc_errors",
+]  # fmt: skip
+
+
+def atalante(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([ATALANTE, *arguments], capture_output=True, text=True, timeout=300)
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[subprocess.CompletedProcess[str], Path]:
+    out = tmp_path_factory.mktemp("demo")
+    done = atalante(
+        "demo", "--steps", "2", "--shape", "pinched", "--shape", "snap", "--out", str(out), "--json",
+        "--can-log", str(out / "frames.log"), "--seed", "3",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done, out
+
+
+def test_stdout_is_one_object_a_shape(demo):
+    results = [json.loads(line) for line in demo[0].stdout.splitlines()]
+    assert [list(result) for result in results] == [KEYS, KEYS]
+    pinched, snap = results
+    assert (pinched["shape"], pinched["certified"], snap["shape"], snap["certified"]) == (
+        "pinched",
+        True,
+        "snap",
+        False,
+    )
+    for result in results:
+        assert result["steps"] == 2
+        assert result["crc_errors"] == 0
+        assert result["frames"] > 19 * result["cycles"]
+        assert 0 <= result["inside"] <= 1
+        assert 0 <= result["filter_active"] <= 1
+    assert pinched["max_ratio"] <= 1.0
+    assert pinched["inside"] == 1.0
+    assert snap["max_ratio"] > 1.0
+
+
+def test_an_uncertified_guide_is_announced_before_the_run(demo):
+    stderr = demo[0].stderr
+    announced = stderr.index("snap: NOT CERTIFIED")
+    assert announced < stderr.index("ACTIVE on")
+    assert "pinched: certified" in stderr
+
+
+def test_the_run_folder(demo):
+    _, out = demo
+    assert {"recording.mcap", "summary.json", "guide_shapes.png"} <= {path.name for path in out.iterdir()}
+    summary = json.loads((out / "summary.json").read_text())
+    assert [list(shape) for shape in summary["shapes"]] == [KEYS, KEYS]
+    assert (summary["steps"], summary["xi"], summary["seed"]) == (2, 0.5, 3)
+    assert (out / "guide_shapes.png").read_bytes().startswith(b"\x89PNG")
+    cycles = sum(shape["cycles"] for shape in summary["shapes"])
+    # 30 steps of six shapes are 300,000 cycles; the default folder stays under 30 MB.
+    assert (out / "recording.mcap").stat().st_size / cycles * 300_000 < 30e6
+
+
+def test_the_recording_holds_every_joint_at_its_rate(demo):
+    _, out = demo
+    summary = json.loads((out / "summary.json").read_text())
+    with (out / "recording.mcap").open("rb") as file:
+        joints = [
+            message_class("JointStates").FromString(message.data)
+            for _, _, message in make_reader(file).iter_messages(topics=["/joint_states"])
+        ]
+    assert [*joints[0].name] == list(JOINTS)
+    assert len(joints) == pytest.approx(sum(shape["cycles"] for shape in summary["shapes"]) / 10, abs=20)
+    knee = [joint.position[3] for joint in joints]
+    assert max(knee) - min(knee) > 0.5
+
+
+def test_the_can_log_is_the_same_to_the_byte_for_the_same_seed_and_another_for_another(demo, tmp_path: Path):
+    _, out = demo
+    logs = []
+    for seed in ("3", "4"):
+        log = tmp_path / f"{seed}.log"
+        done = atalante(
+            "demo", "--steps", "2", "--shape", "pinched", "--shape", "snap", "--out", str(tmp_path), "--json",
+            "--can-log", str(log), "--seed", seed,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        logs.append(log.read_bytes())
+    assert logs[0] == (out / "frames.log").read_bytes()
+    assert logs[1] != logs[0]
+    assert logs[0].count(b"\n") > 200_000
+
+
+class CommandFrames:
+    """The bytes of every command frame."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+
+    def sent(self, frames: Frames) -> None:
+        for frame in frames:
+            if frame["can_id"] in (0x100, 0x101):
+                self.data += frame["data"][:48].tobytes()
+
+    def received(self, frames: Frames, count: int) -> None:
+        pass
+
+
+class Baseline(HangController):
+    """The same controller without the assistance."""
+
+    def _assist(self, *arguments: object) -> None:
+        pass
+
+
+@pytest.mark.parametrize(("xi", "equal"), [(1.0, True), (0.99, False)])
+def test_at_full_assistance_the_command_frames_are_the_baselines_to_the_last_bit(network, robot, urdf_text, xi, equal):
+    sent = []
+    for kind in (HangController, Baseline):
+        ours, theirs = lockstep_pair()
+        body = PyBulletBody(urdf_text)
+        ours.step = Emulator(network, robot, body, theirs, operator=Operator(xi)).poll
+        controller = kind(robot, load_gait(HANG_GAIT, robot), SHAPES["constant"], HangConfig(startup=0.3))
+        tap = CommandFrames()
+        hal = Hal(network, robot, ours, controller_fields=controller.telemetry_fields, tap=tap)
+        run(hal, controller, LockStep(), until=lambda state: state.cycle >= 2300)
+        assert np.ptp(hal.state.position) > 0.3
+        sent.append(bytes(tap.data))
+        body.close()
+    assert (sent[0] == sent[1]) is equal
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (["--shape", "round"], 2, "constant"),
+        (["--steps", "0"], 2, "steps"),
+        (["--xi", "1.5"], 2, "xi"),
+        (["--record-rate", "333"], 1, "1000"),
+        (["--can-log", "frames.xyz"], 1, ".log"),
+    ],
+)
+def test_bad_input_gets_one_sentence_that_says_what_is_valid(arguments, code, says, tmp_path: Path):
+    done = atalante("hang", "--out", str(tmp_path), *arguments)
+    assert done.returncode == code, done.stderr
+    assert says in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_in_hold_with_its_code_and_keeps_what_was_walked(number, code, tmp_path: Path):
+    command = [ATALANTE, "hang", "--steps", "1000", "--out", str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as hang:
+        assert hang.stderr is not None
+        for line in hang.stderr:
+            if "ACTIVE" in line:
+                break
+        hang.send_signal(number)
+        _, said = hang.communicate(timeout=60)
+    assert hang.returncode == code, said
+    assert "HOLD" in said
+    with (tmp_path / "recording.mcap").open("rb") as file:
+        states = [
+            message_class("Event").FromString(message.data).code
+            for _, _, message in make_reader(file).iter_messages(topics=["/events"])
+        ]
+    assert states[-1] == "HOLD"
+    assert json.loads((tmp_path / "summary.json").read_text())["shapes"][0]["shape"] == "constant"
