@@ -1,0 +1,178 @@
+"""The DBC compiled for judging: one row a message, rows of equal layout side by side, and the way from an identifier to its row."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_dbc.foreign import Catalogue, Layout, Refused
+from atalante_hal.bulk import BulkCodec, crc_of_zeros
+from atalante_hal.frame import FLAG_BRS, FLAG_FDF, ID_EXTENDED, header_word
+
+#: Row of an identifier that no message has.
+UNKNOWN = -1
+_STANDARD = 1 << 11
+_ALL_BITS = 0x1FFF_FFFF
+
+Rows = npt.NDArray[np.int16]
+
+
+@dataclass(frozen=True)
+class Family:
+    """Messages whose fields are the same: one plan decodes the frames of all of them."""
+
+    rows: range
+    codec: BulkCodec
+
+    @property
+    def length(self) -> int:
+        """Bytes."""
+        return self.codec.layout.length
+
+
+class Plan:
+    """Rows are ordered by length, then by layout, so that what can be computed together lies together.
+
+    A message that the DBC loader refused has a row as well, behind the others: its frames are counted, nothing looks inside.
+    """
+
+    def __init__(self, catalogue: Catalogue) -> None:
+        self.catalogue = catalogue
+        keys = [_shape(layout) for layout in catalogue.layouts]
+        first = {key: place for place, key in reversed(list(enumerate(keys)))}
+        order = sorted(range(len(keys)), key=lambda place: (catalogue.layouts[place].length, first[keys[place]], place))
+        self.layouts: tuple[Layout, ...] = tuple(catalogue.layouts[place] for place in order)
+        self.refused: tuple[Refused, ...] = catalogue.refused
+        self.row_of = {layout.name: row for row, layout in enumerate(self.layouts)}
+        self.families = _families(self.layouts, [keys[place] for place in order])
+        self._index_identifiers()
+        count = len(self.layouts)
+        headers = [header_word(_can_id(m), m.length, _flags(m)) for m in self.layouts]
+        #: First word of a frame of each row as it should be; a refused message's never is.
+        self.headers = np.array([*headers, *([0] * len(self.refused))], np.uint64)
+        self.lengths = np.array([m.length for m in self.layouts], np.int64)
+        self.cycle_ns = np.array([1e6 * (m.cycle_ms or 0.0) if m.cyclic else 0.0 for m in self.layouts])
+        self.timeout_ns = np.array([1e6 * (m.timeout_ms or 0.0) for m in self.layouts])
+        self.inhibit_ns = np.array([0.0 if m.cyclic else 1e6 * (m.inhibit_ms or 0.0) for m in self.layouts])
+        self.protected = np.array([m.data_id is not None for m in self.layouts], np.bool_)
+        self.crc_constants = np.array(
+            [0 if m.data_id is None else crc_of_zeros(m.length, m.data_id) for m in self.layouts], np.uint16
+        )
+        self.buses: tuple[str, ...] = tuple(catalogue.buses) or ("",)
+        numbers = {name: number for number, name in enumerate(self.buses)}
+        self.bus_of_row = np.array([numbers.get(m.bus or "", 0) for m in self.layouts], np.int64)
+        senders = sorted({m.sender for m in self.layouts if m.sender})
+        self.senders: tuple[str, ...] = tuple(senders)
+        self.sender_of_row = np.array(
+            [senders.index(m.sender) if m.sender else UNKNOWN for m in self.layouts], np.int64
+        )
+        assert len(self.row_of) == count
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether the DBC says which bus a message belongs to."""
+        return bool(self.catalogue.buses)
+
+    def name(self, row: int) -> str:
+        """Message of a row."""
+        count = len(self.layouts)
+        return self.layouts[row].name if row < count else self.refused[row - count].name
+
+    def sender(self, row: int) -> str:
+        """Sending node of a row, empty where the DBC names none."""
+        return self.layouts[row].sender or "" if row < len(self.layouts) else ""
+
+    # -- identifiers -------------------------------------------------------------------------------------------------
+
+    def _index_identifiers(self) -> None:
+        standard = np.full(_STANDARD, UNKNOWN, np.int16)
+        extended: dict[int, int] = {}
+        groups: dict[int, dict[int, int]] = {}
+        items = [(m.frame_id, m.extended, m.pgn_mask) for m in self.layouts]
+        items += [(m.frame_id, m.extended, _ALL_BITS) for m in self.refused]
+        for row, (frame_id, is_extended, mask) in enumerate(items):
+            if not is_extended:
+                standard[frame_id] = row
+                continue
+            extended[frame_id] = row
+            if mask != _ALL_BITS:
+                # Two messages of one parameter group can be told apart by their whole identifier only.
+                known = groups.setdefault(mask, {})
+                known[frame_id & mask] = UNKNOWN if frame_id & mask in known else row
+        self._standard = standard
+        self._extended = _Table(extended)
+        self._groups = [(np.uint32(mask), _Table(rows)) for mask, rows in groups.items()]
+
+    def rows(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
+        """Row of each identifier (with its flags), `UNKNOWN` where there is none. Shape (n,)."""
+        if int(can_ids.max(initial=0)) < _STANDARD:
+            return self._standard[can_ids]
+        is_standard = can_ids < _STANDARD
+        rows = self._standard[np.where(is_standard, can_ids, 0)]
+        rows[~is_standard] = UNKNOWN
+        places = np.flatnonzero((can_ids & np.uint32(0xE0000000)) == ID_EXTENDED)
+        rows[places] = self._rows_extended(can_ids[places] & np.uint32(_ALL_BITS))
+        return rows
+
+    def _rows_extended(self, numbers: npt.NDArray[np.uint32]) -> Rows:
+        rows = self._extended.find(numbers)
+        for mask, table in self._groups:
+            left = np.flatnonzero(rows == UNKNOWN)
+            if not len(left):
+                break
+            rows[left] = table.find(numbers[left] & mask)
+        return rows
+
+    def row_in_other_format(self, can_id: int) -> int:
+        """Row that has the same number with the other identifier length, `UNKNOWN` if none has."""
+        number = can_id & _ALL_BITS
+        if can_id & ID_EXTENDED:
+            return int(self._standard[number]) if number < _STANDARD else UNKNOWN
+        return int(self._extended.find(np.array([number], np.uint32))[0])
+
+
+class _Table:
+    """Numbers and their rows, looked up by bisection."""
+
+    def __init__(self, rows: dict[int, int]) -> None:
+        self._numbers = np.array(sorted(rows), np.uint32)
+        self._rows = np.array([rows[number] for number in sorted(rows)], np.int16)
+
+    def find(self, numbers: npt.NDArray[np.uint32]) -> Rows:
+        if not len(self._numbers):
+            return np.full(len(numbers), UNKNOWN, np.int16)
+        at = np.minimum(np.searchsorted(self._numbers, numbers), len(self._numbers) - 1)
+        return np.where(self._numbers[at] == numbers, self._rows[at], np.int16(UNKNOWN))
+
+
+def _can_id(layout: Layout) -> int:
+    return layout.frame_id | (ID_EXTENDED if layout.extended else 0)
+
+
+def _flags(layout: Layout) -> int:
+    if not layout.fd:
+        return 0
+    return FLAG_FDF | (FLAG_BRS if layout.bit_rate_switch else 0)
+
+
+def _shape(layout: Layout) -> tuple[object, ...]:
+    """What must be equal for two messages to be decoded and judged together."""
+    fields = tuple(
+        (f.name, f.start, f.length, f.big_endian, f.kind, f.factor, f.offset, f.minimum, f.maximum, f.unit, f.invalid_raw)
+        + (tuple(sorted(f.choices.items())), tuple((m, tuple(sorted(ids))) for m, ids in f.selectors))
+        for f in layout.fields
+    )
+    return (layout.length, fields, tuple(sorted((m, tuple(sorted(v))) for m, v in layout.multiplexers.items())))
+
+
+def _families(layouts: Sequence[Layout], keys: Sequence[tuple[object, ...]]) -> tuple[Family, ...]:
+    families: list[Family] = []
+    begin = 0
+    for row in range(1, len(layouts) + 1):
+        if row == len(layouts) or keys[row] != keys[begin]:
+            families.append(Family(range(begin, row), BulkCodec(layouts[begin])))
+            begin = row
+    return tuple(families)
