@@ -106,7 +106,7 @@ def test_margin_falls_with_disturbance_assistance_and_hand_over():
 def test_a_guide_that_snaps_shut_has_no_safe_state_and_says_where():
     certificate = certify(guide("snap"), 0.5, BOX)
     assert not certificate.certified
-    assert "no state of SH is safe at" in certificate.reason
+    assert "no state of SH is safe: at 0.40 T" in certificate.reason
     assert math.isfinite(certificate.joints[0].image_empty_at)
     assert certificate.joints[0].u_ext_max == (0.0, 0.0)
 

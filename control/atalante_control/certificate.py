@@ -145,7 +145,7 @@ def _joint(guide: GuideFilter, bounds: Vector, joint: int, hand_over: HandOver) 
         float(time[at]) / guide.deadbeat.duration,
         ("upper", "lower")[int(side)],
         (low, high),
-        (low * scale if low else 0.0, high * scale if high else 0.0),
+        (low * scale + 0.0, high * scale + 0.0),
         undisturbed + per_disturbance,
         limit,
         math.inf if margin >= 0.0 else _empty_from(guide, bounds, joint),
@@ -156,8 +156,8 @@ def _joint(guide: GuideFilter, bounds: Vector, joint: int, hand_over: HandOver) 
 def _complaint(joint: JointCertificate) -> str:
     if math.isfinite(joint.image_empty_at):
         return (
-            f"no state of {joint.joint} is safe at {joint.image_empty_at:.2f} T: the guide is narrower there, or closes "
-            f"faster, than the backup policy holds against {joint.u_ext[0]:.3g} to {joint.u_ext[1]:.3g} Nm"
+            f"no state of {joint.joint} is safe: at {joint.tightest_phase:.2f} T the guide is narrower, or closes faster, "
+            f"than the backup policy holds against {joint.u_ext[0]:.3g} to {joint.u_ext[1]:.3g} Nm"
         )
     if joint.margin < 0.0:
         return (

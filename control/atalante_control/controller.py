@@ -67,7 +67,7 @@ class HangConfig:
     disturbance: tuple[Pair, Pair] = ((-30.0, 30.0), (-20.0, 20.0))  # Nm, u_ext of SH and SK
     points: int = 100  # intervals of the horizon grid
     overlap: float = 0.1  # s, horizon past the step's end
-    zeta: float = 0.015  # s, derivative gain of the guide
+    zeta: float = 0.01  # s, derivative gain of the guide
     hand_over: HandOver = field(default_factory=HandOver)
     decoupled: bool = True  # SH and SK through their common mass matrix; False: u_v on its own joint, as printed
     feedforward: bool = False  # u_f of the gait on the assisted joints; off in the air
@@ -334,7 +334,8 @@ class HangController:
         deviations, rates = (float(deviation[hip]), float(deviation[knee])), (float(rate[hip]), float(rate[knee]))
         self.guide.start_step(xi, deviations, rates)
         largest = config.hand_over
-        if max(map(abs, deviations)) > largest.deviation or max(map(abs, rates)) > largest.rate:
+        exceeded = max(map(abs, deviations)) > largest.deviation or max(map(abs, rates)) > largest.rate
+        if exceeded and self.statistics.steps:
             self.statistics.hand_overs_exceeded += 1
         if config.flat_foot:
             angles, speeds = self._flat_target(state, leg)

@@ -45,7 +45,7 @@ class GuideConfig:
     disturbance: tuple[tuple[float, float], tuple[float, float]]  # Nm, (u_ext_min, u_ext_max) of each joint
     points: int = 100  # grid intervals over a step
     overlap: float = 0.1  # s, horizon beyond the step's end
-    zeta: float = 0.03  # s, gain of the derivative term lambda_d
+    zeta: float = 0.01  # s, gain of the derivative term lambda_d
     derivative_time: float = 0.005  # s, time constant of the low pass on dh/dt
     reserve: float = 0.1  # part of the torque limit the rollouts do not count on: it corrects what a cycle is late
 
