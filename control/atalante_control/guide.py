@@ -22,6 +22,7 @@ from atalante_control.backup import BackupPolicy, forced_response, free_drift
 from atalante_control.deadbeat import Deadbeat
 from atalante_control.gait import PERIOD
 from atalante_control.guide_shapes import GuideShape
+from atalante_control.limited import LimitedRollouts, combine
 
 Vector = npt.NDArray[np.float64]
 
@@ -30,7 +31,6 @@ Vector = npt.NDArray[np.float64]
 _ROWS = 8
 #: Columns of its left factor: Phi11 and Phi12 of SH, of SK, and what the disturbance adds to each rollout.
 _TERMS = 8
-_HOPELESS = 2.0  # |e| / q_bound from which a stepped rollout is left: lambda is 1 from 1 on
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,6 @@ class GuideFilter:
         bounds: guide at the last tick, upper and lower [rad].
         cycles, stride, grid, horizon: cycles of a step, of a grid interval, of the grid points, of the horizon's end.
         time: of every cycle to the horizon's end [s]; `forced`: responses of SH and SK on it that P is made of.
-        stepped: rollouts so far that were not linear, because the backup policy saturates along them.
     """
 
     def __init__(
@@ -124,12 +123,9 @@ class GuideFilter:
         ufs = (None, None) if feedforward is None else (feedforward[0], feedforward[1])
         parts = list(zip(config.policies, nominal, following, ufs, strict=True))
         self.forced = [forced_response(p, deadbeat, q, after, self.time, uf) for p, q, after, uf in parts]
-        drifts = [free_drift(p, deadbeat, q, after, self.time, uf) for p, q, after, uf in parts]
         # Tables of (e, e') of SH, then of SK: nominal, per deviation, per rate; P is their sum for the step.
         self._p_parts = tuple(np.hstack(columns) for columns in zip(*self.forced, strict=True))
-        self._drift_parts = tuple(np.hstack(columns) for columns in zip(*drifts, strict=True))
-        self._p, self._drift, self._scratch = (np.empty((self.horizon + 1, 4)) for _ in range(3))
-        self._deviation, self._rate, self._drift_known = np.zeros(4), np.zeros(4), False
+        self._p = np.empty((self.horizon + 1, 4))
 
         lags = len(self.grid)
         self._flow = _rollout_table(config, self.stride, lags)
@@ -157,18 +153,15 @@ class GuideFilter:
             for policy, (low, high) in zip(config.policies, config.disturbance, strict=True)
         ]
         self._cells = memoryview(self._z.data).cast("B").cast("d")
-        one = np.array([PERIOD])
-        self._cycle_flow = [
-            (*p.transition(one)[0].ravel().tolist(), *p.step_response(one)[0].tolist()) for p in config.policies
-        ]
-        self._allowance = [
-            _allowance(p, d, self.time) for p, d in zip(config.policies, config.disturbance, strict=True)
-        ]
         self._monotone = all(p.monotone for p in config.policies)
+        drifts = [free_drift(p, deadbeat, q, after, self.time, uf) for p, q, after, uf in parts]
+        self._limited = LimitedRollouts(
+            config.policies, self._limits, config.disturbance, drifts, self._p, self._bounds, self.stride, self._linear
+        )
 
         self._smoothing = PERIOD / (config.derivative_time + PERIOD)
         self._xi, self._fresh, self._dh, self._ratio = math.nan, True, [0.0, 0.0], [0.0, 0.0]
-        self.h, self.gates, self.bounds, self.stepped = [1.0, 1.0], [0.0, 0.0], [0.0, 0.0], 0
+        self.h, self.gates, self.bounds = [1.0, 1.0], [0.0, 0.0], [0.0, 0.0]
         self.start_step(0.0, (0.0, 0.0), (0.0, 0.0))
 
     def start_step(self, xi: float, deviation: tuple[float, float], rate: tuple[float, float]) -> None:
@@ -184,10 +177,8 @@ class GuideFilter:
             self._rows_scale[:4] = np.tile(1.0 / self._bounds[self.grid].T, (2, 1))
             self._rows_scale.take(self._blocks, out=self._packed_scale, mode="clip")
             self._xi = xi
-        self._deviation[:] = deviation[0], deviation[0], deviation[1], deviation[1]
-        self._rate[:] = rate[0], rate[0], rate[1], rate[1]
-        self._sum(self._p_parts, self._p)
-        self._drift_known = False
+        combine(self._p_parts, deviation, rate, self._p)
+        self._limited.start_step(deviation, rate)
         p, rows = self._p[self.grid].T, self._rows_p
         for joint, policy in enumerate(self.config.policies):
             e, ed = p[2 * joint], p[2 * joint + 1]
@@ -219,6 +210,11 @@ class GuideFilter:
         flow, p, _, _, _ = self._views[cycle]
         self._load(cycle, e_hip, ed_hip, e_knee, ed_knee)
         return np.asarray((self._z @ flow + p)[:4])
+
+    @property
+    def stepped(self) -> int:
+        """Rollouts so far that were not linear, because the backup policy saturates along them."""
+        return self._limited.stepped
 
     def solution(self) -> Vector:
         """P of this step on the cycle grid, (e, e') of SH then of SK. Shape (horizon + 1, 4) [rad, rad/s]."""
@@ -269,12 +265,12 @@ class GuideFilter:
         hip_torques, knee_torques = (float(out[4, i4]), float(out[5, i5])), (float(out[6, i6]), float(out[7, i7]))
         now = (hip.kp * e_hip + hip.kd * ed_hip) / self._limits[0]
         if hip_torques[0] > 1.0 or hip_torques[1] > 1.0 or now > 1.0 or now < -1.0:
-            self._ratio[0] = self._limited(0, cycle, e_hip, ed_hip, now, (a, b), hip_torques)
+            self._ratio[0] = self._saturated(0, cycle, e_hip, ed_hip, now, (a, b), hip_torques)
         now = (knee.kp * e_knee + knee.kd * ed_knee) / self._limits[1]
         if knee_torques[0] > 1.0 or knee_torques[1] > 1.0 or now > 1.0 or now < -1.0:
-            self._ratio[1] = self._limited(1, cycle, e_knee, ed_knee, now, (c, d), knee_torques)
+            self._ratio[1] = self._saturated(1, cycle, e_knee, ed_knee, now, (c, d), knee_torques)
 
-    def _limited(
+    def _saturated(
         self,
         joint: int,
         cycle: int,
@@ -293,100 +289,12 @@ class GuideFilter:
         for side in (0, 1):
             against = abs(now) if not self._monotone else -now if side else now
             if against > 1.0 or torques[side] > 1.0:
-                worst = max(worst, self._stepped(joint, side, cycle, e, ed))
+                worst = max(worst, self._limited.ratio(joint, side, cycle, e, ed))
             else:
                 worst = max(worst, ratios[side])
         return worst
 
-    def _stepped(self, joint: int, side: int, cycle: int, e: float, ed: float) -> float:
-        """Largest |e| / q_bound ahead on one side, with the drive's limit.
-
-        Saturated, the torque is constant and the error a known drift plus a parabola: the cycle it comes off the limit
-        is found, and its largest error until then. From there on the flow is linear again. A rollout that saturates a
-        second time, or for long, goes on cycle by cycle.
-        """
-        if not self._drift_known:
-            self._sum(self._drift_parts, self._drift)
-            self._drift_known = True
-        self.stepped += 1
-        policy, columns = self.config.policies[joint], slice(2 * joint, 2 * joint + 2)
-        kp, kd, limit = policy.kp, policy.kd, self._limits[joint]
-        phi00, phi01, phi10, phi11, s0, s1 = self._cycle_flow[joint]
-        external, allowance = self.config.disturbance[joint][1 - side], self._allowance[joint][side]
-        sign, start, worst, linear = (-1.0 if side else 1.0), cycle, 0.0, False
-        while cycle < self.horizon and worst < _HOPELESS:
-            u = -kp * e - kd * ed
-            if -limit <= u <= limit:
-                if not linear:
-                    ratio, torque = self._finish(joint, side, cycle, e, ed)
-                    if torque <= 1.0:
-                        return max(worst, ratio)
-                linear = True
-                (p0, p1), (n0, n1) = self._p[cycle : cycle + 2, columns].tolist()
-                e, ed = e - p0, ed - p1
-                e, ed = n0 + phi00 * e + phi01 * ed + s0 * external, n1 + phi10 * e + phi11 * ed + s1 * external
-                cycle += 1
-            else:
-                linear = False
-                e, ed, cycle, peak = self._off_limit(joint, cycle, e, ed, math.copysign(limit, u) + external, sign)
-                worst = max(worst, peak)
-            worst = max(worst, (sign * e + allowance[cycle - start]) / float(self._bounds[cycle, side]))
-        return worst
-
-    def _off_limit(
-        self, joint: int, cycle: int, e: float, ed: float, force: float, sign: float
-    ) -> tuple[float, float, int, float]:
-        """The cycle at which a saturated rollout comes off the limit, by false position on the excess torque.
-
-        Args:
-            force: torque until then, limit and disturbance together [Nm].
-            sign: +1 towards the upper bound, -1 towards the lower one.
-
-        Returns:
-            e, e', cycle there, and the largest ratio where the error turns in between (0: it does not).
-        """
-        policy, column = self.config.policies[joint], 2 * joint
-        kp, kd, limit, a = policy.kp, policy.kd, self._limits[joint], force / policy.inertia
-        drift, (z, zd) = self._drift, self._drift[cycle, column : column + 2].tolist()
-        e0, ed0 = e - z, ed - zd
-        way = 1.0 if kp * e + kd * ed > 0.0 else -1.0
-
-        def state(n: int) -> tuple[float, float, float]:
-            t = n * PERIOD
-            zn, znd = drift[cycle + n, column : column + 2].tolist()
-            then, rate = e0 + ed0 * t + 0.5 * a * t * t + zn, ed0 + a * t + znd
-            return then, rate, way * (kp * then + kd * rate) - limit
-
-        # g > 0 at `inner`, still saturated; g <= 0 at `outer`, off the limit.
-        inner, g, last = 0, way * (kp * e + kd * ed) - limit, self.horizon - cycle
-        outer, g_outer, found = 0, 0.0, (e, ed)
-        slope = -way * (kp * ed + kd * (a + (drift[cycle + 1, column + 1] - zd) / PERIOD)) * PERIOD
-        reach = 4 * self.stride
-        for trial in range(12):
-            if outer:
-                # False position, and halving now and then: g bends where the error turns.
-                part = g / (g - g_outer) if trial % 3 else 0.5
-                n = inner + min(max(1, round((outer - inner) * part)), outer - inner - 1)
-            else:
-                n = min(last, inner + (math.ceil(g / slope) if slope * reach > g else reach))
-            then, rate, more = state(n)
-            if more <= 0.0:
-                outer, g_outer, found = n, more, (then, rate)
-            else:
-                slope, inner, g = (g - more) / (n - inner), n, more
-                if not outer:
-                    found = then, rate
-            if inner == last or outer - inner == 1:
-                break
-        end = outer or inner
-
-        peak, curvature = 0.0, a + (drift[cycle + end, column + 1] - zd) / (end * PERIOD)
-        if sign * ed > 0.0 > sign * found[1]:
-            turn = min(end, round(-ed / curvature / PERIOD))
-            peak = sign * state(turn)[0] / float(self._bounds[cycle + turn, 0 if sign > 0.0 else 1])
-        return found[0], found[1], cycle + end, peak
-
-    def _finish(self, joint: int, side: int, cycle: int, e: float, ed: float) -> tuple[float, float]:
+    def _linear(self, joint: int, side: int, cycle: int, e: float, ed: float) -> tuple[float, float]:
         """Largest ratio and largest torque over the limit of one linear rollout from `cycle` on."""
         flow, p, scale, out, _ = self._views[cycle]
         if joint:
@@ -398,12 +306,6 @@ class GuideFilter:
         np.multiply(out, scale, out=out)
         row, best = 2 * joint + side, out.argmax(1)
         return float(out[row, best[row]]), float(out[row + 4, best[row + 4]])
-
-    def _sum(self, parts: tuple[Vector, ...], out: Vector) -> None:
-        np.multiply(parts[1], self._deviation, out=out)
-        np.multiply(parts[2], self._rate, out=self._scratch)
-        np.add(out, self._scratch, out=out)
-        np.add(out, parts[0], out=out)
 
     def _block(self, first: int) -> int:
         """Where the packed block of the grid points from `first` on begins."""
@@ -435,11 +337,3 @@ def _rollout_table(config: GuideConfig, stride: int, lags: int) -> Vector:
             flow[offset, :, 2 * joint : 2 * joint + 2] = policy.transition(tau)[:, 0]
             flow[offset, :, 4 + 2 * joint : 6 + 2 * joint] = np.stack([largest, -smallest], axis=1)
     return flow
-
-
-def _allowance(policy: BackupPolicy, disturbance: tuple[float, float], time: Vector) -> tuple[list[float], list[float]]:
-    """What the worst disturbance adds to a constant extreme, upper and lower [rad]: zero for a monotone loop."""
-    largest, smallest = policy.disturbance(time, *disturbance)
-    step = policy.step_response(time)[:, 0]
-    low, high = disturbance
-    return (largest - high * step).tolist(), (low * step - smallest).tolist()
