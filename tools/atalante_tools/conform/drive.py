@@ -48,6 +48,8 @@ ROUTES: Final[dict[DriveState, tuple[Controlword, ...]]] = {
     _S.QUICK_STOP_ACTIVE: (_C.SHUTDOWN, _C.SWITCH_ON, _C.ENABLE_OPERATION, _C.QUICK_STOP),
 }
 
+#: Controlwords outside the range: known ones with the highest bit set, as a sloppy mask would let through, and the last.
+UNKNOWN: Final = (0x82, 0x86, 0x87, 0x8F, 0xFE)
 #: Cycles a drive may take for a transition, and for a quick stop.
 FOLLOW, STOP = 50, 5
 #: Cycles for which a command that must not move is repeated.
@@ -101,7 +103,7 @@ def requirements(bench: Bench) -> list[Requirement]:
         Requirement(
             "DRIVE-05",
             "Holds its position while QUICK STOP ACTIVE.",
-            "100 cycles of QUICK_STOP, position at the joint",
+            f"QUICK_STOP after 10 cycles of {torque:g} Nm, position at the joint over 100 cycles",
             f"{CIA402} quick stop option code 6",
             holds_its_position,
         ),
@@ -129,14 +131,14 @@ def requirements(bench: Bench) -> list[Requirement]:
         Requirement(
             "DRIVE-09",
             "Takes a MaxTorque at the end of its range.",
-            f"MaxTorque at the end of the DBC range, target {torque:g} Nm",
+            f"target {torque:g} Nm under MaxTorque {torque:g} Nm and at the end of the DBC range",
             "DBC MaxTorque",
             takes_the_largest_limit,
         ),
         Requirement(
             "DRIVE-10",
             "Does not act on a controlword outside its range.",
-            "codes 129, 143, 192 and 254 in OPERATION ENABLED and SWITCH ON DISABLED",
+            f"codes {', '.join(map(str, UNKNOWN))} in OPERATION ENABLED and SWITCH ON DISABLED",
             "DBC Controlword range",
             ignores_unknown_controlwords,
         ),
@@ -338,6 +340,11 @@ def torque_of(heard: list[Heard]) -> float:
     return max((h.values["Torque"] for h in heard), key=abs, default=0.0)
 
 
+def mean_torque(heard: list[Heard]) -> float:
+    """Mean of the measured torque [Nm]; NaN without frames."""
+    return sum(h.values["Torque"] for h in heard) / len(heard) if heard else math.nan
+
+
 def _names(heard: list[Heard]) -> str:
     return " -> ".join(dict.fromkeys(name_of(state_of(h)) for h in heard)) or "no state frame"
 
@@ -396,7 +403,10 @@ def stops_quickly(bench: Bench) -> Outcome:
 def holds_its_position(bench: Bench) -> Outcome:
     """DRIVE-05."""
     axis = Axis(bench)
-    axis.go(_S.QUICK_STOP_ACTIVE)
+    axis.enable()
+    axis.run(10, _C.ENABLE_OPERATION, bench.limits.torque)
+    if axis.follow(_C.QUICK_STOP, _S.QUICK_STOP_ACTIVE) is None:
+        raise NotTested("the drive does not go to QUICK_STOP_ACTIVE; see DRIVE-02")
     heard = axis.run(100, _C.QUICK_STOP)
     positions = [h.values["Position"] / bench.robot.gear[axis.joint] for h in heard]
     gave = max(positions) - min(positions) if positions else math.inf
@@ -427,7 +437,7 @@ def follows_torque(bench: Bench) -> Outcome:
     axis.enable()
     for wanted in (0.0, most, -most, most / 2.0):
         heard = axis.run(12, _C.ENABLE_OPERATION, wanted)[2 * _SHOWN :]
-        mean = sum(h.values["Torque"] for h in heard) / len(heard) if heard else math.nan
+        mean = mean_torque(heard)
         passed &= abs(mean - wanted) <= _NOISE
         found.append(f"{wanted:+g}: {mean:+.2f} Nm")
     return Outcome(passed, ", ".join(found))
@@ -441,7 +451,7 @@ def respects_the_limit(bench: Bench) -> Outcome:
     for limit in (bench.limits.torque, 0.0):
         for wanted in (target.maximum, target.minimum):
             most = torque_of(axis.run(12, _C.ENABLE_OPERATION, wanted, limit)[2 * _SHOWN :])
-            passed &= abs(most) <= limit + _NOISE and (limit == 0.0 or most * wanted > 0.0)
+            passed &= limit / 2.0 <= abs(most) <= limit + _NOISE
             found.append(f"{wanted:+.0f} Nm under {limit:g} Nm: {most:+.2f} Nm")
     return Outcome(passed, ", ".join(found))
 
@@ -450,11 +460,12 @@ def takes_the_largest_limit(bench: Bench) -> Outcome:
     """DRIVE-09."""
     axis, wanted = Axis(bench), bench.limits.torque
     axis.enable()
+    usual = mean_torque(axis.run(12, _C.ENABLE_OPERATION, wanted)[2 * _SHOWN :])
     most = bench.command.message.signal(axis.signal("MaxTorque")).maximum
     heard = axis.run(12, _C.ENABLE_OPERATION, wanted, most)
-    made = torque_of(heard[2 * _SHOWN :])
-    passed = abs(made - wanted) <= _NOISE and _always(heard, _S.OPERATION_ENABLED)
-    return Outcome(passed, f"{made:+.2f} Nm, {_names(heard)}")
+    made = mean_torque(heard[2 * _SHOWN :])
+    passed = abs(made - usual) <= _NOISE and _always(heard, _S.OPERATION_ENABLED)
+    return Outcome(passed, f"{made:+.2f} Nm as against {usual:+.2f} Nm, {_names(heard)}")
 
 
 # -- commands that are none --------------------------------------------------------------------------------------------
@@ -465,7 +476,7 @@ def ignores_unknown_controlwords(bench: Bench) -> Outcome:
     axis, wrong = Axis(bench), []
     for state, stay in ((_S.OPERATION_ENABLED, _C.ENABLE_OPERATION), (_S.SWITCH_ON_DISABLED, _C.DISABLE_VOLTAGE)):
         axis.go(state)
-        for code in (129, 143, 192, 254):
+        for code in UNKNOWN:
             heard = [*axis.send(axis.word(stay, raw={"Controlword": code})), *axis.run(2 * _SHOWN, stay)]
             if not _always(heard, state):
                 wrong.append(f"{code} in {state.name}: {_names(heard)}")
@@ -528,12 +539,12 @@ def rides_through(bench: Bench) -> Outcome:
     """DRIVE-12."""
     axis, wanted = Axis(bench), bench.limits.torque
     axis.enable()
-    axis.run(2 * _SHOWN, _C.ENABLE_OPERATION, wanted)
+    before = mean_torque(axis.run(12, _C.ENABLE_OPERATION, wanted)[2 * _SHOWN :])
     heard = bench.states([h for _ in range(RIDDEN) for h in bench.cycle()])
     heard += axis.run(2 * _SHOWN, _C.ENABLE_OPERATION, wanted)
     least = min((h.values["Torque"] for h in heard), default=math.nan)
-    passed = _always(heard, _S.OPERATION_ENABLED) and least >= wanted - 2.0 * _NOISE
-    return Outcome(passed, f"at least {least:+.2f} of {wanted:+g} Nm, {_names(heard)}")
+    passed = _always(heard, _S.OPERATION_ENABLED) and least >= before - _NOISE
+    return Outcome(passed, f"at least {least:+.2f} of {before:+.2f} Nm, {_names(heard)}")
 
 
 def latches(bench: Bench) -> Outcome:
@@ -580,7 +591,8 @@ def latches_without_sync(bench: Bench) -> Outcome:
     for _ in range(20):
         bench.silent_cycle()
     long = axis.run(2 * _SHOWN, _C.ENABLE_OPERATION)
-    passed = _always(short, _S.OPERATION_ENABLED) and _always(long, _S.QUICK_STOP_ACTIVE)
+    # Whether it stays in the hold is DRIVE-14.
+    passed = _always(short, _S.OPERATION_ENABLED) and any(state_of(h) == _S.QUICK_STOP_ACTIVE for h in long)
     return Outcome(passed, f"after 3 ms {_names(short)}, after 20 ms {_names(long)}")
 
 
@@ -607,7 +619,8 @@ def trips_when_hot(bench: Bench) -> Outcome:
     def enabled() -> list[Heard]:
         return bench.cycle(axis.word(_C.ENABLE_OPERATION))
 
-    bench.ask(Action.OVERHEAT, is_faulty, enabled)
+    if not bench.ask(Action.OVERHEAT, is_faulty, enabled):
+        return Outcome(False, "does not trip")
     axis.run(2 * _SHOWN, _C.ENABLE_OPERATION, bench.limits.torque)
     made = torque_of(axis.run(2 * _SHOWN, _C.ENABLE_OPERATION, bench.limits.torque))
     told = _emergencies(bench, first)

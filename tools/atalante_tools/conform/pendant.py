@@ -59,8 +59,7 @@ def tells_the_dead_man(bench: Bench) -> Outcome:
     if not bench.until(says(True)):
         bench.ask(Action.SQUEEZE_DEAD_MAN, says(True))
     for action, pressed in ((Action.RELEASE_DEAD_MAN, False), (Action.SQUEEZE_DEAD_MAN, True)):
-        bench.technician.please(action, bench.node.name)
-        if not bench.until(says(pressed)):
+        if not bench.ask(action, says(pressed)):
             return Outcome(False, f"{'pressing' if pressed else 'releasing'} it does not show")
     return Outcome(True, "released, then pressed")
 
@@ -68,12 +67,11 @@ def tells_the_dead_man(bench: Bench) -> Outcome:
 def sets_the_factor(bench: Bench) -> Outcome:
     """PENDANT-06."""
     before = _last(bench, bench.idle(3))["AssistanceFactor"]
-    bench.technician.please(Action.TURN_DIAL, bench.node.name)
 
     def is_set(heard: list[Heard]) -> bool:
         return any(h.values["AssistanceSet"] and h.values["AssistanceFactor"] != before for h in bench.states(heard))
 
-    passed = bench.until(is_set)
+    passed = bench.ask(Action.TURN_DIAL, is_set)
     now = _last(bench, bench.idle(3))["AssistanceFactor"]
     return Outcome(passed, f"factor {before:g} -> {now:g}")
 
@@ -81,12 +79,11 @@ def sets_the_factor(bench: Bench) -> Outcome:
 def _tells(action: Action, request: int) -> Callable[[Bench], Outcome]:
     def test(bench: Bench) -> Outcome:
         before = _last(bench, bench.idle(3))["RequestCounter"]
-        bench.technician.please(action, bench.node.name)
 
         def is_told(heard: list[Heard]) -> bool:
             return any(h.values["RequestCounter"] != before for h in bench.states(heard))
 
-        if not bench.until(is_told):
+        if not bench.ask(action, is_told):
             return Outcome(False, "the press does not show")
         now = _last(bench, bench.idle(_AFTER))
         presses = int(now["RequestCounter"] - before) & 0xFF

@@ -32,6 +32,7 @@ class Technician(Protocol):
 
     patience: float  # s a requirement waits for the action to show
     fresh: bool  # the node has just been switched on, when the examination begins
+    certain: bool  # what is asked is done, whether it shows or not
 
     def please(self, action: Action, node: str) -> None:
         """Do it, or say that it is wanted."""
@@ -43,6 +44,7 @@ class Person:
     def __init__(self, patience: float) -> None:
         self.patience = patience
         self.fresh = False
+        self.certain = False
 
     def please(self, action: Action, node: str) -> None:
         """Ask on stderr."""
@@ -56,6 +58,7 @@ class EmulatorTechnician:
         self._emulator, self._operator = emulator, operator
         self.patience = 0.3
         self.fresh = True
+        self.certain = True
 
     def please(self, action: Action, node: str) -> None:
         """Do it at once."""
