@@ -30,13 +30,13 @@ class Limiter:
         self._low = np.empty_like(self._step)
         self._high = np.empty_like(self._step)
         self._finite = np.empty(self._step.shape, np.bool_)
-        # Change and size of a torque side by side, to be asked about together.
         self._asked = np.empty((2, len(self._step)))
-        self._change, self._size = self._asked
         self._allowed = np.stack([self._step, self._torque_max])
         self._within = np.empty(self._asked.shape, np.bool_)
+        # Change and size of a torque side by side, to be asked about together: what each is counted from.
+        self._origin = np.zeros((2, len(self._step)))
         #: What was sent last; the rate limit counts from here. Shape (12,) [Nm].
-        self.last = np.zeros_like(self._step)
+        self.last = self._origin[0]
 
     def apply(self, torque: Vector) -> Limited:
         """Limit a command; the result is in `last`.
@@ -44,11 +44,11 @@ class Limiter:
         Args:
             torque: shape (12,) [Nm], not changed.
         """
-        np.subtract(torque, self.last, out=self._change)
-        np.copyto(self._size, torque)
-        np.abs(self._asked, out=self._asked)
-        if np.less_equal(self._asked, self._allowed, out=self._within).tobytes() == _ALL_WITHIN:
-            np.copyto(self.last, torque)
+        asked = self._asked
+        np.subtract(torque, self._origin, asked)
+        np.absolute(asked, asked)
+        if np.less_equal(asked, self._allowed, self._within).tobytes() == _ALL_WITHIN:
+            self.last[:] = torque
             return _AS_ASKED
         if np.isfinite(torque, out=self._finite).tobytes() != _ALL_TRUE:
             return _NOT_FINITE
