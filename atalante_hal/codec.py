@@ -6,7 +6,6 @@ of the payload: a signal is one gather, two shifts, one multiply and one add, fo
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -100,7 +99,11 @@ class Codec:
         self._scaled = np.empty(self.size)
         self._bits = self._scaled.view(np.uint64)
         self._sorted = np.empty(self.size, np.uint64)
-        self._ones, self._round = np.ones(self.size), np.full(self.size, _ROUND)
+        self._round = np.full(self.size, _ROUND)
+        self._lowest = self._round.view(np.uint64) + _words(low for low, _ in limits)
+        self._range = _words(high - low for low, high in limits)
+        self._distance = np.empty(self.size, np.uint64)
+        self._beyond = np.empty(self.size, np.bool_)
         self._invalid = np.array([s.invalid_raw or 0 for s in signals], np.uint64)
         self._no_invalid = [s.invalid_raw is None for s in signals]
 
@@ -192,23 +195,25 @@ class Codec:
     def pack(self, values: Vector, words: Words) -> None:
         """As `encode`, into a flat view of the frames made beforehand. Shape (rows * 9,)."""
         scaled, bits = self._scaled, self._bits
-        if self._has_offset:
-            values = np.subtract(values, self._offset, scaled)
-        np.divide(values, self._factor, scaled)
-        np.maximum(scaled, self._raw_min, out=scaled)
-        np.minimum(scaled, self._raw_max, out=scaled)
-        no_value = np.isnan(scaled) if math.isnan(scaled.dot(self._ones)) else None
+        np.divide(np.subtract(values, self._offset, scaled) if self._has_offset else values, self._factor, scaled)
         np.add(scaled, self._round, scaled)
-        if no_value is not None:
-            self._encode_invalid(no_value)
+        # One comparison for both ends, infinities and NaN: as numbers of bits all are far beyond the maximum.
+        np.subtract(bits, self._lowest, self._distance)
+        np.greater(self._distance, self._range, self._beyond)
+        if self._beyond.tobytes() != self._all_inside:
+            self._round_nearest(values)
         np.bitwise_and(bits, self._mask, bits)
         bits.take(self._by_word, None, self._sorted, "clip")
         np.left_shift(self._sorted, self._place, self._sorted)
         words[self._word_target] = np.bitwise_or.reduceat(self._sorted, self._word_start)
 
-    def _encode_invalid(self, no_value: npt.NDArray[np.bool_]) -> None:
+    def _round_nearest(self, values: Vector) -> None:
+        """Codes as `pack` needs them, when there are values outside their range or NaN."""
+        codes = (values - self._offset) / self._factor
+        no_value = np.isnan(codes)
         for i in np.flatnonzero(no_value).tolist():
             if self._no_invalid[i]:
                 message, signal = self.signals[i]
                 raise ValueError(f"{message.name}.{signal.name} is NaN and has no invalid code in the DBC")
+        np.add(np.clip(codes, self._raw_min, self._raw_max), self._round, self._scaled)
         self._bits[no_value] = self._invalid[no_value]
