@@ -16,6 +16,7 @@ FRAME = np.dtype([("can_id", "<u4"), ("len", "u1"), ("flags", "u1"), ("res", "u1
 FRAME_BYTES = FRAME.itemsize
 #: A record as nine 64-bit words: one header word, eight payload words.
 WORDS = FRAME_BYTES // 8
+_WORD = np.dtype("<u8")
 
 FLAG_BRS = 0x01  # payload sent at the data bit rate
 FLAG_ESI = 0x02  # sender is error passive
@@ -37,7 +38,7 @@ def new_frames(count: int) -> Frames:
 
 def as_words(frames: Frames) -> npt.NDArray[np.uint64]:
     """The same memory as 64-bit words. Shape (n, 9): header word, then the payload."""
-    return frames.view("<u8").reshape(-1, WORDS)
+    return frames.view(_WORD).reshape(-1, WORDS)
 
 
 def header_word(can_id: int, length: int, flags: int) -> int:

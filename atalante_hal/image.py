@@ -56,7 +56,7 @@ class ReceiveImage:
         #: The last cycle was perfect: every row was committed exactly as expected.
         self.all_fresh = False
         self._scratch: _Scratch | None = None
-        self._ordered = _Scratch(new_frames(count), self._lengths, self._data_ids)
+        self._ordered = _Scratch(new_frames(count), self.codec.messages)
 
     def new_cycle(self, elapsed: int = 1) -> None:
         """`elapsed` cycles have begun: until something arrives, every row is that much older and has no data."""
@@ -96,7 +96,7 @@ class ReceiveImage:
 
     def _scratch_of(self, frames: Frames) -> _Scratch:
         if self._scratch is None or self._scratch.frames is not frames:
-            self._scratch = _Scratch(frames, self._lengths, self._data_ids)
+            self._scratch = _Scratch(frames, self.codec.messages)
         return self._scratch
 
     def accept_exact(self, scratch: _Scratch) -> bool:
@@ -105,9 +105,9 @@ class ReceiveImage:
         Replaces `new_cycle` and `accept_each` for a perfect cycle; otherwise returns False and changes nothing.
         """
         expected = self._expected_counters or self._next_counters()
-        if scratch.headers.tobytes() != self._expected_headers or scratch.counters.tobytes() != expected:
+        if scratch.headers.tobytes() != self._expected_headers or scratch.e2e.counters.tobytes() != expected:
             return False
-        if [crc_hqx(i, crc_hqx(p, CRC_START)) for p, i in scratch.protected] != scratch.crcs.tolist():
+        if scratch.e2e.checksums() != scratch.e2e.crcs.tolist():
             return False
         if not self.codec.extract(scratch.words):
             return False
@@ -128,7 +128,7 @@ class ReceiveImage:
         """
         self._synchronise_counters()
         foreign: list[int] = []
-        before, age_before, checks = self._words.copy(), self.age.copy(), self.check.tolist()
+        before, age_before, checks = self._words.copy(), self.age.copy(), self.check
         words = as_words(frames)
         committed = False
         for place, header in enumerate(words[:count, 0].tolist()):
@@ -148,7 +148,6 @@ class ReceiveImage:
                 committed = True
             if result <= _FRESH or checks[row] > _FRESH:
                 checks[row] = result
-        self.check[:] = checks
         if committed and not self.codec.extract(self._words):
             for row in self.codec.rows_outside():
                 self.check[row], self.age[row] = Check.RANGE, age_before[row]
@@ -178,23 +177,50 @@ class ReceiveImage:
         return bytes((c + 1) & 0xFF for c in self._counter if c is not None) if None not in self._counter else b""
 
 
+class _E2eFields:
+    """Where CRC, counter and what the CRC covers lie in the rows of an array of frames: views, made once."""
+
+    def __init__(self, frames: Frames, messages: Sequence[Message]) -> None:
+        octets = frames.view(np.uint8)
+        rows = octets.reshape(-1, FRAME_BYTES)
+        self.counters = rows[:, _HEADER_BYTES + COUNTER_BYTE]
+        self.crcs = frames.view(np.uint16).reshape(-1, FRAME_BYTES // 2)[:, _HEADER_BYTES // 2]
+        # The CRC ends with the Data ID. Put into the unused bytes behind the payload, it costs no call of its own; a payload
+        # of 64 bytes leaves none.
+        protected: list[memoryview] = []
+        parked: list[int] = []
+        ids = b""
+        self._rest: list[tuple[int, bytes]] = []
+        for row, message in enumerate(messages):
+            data_id, end = data_id_bytes(message.data_id), _HEADER_BYTES + message.length
+            if end + len(data_id) <= FRAME_BYTES:
+                parked += range(row * FRAME_BYTES + end, row * FRAME_BYTES + end + len(data_id))
+                ids, end = ids + data_id, end + len(data_id)
+            else:
+                self._rest.append((row, data_id))
+            protected.append(rows[row].data[_HEADER_BYTES + CRC_BYTES : end])
+        self._octets, self._parked, self._ids = octets, np.array(parked, np.intp), np.frombuffer(ids, np.uint8)
+        self._protected, self._starts = protected, [CRC_START] * len(protected)
+
+    def checksums(self) -> list[int]:
+        """What the CRC of each row should be."""
+        self._octets[self._parked] = self._ids
+        checksums = list(map(crc_hqx, self._protected, self._starts))
+        for row, data_id in self._rest:
+            checksums[row] = crc_hqx(data_id, checksums[row])
+        return checksums
+
+
 class _Scratch:
     """Views of the first rows of a receive buffer, made once: what the fast path reads every cycle."""
 
-    def __init__(self, frames: Frames, lengths: Sequence[int], data_ids: Sequence[bytes]) -> None:
-        rows = len(lengths)
+    def __init__(self, frames: Frames, messages: Sequence[Message]) -> None:
         self.frames = frames
-        head = frames[:rows]
+        head = frames[: len(messages)]
         self.words = head.view(np.uint64)
         self.bytes = head.view(np.uint8)
         self.headers = as_words(head)[:, 0]
-        octets = self.bytes.reshape(rows, FRAME_BYTES)
-        self.counters = octets[:, _HEADER_BYTES + COUNTER_BYTE]
-        self.crcs = head.view(np.uint16).reshape(rows, FRAME_BYTES // 2)[:, _HEADER_BYTES // 2]
-        self.protected = [
-            (memoryview(octets[row])[_HEADER_BYTES + CRC_BYTES : _HEADER_BYTES + length], data_id)
-            for row, (length, data_id) in enumerate(zip(lengths, data_ids, strict=True))
-        ]
+        self.e2e = _E2eFields(head, messages)
 
 
 class TransmitImage:
@@ -205,20 +231,11 @@ class TransmitImage:
         self.values = np.zeros(self.codec.size)
         self.frames = self.codec.template()
         self._words = self.frames.view(np.uint64)
-        self._bytes = self.frames.view(np.uint8).reshape(-1, FRAME_BYTES)
-        rows = range(len(self.codec.messages))
-        # The counter of a row is the low byte of a number that grows by one a frame, so that all rows advance in one addition.
-        self._counters = np.full(len(rows), 255, np.uint8)
-        self._counter_bytes = self._bytes[:, _HEADER_BYTES + COUNTER_BYTE]
-        self._crcs = self.frames.view(np.uint16).reshape(-1, FRAME_BYTES // 2)[:, _HEADER_BYTES // 2]
-        self._protected = [
-            (
-                memoryview(self._bytes[row])[_HEADER_BYTES + CRC_BYTES : _HEADER_BYTES + message.length],
-                data_id_bytes(message.data_id),
-            )
-            for row, message in enumerate(self.codec.messages)
-        ]
-        self._singles = [self.frames[row : row + 1] for row in rows]
+        self._e2e = _E2eFields(self.frames, self.codec.messages)
+        rows = len(self.codec.messages)
+        # Counters overflow into nothing, as they should.
+        self._counters, self._one = np.full(rows, 255, np.uint8), np.ones(rows, np.uint8)
+        self._singles = [self.frames[row : row + 1] for row in range(rows)]
 
     def seal(self) -> Frames:
         """Encode the values and protect every row: one counter step and the CRC. Returns the frames to send, shape (rows,).
@@ -227,18 +244,17 @@ class TransmitImage:
             ValueError: NaN for a signal without an invalid code.
         """
         self.codec.pack(self.values, self._words)
-        self._counters += 1
-        self._counter_bytes[:] = self._counters
-        self._crcs[:] = [crc_hqx(i, crc_hqx(p, CRC_START)) for p, i in self._protected]
+        np.add(self._counters, self._one, self._counters)
+        self._e2e.counters[:] = self._counters
+        self._e2e.crcs[:] = self._e2e.checksums()
         return self.frames
 
     def seal_row(self, row: int) -> Frames:
         """As `seal` for one row alone, the counters of the others stay. Shape (1,)."""
         self.codec.pack(self.values, self._words)
         self._counters[row : row + 1] += 1
-        self._counter_bytes[:] = self._counters
-        protected, data_id = self._protected[row]
-        self._crcs[row] = crc(protected, data_id)
+        self._e2e.counters[:] = self._counters
+        self._e2e.crcs[:] = self._e2e.checksums()
         return self._singles[row]
 
     def resume(self, row: int, counter: int) -> None:
