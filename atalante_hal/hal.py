@@ -95,6 +95,7 @@ class Hal:
         self._build_state(assistance_factor)
         self._build_status(gait_hash)
         self._limiter = Limiter(robot, PERIOD)
+        self._all_valid = False  # `state.valid` says so
         self._settled = False  # the supervisor stays where it is while the conditions stay as they are
         self._pending = 0  # conditions raised since the last read, judged in the next
         self._start_wanted = 0  # cycles left to reach ACTIVE, 0: nobody asked
@@ -146,7 +147,8 @@ class Hal:
         per_turn = robot.polarity / robot.gear
         # Torque is at the joint on the wire, in both directions.
         self._to_joint = np.concatenate([per_turn, per_turn, np.ones(_JOINT_COUNT)])
-        self._header = record[: len(HEADER_FIELDS)]
+        # A memoryview: half the price of an array, a number at a time.
+        self._header = memoryview(record.data).cast("B").cast("d")[: len(HEADER_FIELDS)]
         self.state = State(
             cycle=0,
             time=0.0,
@@ -209,6 +211,8 @@ class Hal:
         self._tx_control[:] = Controlword.QUICK_STOP
         self._tx_level[:] = 0.0
         self._hold_values = self._tx.values.copy()
+        self._no_level = np.zeros_like(self._tx_level)
+        self._enable = np.full_like(self._tx_control, Controlword.ENABLE_OPERATION)
         self._seal()
         self._written = True
 
@@ -232,7 +236,7 @@ class Hal:
         foreign = self._rx.accept(self._scratch, count)
         if foreign:
             self._accept_slow(foreign)
-        np.multiply(self._motor_side, self._to_joint, out=self._joint_side)
+        np.multiply(self._motor_side, self._to_joint, self._joint_side)
         self._supervise()
         header = self._header
         header[0], header[1] = state.cycle, state.time
@@ -255,11 +259,10 @@ class Hal:
         if not limited.finite:
             self._raise_condition(Condition.COMMAND_NOT_FINITE, "the controller asked for a torque that is not finite")
             return self.hold()
-        np.maximum(command.vibration, 0.0, out=self._level_command)  # the codec cuts at 1
-        self._torque_command[:] = self._limiter.last
-        self._tx_torque[:] = self._limiter.last
+        np.maximum(command.vibration, self._no_level, out=self._level_command)  # the codec cuts at 1
+        self._torque_command[:] = self._tx_torque[:] = self._limiter.last
         self._tx_level[:] = self._level_command
-        self._tx_control.fill(Controlword.ENABLE_OPERATION)
+        self._tx_control[:] = self._enable
         return self._send_command()
 
     def hold(self) -> Vector:
@@ -378,7 +381,8 @@ class Hal:
     def _accept_slow(self, places: Sequence[int]) -> None:
         elapsed = self.state.cycle - self._slow_seen
         self._slow_seen = self.state.cycle
-        frames = self._scratch[list(places)]
+        in_row = isinstance(places, range)
+        frames = self._scratch[slice(places[0], places[-1] + 1) if in_row else list(places)]
         self._slow.new_cycle(elapsed)
         self._slow.accept_each(frames, len(frames))
         if self._slow.check[self._amplitude_row] <= 1:
@@ -399,9 +403,10 @@ class Hal:
         state = self.state
         found = self._pending
         self._pending = 0
-        state.joints_valid = self._rx.all_fresh
         if self._rx.all_fresh:
-            state.valid.fill(True)
+            if not self._all_valid:
+                state.valid.fill(True)
+                state.joints_valid = self._all_valid = True
             found |= _NODES_WELL if self._nodes_known else 0
         else:
             found |= self._judge_ages()
@@ -446,6 +451,7 @@ class Hal:
     def _judge_ages(self) -> int:
         """The slow half of validity: something was not fresh this cycle."""
         ages = self._rx.age
+        self._all_valid = False
         np.less_equal(self._rx.check, 1, out=self.state.valid)
         self.state.joints_valid = bool(self.state.valid[self._joint_rows].all())
         late = (ages > self._timeouts) & self._needed
