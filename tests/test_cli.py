@@ -60,7 +60,7 @@ def test_every_command_has_help_with_an_example(name: str) -> None:
     command = cli.get_command(click.Context(cli), name)
     assert command is not None
     first, *others = helps(command, [name])
-    assert f"Example: atalante {name}" in first
+    assert "Example: atalante " in first
     assert all(len(text.split("Options:")[0].splitlines()) > 2 for text in others)
 
 

@@ -144,6 +144,13 @@ def test_a_node_that_falls_silent_grows_old(network: Network, robot: Robot, traf
     assert f"LEFT_SK          {lost.age_ms} ms ago" in render(report, TARGET)
 
 
+def test_a_hal_that_is_gone_is_said_to_be(network: Network, robot: Robot, traffic: list[Frames]) -> None:
+    observer, now = observe(network, robot, [*traffic, *[new_frames(0)] * 40])
+    assert render(observer.report(now), TARGET).startswith(
+        "virtual test: the HAL has been silent for 40 ms; it was ACTIVE in cycle 5"
+    )
+
+
 def test_what_was_never_heard_is_none_and_not_zero(network: Network, robot: Robot) -> None:
     report = Observer(network, robot, 0.0).report(1.0)
     assert report.supervisor is None

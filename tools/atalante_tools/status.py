@@ -135,6 +135,11 @@ def render(report: Report, target: Target) -> str:
 def _headline(report: Report, target: Target) -> str:
     if report.supervisor is None:
         return f"{target}: no HAL (no SYNC was heard)"
+    hal = next(n for n in report.nodes if n.kind == "master")
+    if hal.late:
+        return (
+            f"{target}: the HAL has been silent for {hal.age_ms} ms; it was {report.supervisor} in cycle {report.cycle}"
+        )
     said = [f"{target}: HAL {report.supervisor}, cycle {report.cycle}"]
     if report.assistance_factor is not None:
         said.append(f"assistance factor {report.assistance_factor:.2f}")
