@@ -1,0 +1,87 @@
+"""What installs: all packages with their data, the robot side without PyBullet, and python-control keeps its name."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    folder = tmp_path_factory.mktemp("wheel")
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
+    done = subprocess.run(build, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return zipfile.ZipFile(next(folder.glob("*.whl"))).namelist()
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "atalante_dbc/atalante.dbc",
+        "atalante_hal/robot.toml",
+        "atalante_hal/telemetry/messages.binpb",
+        "atalante_control/gaits/hang.json",
+        "atalante_emulator/emulator.py",
+        "atalante_tools/cli.py",
+        *(f"atalante_{package}/py.typed" for package in ("dbc", "hal", "control", "emulator", "tools")),
+    ],
+)
+def test_the_wheel_has(wheel: list[str], path: str):
+    assert path in wheel
+
+
+def test_the_wheel_has_nothing_else_at_the_top(wheel: list[str]):
+    top = {path.split("/")[0] for path in wheel}
+    assert {name for name in top if not name.startswith("atalante_")} == set()
+
+
+def run(program: str, *path: Path) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, cwd=path[0] if path else None
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_hal_and_controller_run_without_pybullet_and_without_a_telemetry_library():
+    run(
+        "import sys\n"
+        "for name in ('pybullet', 'zenoh', 'mcap', 'google', 'matplotlib'): sys.modules[name] = None\n"
+        "import atalante_hal.hal, atalante_hal.loop, atalante_hal.bus.socketcan, atalante_hal.telemetry.process\n"
+        "import atalante_control.controller, atalante_control.certificate\n"
+    )
+
+
+def test_importing_control_gives_another_package_of_that_name(tmp_path: Path):
+    """The component roots are no packages: python-control, installed later on the path, keeps its name."""
+    package = tmp_path / "control"
+    package.mkdir()
+    (package / "__init__.py").write_text("owner = 'python-control'\n")
+    program = f"import sys; sys.path.append({str(tmp_path)!r}); import control; print(control.owner)"
+    assert run(program, ROOT).strip() == "python-control"
+
+
+def test_the_loops_process_opens_no_network_socket():
+    """The whole embedded stack but the telemetry process: no socket is made (audited by the interpreter), none is open."""
+    run(
+        "import os, sys\n"
+        "made = []\n"
+        "sys.addaudithook(lambda event, what: made.append(what) if event == 'socket.__new__' else None)\n"
+        "from atalante_tools.options import Target\n"
+        "from atalante_tools.rig import open_hal\n"
+        "with open_hal(Target('embedded', '', lockstep=True)) as rig:\n"
+        "    for _ in range(300):\n"
+        "        rig.hal.read()\n"
+        "        rig.hal.hold()\n"
+        "    links = [os.readlink(entry.path) for entry in os.scandir('/proc/self/fd') if os.path.islink(entry.path)\n"
+        "             and os.path.lexists(entry.path) and int(entry.name) > 2 and os.path.exists(entry.path)]\n"
+        "assert not made, made\n"
+        "assert not [link for link in links if link.startswith('socket:')], links\n"
+    )
