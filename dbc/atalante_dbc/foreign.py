@@ -55,6 +55,7 @@ class Field:
     unit: str
     invalid_raw: int | None  # raw code (as unsigned bits) that says "no value"
     choices: Mapping[int, str]  # raw value -> name; empty when there is no value table
+    receivers: tuple[str, ...]
     #: Multiplexer signals and the raw values of each at which this signal is in the frame; empty: always.
     selectors: tuple[tuple[str, frozenset[int]], ...]
 
@@ -329,6 +330,7 @@ def _field(signal: RawSignal, selectors: tuple[tuple[str, frozenset[int]], ...])
         unit=signal.unit or "",
         invalid_raw=_invalid_raw(signal),
         choices={int(k): str(v) for k, v in (signal.choices or {}).items()},
+        receivers=tuple(signal.receivers),
         selectors=selectors,
     )
 

@@ -271,9 +271,7 @@ def _identifiers(lines: _Lines, frames: npt.NDArray[np.void]) -> npt.NDArray[np.
     return regular
 
 
-def _payloads(
-    lines: _Lines, frames: npt.NDArray[np.void], wanted: npt.NDArray[np.bool_]
-) -> npt.NDArray[np.bool_]:
+def _payloads(lines: _Lines, frames: npt.NDArray[np.void], wanted: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
     """Payload bytes, lines of one length after the other."""
     regular = wanted.copy()
     digits = np.where(wanted, lines.digits, 0)

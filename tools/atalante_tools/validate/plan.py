@@ -1,4 +1,4 @@
-"""The DBC compiled for judging: one row a message, rows of equal layout side by side, and the way from an identifier to its row."""
+"""The DBC compiled for judging: one row a message, rows of equal layout side by side, and the row of an identifier."""
 
 from __future__ import annotations
 
@@ -161,8 +161,11 @@ def _flags(layout: Layout) -> int:
 def _shape(layout: Layout) -> tuple[object, ...]:
     """What must be equal for two messages to be decoded and judged together."""
     fields = tuple(
-        (f.name, f.start, f.length, f.big_endian, f.kind, f.factor, f.offset, f.minimum, f.maximum, f.unit, f.invalid_raw)
-        + (tuple(sorted(f.choices.items())), tuple((m, tuple(sorted(ids))) for m, ids in f.selectors))
+        (
+            *(f.name, f.start, f.length, f.big_endian, f.kind, f.factor, f.offset, f.minimum, f.maximum, f.invalid_raw),
+            tuple(sorted(f.choices.items())),
+            tuple((multiplexer, tuple(sorted(ids))) for multiplexer, ids in f.selectors),
+        )
         for f in layout.fields
     )
     return (layout.length, fields, tuple(sorted((m, tuple(sorted(v))) for m, v in layout.multiplexers.items())))

@@ -1,0 +1,255 @@
+"""What is in a frame: ranges, codes for "no value", value tables, reserved bits, multiplexers. A family of messages at once.
+
+The common case costs two reductions a field (its least and its greatest raw code); only a column that fails is looked at value
+by value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_dbc.foreign import Field, Layout
+from atalante_hal.bulk import BulkCodec, Mask, Words, payload_words, raw_range
+from atalante_tools.validate.findings import Findings
+from atalante_tools.validate.plan import Family, Plan
+from atalante_tools.validate.project import Project
+from atalante_tools.validate.stream import Stream
+
+#: Fields of up to this many bits get a table of their named values.
+_TABLE_BITS = 16
+_WORD = 64
+
+
+@dataclass
+class Decoded:
+    """The raw codes of a family's frames, and which of them were found wrong."""
+
+    family: Family
+    span: slice  # of the stream
+    raw: Words  # shape (fields, n)
+    bad: dict[int, Mask] = field(default_factory=dict)  # place of a field -> where its value means nothing
+
+    @property
+    def codes(self) -> npt.NDArray[np.int64]:
+        """Raw codes as signed integers. Shape (fields, n)."""
+        return self.raw.view(np.int64)
+
+
+class ValueRules:
+    """Judges the payloads of one family after the other."""
+
+    def __init__(self, plan: Plan, findings: Findings, project: Project) -> None:
+        self._findings = findings
+        pattern = project.number("reserved-bits", "value")
+        self._checks = {family.rows.start: _FamilyChecks(family.codec, pattern) for family in plan.families}
+
+    def judge(self, family: Family, stream: Stream) -> Decoded | None:
+        """Decode and judge the frames of a family; None if there are none."""
+        span = stream.span(family.rows)
+        if span.start == span.stop or not family.codec.fields:
+            return None
+        words = payload_words(stream.frames[span], family.length)
+        decoded = Decoded(family, span, family.codec.extract(words))
+        checks = self._checks[family.rows.start]
+        self._judge_multiplexers(decoded, stream)
+        self._judge_limits(checks, decoded, stream)
+        self._judge_tables(checks, decoded, stream)
+        self._judge_reserved(checks, words, decoded, stream)
+        return decoded
+
+    def _report(
+        self,
+        rule: str,
+        decoded: Decoded,
+        stream: Stream,
+        wrong: Mask,
+        place: int,
+        shown: npt.NDArray[np.generic],
+        badness: npt.NDArray[np.generic] | None = None,
+        unit: str | None = None,
+    ) -> None:
+        self._findings.add_rows(
+            rule,
+            stream.rows[decoded.span][wrong],
+            stream.stamps[decoded.span][wrong],
+            signal=decoded.family.codec.fields[place].name,
+            shown=shown[wrong],
+            badness=None if badness is None else badness[wrong],
+            unit=unit,
+        )
+        known = decoded.bad.get(place)
+        decoded.bad[place] = wrong if known is None else known | wrong
+
+    def _judge_multiplexers(self, decoded: Decoded, stream: Stream) -> None:
+        codec = decoded.family.codec
+        for name in codec.layout.multiplexers:
+            undefined = codec.undefined(decoded.raw, name)
+            if bool(undefined.any()):
+                place = codec.place(name)
+                self._report("multiplexer", decoded, stream, undefined, place, decoded.codes[place])
+
+    def _judge_limits(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream) -> None:
+        if len(checks.limited):
+            codes = decoded.codes[checks.limited] if len(checks.limited) < len(decoded.raw) else decoded.codes
+            outside = (codes.min(axis=1) < checks.low) | (codes.max(axis=1) > checks.high)
+            for at in np.flatnonzero(outside).tolist():
+                self._judge_limit(checks, decoded, stream, int(checks.limited[at]))
+        for place in checks.special:
+            self._judge_special(decoded, stream, place)
+
+    def _judge_limit(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream, place: int) -> None:
+        """A column in which some code is outside: the code for "no value", a named special value, or really wrong."""
+        codec, codes = decoded.family.codec, decoded.codes[place]
+        low, high = checks.bounds[place]
+        outside = (codes < low) | (codes > high)
+        self._judge_outside(decoded, stream, place, outside, codec.values(decoded.raw, place).astype(np.float64))
+
+    def _judge_special(self, decoded: Decoded, stream: Stream, place: int) -> None:
+        """Floats and 64-bit fields are compared by their physical value."""
+        values = decoded.family.codec.values(decoded.raw, place).astype(np.float64)
+        limits = decoded.family.codec.fields[place]
+        low = -math.inf if limits.minimum is None else limits.minimum
+        high = math.inf if limits.maximum is None else limits.maximum
+        margin = 1e-9 * max(abs(x) for x in (low, high, 1.0) if math.isfinite(x))
+        outside = ~((values >= low - margin) & (values <= high + margin))
+        self._judge_outside(decoded, stream, place, outside, values)
+
+    def _judge_outside(
+        self, decoded: Decoded, stream: Stream, place: int, outside: Mask, values: npt.NDArray[np.float64]
+    ) -> None:
+        codec, codes = decoded.family.codec, decoded.codes[place]
+        limits = codec.fields[place]
+        there = codec.present(decoded.raw, place)
+        if there is not None:
+            outside = outside & there
+        invalid = np.zeros(len(codes), np.bool_)
+        if limits.invalid_raw is not None:
+            invalid = outside & (codes == _as_signed(limits, limits.invalid_raw))
+            if bool(invalid.any()):
+                self._report("invalid-code", decoded, stream, invalid, place, codes)
+        wrong = outside & ~invalid
+        if limits.choices and bool(wrong.any()):
+            wrong &= ~np.isin(codes, list(limits.choices))
+        if bool(wrong.any()):
+            low, high = limits.minimum or 0.0, limits.maximum or 0.0
+            distance = np.maximum(low - values, values - high)
+            self._report(
+                "range", decoded, stream, wrong, place, values, np.nan_to_num(distance, nan=np.inf), limits.unit
+            )
+
+    def _judge_tables(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream) -> None:
+        for place, table in checks.tables.items():
+            codes = decoded.codes[place]
+            limits = decoded.family.codec.fields[place]
+            known = table.take(codes & len(table) - 1) if isinstance(table, np.ndarray) else np.isin(codes, table)
+            if bool(known.all()):
+                continue
+            wrong = ~known
+            if (there := decoded.family.codec.present(decoded.raw, place)) is not None:
+                wrong &= there
+            if (bad := decoded.bad.get(place)) is not None:
+                wrong &= ~bad
+            if limits.invalid_raw is not None:
+                wrong &= codes != _as_signed(limits, limits.invalid_raw)
+            if bool(wrong.any()):
+                self._report("value-table", decoded, stream, wrong, place, codes)
+
+    def _judge_reserved(self, checks: _FamilyChecks, words: Words, decoded: Decoded, stream: Stream) -> None:
+        set_bits = np.zeros(0, np.uint64)
+        for word, mask in checks.reserved.items():
+            column = (words[word] ^ checks.pattern) & mask
+            if bool(np.bitwise_or.reduce(column)):
+                counted = np.bitwise_count(column).astype(np.uint64)
+                set_bits = counted if not len(set_bits) else set_bits + counted
+        if len(set_bits):
+            wrong = set_bits > 0
+            self._findings.add_rows(
+                "reserved-bits",
+                stream.rows[decoded.span][wrong],
+                stream.stamps[decoded.span][wrong],
+                shown=set_bits[wrong],
+            )
+
+
+class _FamilyChecks:
+    """What can be wrong in the payloads of a family, compiled."""
+
+    def __init__(self, codec: BulkCodec, pattern: float) -> None:
+        fields = list(enumerate(codec.fields))
+        ranged = [(p, f) for p, f in fields if is_limited(f)]
+        self.special = [p for p, f in ranged if f.kind == "float" or f.length == _WORD]
+        self.bounds = {p: raw_bounds(f) for p, f in ranged if p not in self.special}
+        self.limited = np.array(list(self.bounds), np.intp)
+        self.low = np.array([low for low, _ in self.bounds.values()], np.int64)
+        self.high = np.array([high for _, high in self.bounds.values()], np.int64)
+        self.tables = {p: _table(f) for p, f in fields if is_enumeration(f)}
+        self.pattern = np.uint64(2**64 - 1 if pattern else 0)
+        unused = reserved_bits(codec.layout)
+        self.reserved = {
+            word: np.uint64(mask)
+            for word in range((codec.layout.length + 7) // 8)
+            if (mask := sum(1 << bit % _WORD for bit in unused if bit // _WORD == word))
+        }
+
+
+def reserved_bits(layout: Layout) -> list[int]:
+    """Bits of the payload that no signal has, numbered from the least significant bit of byte 0."""
+    used = {bit for f in layout.fields for bit in f.bits}
+    return [bit for bit in range(8 * layout.length) if bit not in used]
+
+
+def is_limited(limits: Field) -> bool:
+    """Whether some raw code of the field is outside its range: otherwise there is nothing to judge."""
+    if limits.minimum is None or limits.maximum is None or limits.factor == 0:
+        return False
+    if limits.kind == "float":
+        return True
+    low, high = raw_bounds(limits)
+    codes = raw_range(limits)
+    return low > codes[0] or high < codes[-1]
+
+
+def raw_bounds(limits: Field) -> tuple[int, int]:
+    """Least and greatest raw code inside the range; the decimals of a DBC are rounded."""
+    assert limits.minimum is not None
+    assert limits.maximum is not None
+    raw = sorted((x - limits.offset) / limits.factor for x in (limits.minimum, limits.maximum))
+    codes = raw_range(limits)
+    low, high = math.ceil(raw[0] - 1e-6), math.floor(raw[1] + 1e-6)
+    return max(low, codes[0]), min(high, codes[-1])
+
+
+def is_enumeration(named: Field) -> bool:
+    """Whether the value table names the values a field can have, and not just a few special ones of a number.
+
+    A table that names both ends of the range does; without a range, one that begins at 0 and has two names.
+    """
+    if len(named.choices) < 2 or named.kind == "float" or named.factor != 1 or named.offset != 0:
+        return False
+    if all(code in named.choices for code in raw_range(named)[: len(named.choices) + 1]):
+        return False  # every code has a name: nothing can be wrong
+    if named.minimum is None or named.maximum is None:
+        return 0 in named.choices
+    return int(named.minimum) in named.choices and int(named.maximum) in named.choices
+
+
+def _table(named: Field) -> npt.NDArray[np.bool_] | Sequence[int]:
+    if named.length > _TABLE_BITS:
+        return list(named.choices)
+    table = np.zeros(1 << named.length, np.bool_)
+    for code in named.choices:
+        if -len(table) <= code < len(table):
+            table[code] = True
+    return table
+
+
+def _as_signed(limits: Field, raw: int) -> int:
+    """A raw code, given as unsigned bits, the way `Decoded.codes` has it."""
+    if limits.kind == "signed" and raw >> limits.length - 1:
+        return raw - (1 << limits.length)
+    return raw - (1 << _WORD) if raw >= 1 << _WORD - 1 else raw
