@@ -25,8 +25,10 @@ _HEARTBEAT_CYCLES, _ANSWER_CYCLES = 520, 200
 _MEAN, _ONE = 0.1, 0.5
 #: Foreign frames a cycle, and cycles, of the flood: as many as a wire has room for beside the cyclic set.
 _FLOOD, _FLOOD_CYCLES = 6, 100
+#: Bits of SYNC that are damaged: of its CRC, of the HAL's state, of the cycle's number.
+_DAMAGED: Final = (0, 5, 10, 15, *range(24, 32), *range(48, 56))
 #: Wrong SYNCs of a kind.
-_WRONG: Final = 20
+_WRONG: Final = len(_DAMAGED)
 #: Defects named one by one in a result; the rest are counted.
 _NAMED: Final = 3
 
@@ -82,7 +84,7 @@ def requirements(bench: Bench) -> tuple[list[Requirement], list[Requirement]]:
                 "Does not answer a SYNC with a wrong CRC.",
                 f"every other SYNC with one bit damaged, {_WRONG} times",
                 e2e,
-                _ignores_sync(lambda b, i: b.sync_frame(flip=24 + i)),
+                _ignores_sync(lambda b, i: b.sync_frame(flip=_DAMAGED[i])),
             ),
             Requirement(
                 "NODE-08",

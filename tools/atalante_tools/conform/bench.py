@@ -170,11 +170,13 @@ class Bench:
         Returns:
             What the node said since the SYNC.
         """
+        if sync is None:
+            sync = self.sync_frame()
         self.clock.next_cycle(sync=True, listen=self._listen)
         self.cycle_number += 1
         if before is not None:
             self._send(before)
-        self._send(self.sync_frame() if sync is None else sync)
+        self._send(sync)
         first = len(self.heard)
         self._listen_for_answer()
         for frames in commands:
@@ -193,7 +195,7 @@ class Bench:
         self, *, counter: int | None = None, length: int | None = None, classic: bool = False, flip: int | None = None
     ) -> Frames:
         """The next SYNC, with the defects of `Outgoing.frame`."""
-        cycle = {"Cycle": self.cycle_number & 0xFFFFFFFF}
+        cycle = {"Cycle": self.cycle_number + 1 & 0xFFFFFFFF}
         return self.sync.frame(cycle, counter=counter, length=length, classic=classic, flip=flip)
 
     def _send(self, frames: Frames) -> None:

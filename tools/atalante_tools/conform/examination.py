@@ -21,7 +21,8 @@ def requirements_of(bench: Bench) -> list[Requirement]:
     before, after = any_node.requirements(bench)
     special = _OF_KIND[bench.node.kind](bench)
     # A drive's first requirement is about its start, before anything is tried on it.
-    return [before[0], special[0], *before[1:], *special[1:], *after]
+    early = 1 if bench.node.kind == "drive" else 0
+    return [before[0], *special[:early], *before[1:], *special[early:], *after]
 
 
 def make_safe(bench: Bench) -> None:

@@ -111,7 +111,7 @@ def is_still(bench: Bench) -> Outcome:
 
 def follows_like_a_lag(bench: Bench) -> Outcome:
     """HAPTICS-02: what is left to go shrinks by the same factor from one state to the next."""
-    _run(bench, _SETTLED, 0.0)
+    _bring(bench, 0.0)
     left = 1.0 - _amplitudes(bench, _run(bench, _SETTLED, 1.0))
     period = bench.state_message.cycle_ms * 1e-3
     slowest, worst = 0.0, 0.0
@@ -140,7 +140,7 @@ def moves_one_motor(bench: Bench) -> Outcome:
     wrong = []
     names = _motors(bench)
     for place, name in enumerate(names):
-        last = _amplitudes(bench, _run(bench, _SETTLED, 0.5, only=name))[-1]
+        last = _bring(bench, 0.5, only=name)
         others = np.delete(last, place)
         if not (abs(last[place] - 0.5) <= LAG and others.max() <= _STILL):
             wrong.append(f"{name} {last[place]:.2f}, others up to {others.max():.2f}")
@@ -151,7 +151,7 @@ def stays_in_range(bench: Bench) -> Outcome:
     """HAPTICS-05."""
     found, passed = [], True
     for code in (201, 230, 254):
-        _run(bench, _SETTLED, 0.5)
+        _bring(bench, 0.5)
         heard = [h for _ in range(_BAD) for h in bench.cycle(_command(bench, 0.5, raw=_codes(bench, code)))]
         amplitudes = _amplitudes(bench, heard)
         low, high = amplitudes.min(), amplitudes.max()
@@ -162,14 +162,14 @@ def stays_in_range(bench: Bench) -> Outcome:
 
 def stops_without_commands(bench: Bench) -> Outcome:
     """HAPTICS-07."""
-    _run(bench, _SETTLED, 1.0)
+    _bring(bench, 1.0)
     last = _amplitudes(bench, bench.idle(2 * _SETTLED))[-1].max()
     return Outcome(bool(last <= _STILL), f"amplitude {last:.3f} after {2 * _SETTLED} ms")
 
 
 def _ignores(bad: Callable[[Bench, int], Frames]) -> Callable[[Bench], Outcome]:
     def test(bench: Bench) -> Outcome:
-        _run(bench, _SETTLED, 0.0)
+        _bring(bench, 0.0)
         heard = [h for number in range(_BAD) for h in bench.cycle(bad(bench, number))]
         most = _amplitudes(bench, heard).max()
         _run(bench, 10, 0.0)
@@ -203,6 +203,17 @@ def _command(
 
 def _run(bench: Bench, cycles: int, level: float, only: str | None = None) -> list[Heard]:
     return [h for _ in range(cycles) for h in bench.cycle(_command(bench, level, only=only))]
+
+
+def _bring(bench: Bench, level: float, only: str | None = None) -> Vector:
+    """Command a level until every motor is there, or should be; the amplitudes then. Shape (motors,)."""
+    wanted = np.array([level if only in (None, motor) else 0.0 for motor in _motors(bench)])
+    amplitude = np.full(len(wanted), np.nan)
+    for _ in range(_SETTLED // bench.state_message.cycle_ms):
+        amplitude = _amplitudes(bench, _run(bench, bench.state_message.cycle_ms, level, only))[-1]
+        if np.abs(amplitude - wanted).max() <= _STILL:
+            break
+    return amplitude
 
 
 def _amplitudes(bench: Bench, heard: list[Heard]) -> Vector:

@@ -16,7 +16,7 @@ Vector = npt.NDArray[np.float64]
 
 GRAVITY: Final = 9.81  # m/s2
 #: Cycles a sensor is looked at.
-_LOOK: Final = 200
+_LOOK: Final = 100
 #: Tolerances at rest.
 NORM: Final = 1e-3  # of a unit quaternion
 SPECIFIC_FORCE: Final = 0.3  # m/s2, of the mean

@@ -1,0 +1,432 @@
+"""Every other kind of node passes, and each way of being broken is named by its own requirement and no other."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from atalante_dbc import Message
+from atalante_emulator.haptics import Haptics
+from atalante_emulator.pendant import Operator
+from atalante_hal.frame import FLAG_FDF, Frames
+from atalante_tools.conform.requirement import Verdict
+
+from .conftest import NO_FRAME, Desk, MakeDesk, crc_holds, not_passed, protect, put, raw
+
+Patch = pytest.MonkeyPatch
+Break = Callable[[MakeDesk, Patch], Desk]
+
+IMU = "IMU_TORSO"
+KINDS = {IMU: 21, "IMU_LEFT_TIBIA": 21, "FOOT_LEFT": 18, "FOOT_RIGHT": 18, "HAPTICS": 22, "PENDANT": 21}
+
+
+@pytest.mark.parametrize("node", KINDS)
+def test_an_emulated_node_passes(node: str, make_desk: MakeDesk):
+    results = make_desk(node).examine()
+    assert not_passed(results) == {}
+    assert len(results) == KINDS[node]
+
+
+# -- what it says ------------------------------------------------------------------------------------------------------
+
+
+def _says(kind: str, change: Callable[[Frames, Message, int], Frames | None], node: str = IMU) -> Break:
+    """Change the frames of a kind the node sends: `change(frame, message, number)`; None: unchanged."""
+
+    def broken(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+        del monkeypatch
+        desk = make_desk(node)
+        message, number = desk.message(kind), -1
+
+        def from_node(frame: Frames) -> Frames:
+            nonlocal number
+            if int(frame["can_id"][0]) != message.frame_id:
+                return frame
+            number += 1
+            changed = change(frame.copy(), message, number)
+            return frame if changed is None else changed
+
+        desk.wire.from_node = from_node
+        return desk
+
+    return broken
+
+
+def _never_booting(frame: Frames, message: Message, _: int) -> Frames:
+    put(frame, message, "NodeState", 5)
+    return protect(frame, message)
+
+
+def _every_other(frame: Frames, message: Message, number: int) -> Frames:
+    if number > 1 and number % 2:
+        return NO_FRAME
+    return protect(frame, message, counter=number if number < 2 else number // 2 + 1)
+
+
+def _one_late_in_life(frame: Frames, message: Message, number: int) -> Frames:
+    """A pause of one answer, 0.7 s after the start; the counter knows nothing of it."""
+    return NO_FRAME if number == 700 else protect(frame, message, counter=number - (number > 700))
+
+
+def _counter_slips(frame: Frames, message: Message, number: int) -> Frames | None:
+    return protect(frame, message, counter=0x55) if number == 300 else None
+
+
+def _other_data_id(frame: Frames, message: Message, number: int) -> Frames | None:
+    return protect(frame, message, data_id=message.data_id ^ 1) if number % 1000 == 999 else None
+
+
+def _no_bit_rate_switch(frame: Frames, _message: Message, _number: int) -> Frames:
+    frame["flags"] = FLAG_FDF
+    return frame
+
+
+def _reserved_bits(frame: Frames, message: Message, _: int) -> Frames:
+    frame["data"][0][5] = 0xAA
+    return protect(frame, message)
+
+
+def other_network(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+    del monkeypatch
+    network = make_desk(IMU).bench.network
+    return make_desk(IMU, their_network=dataclasses.replace(network, hash32=network.hash32 ^ 1))
+
+
+def raises_an_emergency(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+    del monkeypatch
+    desk = make_desk(IMU)
+    message, asked = desk.message("EMCY"), 0
+
+    def once() -> Frames:
+        nonlocal asked
+        asked += 1
+        if asked != 150:
+            return NO_FRAME
+        frame = np.zeros(1, NO_FRAME.dtype)
+        frame["can_id"] = message.frame_id
+        put(frame, message, "ErrorCode", 0x5000)
+        return protect(frame, message)
+
+    desk.wire.from_node = lambda frame: frame
+    desk.wire.out_of_the_blue = once
+    return desk
+
+
+def talks_without_sync(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+    desk = _says("STATE", lambda frame, message, number: protect(frame, message, counter=number))(
+        make_desk, monkeypatch
+    )
+    message, from_node = desk.message("STATE"), desk.wire.from_node
+
+    def unasked() -> Frames:
+        if desk.wire.sync_sent:
+            return NO_FRAME
+        frame = np.zeros(1, NO_FRAME.dtype)
+        frame["can_id"] = message.frame_id
+        put(frame, message, "QuaternionW", 0x7FFF)
+        return from_node(frame)
+
+    desk.wire.out_of_the_blue = unasked
+    return desk
+
+
+# -- what it hears -----------------------------------------------------------------------------------------------------
+
+
+def _hears(kind: str, change: Callable[[Frames, Message, dict], Frames | None], node: str = IMU) -> Break:
+    """A node that takes a message of the HAL for another: `change(frame, message, memory)`; None: unchanged."""
+
+    def broken(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+        del monkeypatch
+        desk = make_desk(node)
+        message = desk.bench.sync.message if kind == "SYNC" else desk.bench.command.message
+        memory: dict = {"other": desk.bench.sync.message.data_id}
+
+        def to_node(frame: Frames) -> Frames:
+            if int(frame["can_id"][0]) != message.frame_id:
+                return frame
+            changed = change(frame.copy(), message, memory)
+            return frame if changed is None else changed
+
+        desk.wire.to_node = to_node
+        return desk
+
+    return broken
+
+
+def _is_good(frame: Frames, message: Message) -> bool:
+    return (int(frame["len"][0]), int(frame["flags"][0]) & FLAG_FDF) == (message.length, FLAG_FDF) and crc_holds(
+        frame, message.data_id
+    )
+
+
+def _no_crc(frame: Frames, message: Message, memory: dict) -> Frames | None:
+    damaged = not crc_holds(frame, message.data_id) and not crc_holds(frame, memory["other"])
+    return protect(frame, message) if damaged else None
+
+
+def _no_repetition(frame: Frames, message: Message, memory: dict) -> Frames | None:
+    if not _is_good(frame, message):
+        return None
+    counter = int(frame["data"][0][2])
+    memory["shift"] = memory.get("shift", 0) + (counter == memory.get("last"))
+    memory["last"] = counter
+    return protect(frame, message, counter=counter + memory["shift"])
+
+
+def _no_length(frame: Frames, message: Message, _: dict) -> Frames | None:
+    return (
+        None if _is_good(frame, message) or (int(frame["len"][0]) == 8 and frame["flags"][0]) else protect(frame, message)
+    )
+
+
+def _no_length_of_a_command(frame: Frames, message: Message, _: dict) -> Frames | None:
+    return protect(frame, message) if int(frame["len"][0]) != message.length else None
+
+
+def _no_data_id(frame: Frames, message: Message, memory: dict) -> Frames | None:
+    return protect(frame, message) if crc_holds(frame, memory["other"]) else None
+
+
+def drowns_in_a_flood(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+    """Its receive queue holds four frames."""
+    del monkeypatch
+    desk = make_desk(IMU)
+    known = {m.frame_id for m in desk.bench.network.messages}
+    strangers = 0
+
+    def to_node(frame: Frames) -> Frames:
+        nonlocal strangers
+        if int(frame["can_id"][0]) not in known:
+            strangers += 1
+            return frame
+        drowned, strangers = strangers > 4, 0
+        return NO_FRAME if drowned else frame
+
+    desk.wire.to_node = to_node
+    return desk
+
+
+# -- what it measures --------------------------------------------------------------------------------------------------
+
+
+def _measures(change: Callable[[Callable[[str], int], int, np.ndarray], None], node: str = IMU) -> Break:
+    """Other values before they are encoded: `change(place of a signal, cycle, values)`."""
+
+    def broken(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+        del monkeypatch
+        desk = make_desk(node)
+        codec, message = desk.emulator.signals, desk.message("STATE").name
+        desk.emulator.before_send.append(
+            lambda cycle, values: change(lambda signal: codec.index(message, signal), cycle, values)
+        )
+        return desk
+
+    return broken
+
+
+def _set(signal: str, value: float, node: str = IMU) -> Break:
+    def change(at: Callable[[str], int], _cycle: int, values: np.ndarray) -> None:
+        values[at(signal)] = value
+
+    return _measures(change, node)
+
+
+def _shrunk_quaternion(at: Callable[[str], int], _: int, values: np.ndarray) -> None:
+    for axis in "WXYZ":
+        values[at(f"Quaternion{axis}")] *= 0.99
+
+
+def _scaled_accel(at: Callable[[str], int], _: int, values: np.ndarray) -> None:
+    for axis in "XYZ":
+        values[at(f"Accel{axis}")] *= 1.05
+
+
+def _swapped_accel(at: Callable[[str], int], _: int, values: np.ndarray) -> None:
+    x, z = at("AccelX"), at("AccelZ")
+    values[[x, z]] = values[[z, x]]
+
+
+def _biased_gyro(at: Callable[[str], int], _: int, values: np.ndarray) -> None:
+    values[at("GyroY")] += 0.1
+
+
+def _tare_lost(at: Callable[[str], int], _: int, values: np.ndarray) -> None:
+    values[at("RL_ForceZ")] += 25.0
+
+
+def _no_temperature_once(at: Callable[[str], int], cycle: int, values: np.ndarray) -> None:
+    if cycle == 1000:
+        values[at("Temperature")] = math.nan
+
+
+# -- haptics and pendant -----------------------------------------------------------------------------------------------
+
+
+def _with_motors(advance: Callable[[Haptics, np.ndarray, int, int], None]) -> Break:
+    def broken(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+        class Broken(Haptics):
+            def advance(self, level: np.ndarray, silence: int, cycles: int) -> None:
+                advance(self, level, silence, cycles)
+
+        monkeypatch.setattr("atalante_emulator.emulator.Haptics", Broken)
+        return make_desk("HAPTICS")
+
+    return broken
+
+
+def _ramp(motors: Haptics, level: np.ndarray, silence: int, cycles: int) -> None:
+    wanted = level if silence < 50 else 0.0 * level
+    motors.amplitude += np.clip(wanted - motors.amplitude, -0.01 * cycles, 0.01 * cycles)
+
+
+def _never_stop(motors: Haptics, level: np.ndarray, _silence: int, cycles: int) -> None:
+    Haptics.advance(motors, level, 0, cycles)
+
+
+def _hum(motors: Haptics, level: np.ndarray, silence: int, cycles: int) -> None:
+    """Turn a little until the first command."""
+    if not hasattr(motors, "commanded"):
+        motors.commanded = False
+    motors.commanded |= level.any()
+    Haptics.advance(motors, level if motors.commanded else level + 0.1, silence if motors.commanded else 0, cycles)
+
+
+def _weak(motors: Haptics, level: np.ndarray, silence: int, cycles: int) -> None:
+    """Nine tenths of full level are all there is; half a level is half a level."""
+    Haptics.advance(motors, np.minimum(level, 0.96), silence, cycles)
+
+
+def _levels(read: Callable[[list[int]], list[int]]) -> Callable[[Frames, Message, dict], Frames | None]:
+    def change(frame: Frames, message: Message, _: dict) -> Frames | None:
+        if not _is_good(frame, message):
+            return None
+        names = [s.name for s in message.signals if s.name.endswith("_Level")]
+        codes = read([raw(frame, message, name) for name in names])
+        for name, code in zip(names, codes, strict=True):
+            put(frame, message, name, code)
+        return protect(frame, message)
+
+    return change
+
+
+def _pendant(operator: Callable[[], Operator]) -> Break:
+    def broken(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+        del monkeypatch
+        return make_desk("PENDANT", operator=operator())
+
+    return broken
+
+
+class Bouncing(Operator):
+    """A START button that bounces."""
+
+    def start(self) -> None:
+        super().start()
+        super().start()
+
+
+class Swapped(Operator):
+    """HOLD wired to STOP."""
+
+    def hold(self) -> None:
+        self.stop()
+
+
+class Unplugged(Operator):
+    """No STOP button."""
+
+    def stop(self) -> None:
+        pass
+
+
+class Ghost(Operator):
+    """Presses by itself, now and then, when nobody touches anything for long."""
+
+    def __init__(self) -> None:
+        super().__init__(starts=False)
+        self._heard = 0
+
+    def hear(self, hal_state: int) -> None:
+        self._heard += 1
+        if self._heard == self.at:
+            self.start()
+
+    #: In the 200 ms after its start-up.
+    at = 300
+
+
+BROKEN: dict[str, tuple[Break, str]] = {
+    "no boot-up": (_says("STATUS", _never_booting), "NODE-01"),
+    "other network": (other_network, "NODE-02"),
+    "half the heartbeat": (_says("STATUS", _every_other), "NODE-03"),
+    "misses a SYNC": (_says("STATE", _one_late_in_life), "NODE-04"),
+    "emergency at rest": (raises_an_emergency, "NODE-05"),
+    "talks without SYNC": (talks_without_sync, "NODE-06"),
+    "no CRC of SYNC": (_hears("SYNC", _no_crc), "NODE-07"),
+    "answers a repeated SYNC": (_hears("SYNC", _no_repetition), "NODE-08"),
+    "answers any length of SYNC": (_hears("SYNC", _no_length), "NODE-09"),
+    "drowns in a flood": (drowns_in_a_flood, "NODE-10"),
+    "counter slips": (_says("STATE", _counter_slips), "NODE-11"),
+    "wrong Data ID now and then": (_says("STATE", _other_data_id), "NODE-12"),
+    "no bit rate switch": (_says("STATUS", _no_bit_rate_switch), "NODE-13"),
+    "an invalid code": (_measures(_no_temperature_once), "NODE-14"),
+    "reserved bits": (_says("STATE", _reserved_bits), "NODE-15"),
+    "quaternion not of unit length": (_measures(_shrunk_quaternion), "IMU-01"),
+    "accelerometer scale": (_measures(_scaled_accel), "IMU-02"),
+    "axes swapped": (_measures(_swapped_accel), "IMU-03"),
+    "gyro bias": (_measures(_biased_gyro), "IMU-04"),
+    "gyro axis stuck": (_set("GyroX", 0.01), "IMU-05"),
+    "IMU not well": (_set("ImuState", 1.0), "IMU-06"),
+    "tare lost": (_measures(_tare_lost, "FOOT_LEFT"), "FOOT-01"),
+    "cell stuck": (_set("FR_ForceX", 0.0, "FOOT_RIGHT"), "FOOT-02"),
+    "foot not well": (_set("FootState", 1.0, "FOOT_LEFT"), "FOOT-03"),
+    "hums": (_with_motors(_hum), "HAPTICS-01"),
+    "ramps": (_with_motors(_ramp), "HAPTICS-02"),
+    "never full": (_with_motors(_weak), "HAPTICS-03"),
+    "two motors swapped": (
+        _hears("COMMAND", _levels(lambda codes: [codes[1], codes[0], *codes[2:]]), "HAPTICS"),
+        "HAPTICS-04",
+    ),
+    "wraps around": (
+        _hears("COMMAND", _levels(lambda codes: [c - 201 if 200 < c < 255 else c for c in codes]), "HAPTICS"),
+        "HAPTICS-05",
+    ),
+    "takes the invalid level for full": (
+        _hears("COMMAND", _levels(lambda codes: [200 if c == 255 else c for c in codes]), "HAPTICS"),
+        "HAPTICS-06",
+    ),
+    "never stops": (_with_motors(_never_stop), "HAPTICS-07"),
+    "no CRC": (_hears("COMMAND", _no_crc, "HAPTICS"), "HAPTICS-08"),
+    "no Data ID": (_hears("COMMAND", _no_data_id, "HAPTICS"), "HAPTICS-09"),
+    "takes repeated levels": (_hears("COMMAND", _no_repetition, "HAPTICS"), "HAPTICS-10"),
+    "takes any length": (_hears("COMMAND", _no_length_of_a_command, "HAPTICS"), "HAPTICS-11"),
+    "presses by itself": (_pendant(Ghost), "PENDANT-01"),
+    "dead-man stuck": (_set("DeadMan", 1.0, "PENDANT"), "PENDANT-02"),
+    "START bounces": (_pendant(lambda: Bouncing(starts=False)), "PENDANT-03"),
+    "no STOP": (_pendant(lambda: Unplugged(starts=False)), "PENDANT-04"),
+    "HOLD is STOP": (_pendant(lambda: Swapped(starts=False)), "PENDANT-05"),
+    "dial dead": (_set("AssistanceSet", 0.0, "PENDANT"), "PENDANT-06"),
+}
+
+#: What every node owes takes long; what breaks something else is examined without.
+_REST = ("NODE-03", "NODE-04", "NODE-07", "NODE-08", "NODE-09", "NODE-10")
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_node_fails_for_its_own_reason(name: str, make_desk: MakeDesk, monkeypatch: Patch):
+    broken, expected = BROKEN[name]
+    desk = broken(make_desk, monkeypatch)
+    without = () if expected.startswith("NODE") else _REST
+    assert not_passed(desk.examine(without)) == {expected: Verdict.FAILED}
+
+
+def test_every_requirement_has_a_node_that_breaks_it(make_desk: MakeDesk):
+    from atalante_tools.conform.examination import requirements_of
+
+    ids = {r.id for node in KINDS for r in requirements_of(make_desk(node).bench)}
+    assert {expected for _, expected in BROKEN.values()} == ids
