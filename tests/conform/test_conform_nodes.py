@@ -180,7 +180,9 @@ def _no_repetition(frame: Frames, message: Message, memory: dict) -> Frames | No
 
 def _no_length(frame: Frames, message: Message, _: dict) -> Frames | None:
     return (
-        None if _is_good(frame, message) or (int(frame["len"][0]) == 8 and frame["flags"][0]) else protect(frame, message)
+        None
+        if _is_good(frame, message) or (int(frame["len"][0]) == 8 and frame["flags"][0])
+        else protect(frame, message)
     )
 
 
