@@ -24,7 +24,10 @@ to hold for a whole walk, and each is computed here, exactly, from the linear fl
 
 By induction over the steps the joint never leaves its guide. The law is sampled every millisecond and the joint is not
 the model: delay, quantisation, friction left over, coupling and the hand-over torque all count as disturbance, so its
-bound has to be set wider than the push one wants to admit.
+bound has to be set wider than the push one wants to admit. Disturbances are those of the separate inertias: torques tau
+on the coupled hip and knee count as J M^-1 tau (`AssistedInertia.ideal`), which on the light empty leg is several times
+tau. And 1 and 2 hold for the linear loop: where the drive saturates away from the re-centred path, the filter steps the
+two extremes and keeps a torque reserve, which is tested under adversarial pushes, not proved.
 """
 
 from __future__ import annotations
