@@ -58,7 +58,7 @@ install_missing() {
 
 run_tests() {
     say "running tests/vcan on $channel, kernel $(uname -r)"
-    "$python" -m pytest tests/vcan -p no:cacheprovider "$@"
+    "$python" -m pytest tests/vcan -vv -p no:cacheprovider -o faulthandler_timeout=300 "$@"
 }
 
 # The newest kernel of this machine that brings the vcan module.
