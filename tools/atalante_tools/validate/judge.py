@@ -10,7 +10,6 @@ from collections.abc import Iterable
 import numpy as np
 import numpy.typing as npt
 
-from atalante_dbc.foreign import Catalogue
 from atalante_tools.validate.buses import Homes
 from atalante_tools.validate.chunk import Chunk
 from atalante_tools.validate.drive_rules import DriveRules
@@ -34,17 +33,18 @@ class Judge:
     """Judges one log against one DBC; after `finish`, `findings` has everything."""
 
     def __init__(
-        self, catalogue: Catalogue, project: Project | None = None, *, node: str | None = None, keeps_flags: bool = True
+        self, plan: Plan, project: Project | None = None, *, node: str | None = None, keeps_flags: bool = True
     ) -> None:
         """Get ready.
 
         Args:
+            plan: of the DBC; several judges may share it.
             project: thresholds, silences and channels.
             node: expect the messages of this node alone; the others may be missing.
             keeps_flags: whether the log has the flags of CAN FD frames.
         """
         self.project = project or Project()
-        self.plan = Plan(catalogue)
+        self.plan = plan
         self.node = node
         self.findings = Findings(self.plan)
         self.homes = Homes(self.plan, self.project.channels)

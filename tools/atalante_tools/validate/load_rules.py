@@ -139,7 +139,8 @@ class LoadRules:
         busy = np.zeros((len(numbers), width))
         np.add.at(busy, places, np.concatenate([np.pad(b, ((0, 0), (0, width - b.shape[1]))) for b in self._busy]))
         window_s = self._window_ns * 1e-9
-        self.begins, self.load = numbers * window_s, busy / window_s
+        self.begins = numbers * window_s
+        self.load = np.divide(busy, window_s)
         for bus, name in enumerate(self.names(channels)):
             expected = self.expected(bus) if bus < len(self._plan.buses) or not self._plan.is_ours else None
             limit = self._limit if expected is None else self._over * expected

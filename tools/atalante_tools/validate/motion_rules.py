@@ -195,6 +195,9 @@ class _Steps:
         self._columns = _Columns(family, self.places)
         fields = [family.codec.fields[p] for p in self.places]
         self._limits = np.array([limit / abs(f.factor) for limit, f in zip(limits.values(), fields, strict=True)])
+        self._first_row = family.rows.start
+        #: Whether the last value was found wrong, by (field, row): then the next one may jump back.
+        self._was_bad = np.zeros((len(self.places), len(family.rows)), np.bool_)
 
     @classmethod
     def of(cls, family: Family, findings: Findings, project: Project) -> _Steps | None:
@@ -209,6 +212,11 @@ class _Steps:
     def judge(self, decoded: Decoded, stream: Stream, steps: Steps) -> None:
         codes, before, _ = self._columns.with_before(decoded, stream)
         moved = np.abs(codes - before)
+        for row, first, behind in stream.bounds(decoded.family):
+            moved[self._was_bad[:, row - self._first_row], first] = 0
+            for at, place in enumerate(self.places):
+                bad = decoded.bad.get(place)
+                self._was_bad[at, row - self._first_row] = bad is not None and bool(bad[behind - 1])
         for at in np.flatnonzero(moved.max(axis=1) > self._limits).tolist():
             self._judge_column(decoded, stream, steps, at, moved[at])
 
