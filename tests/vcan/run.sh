@@ -22,7 +22,8 @@ as_root() {
     elif command -v sudo >/dev/null; then
         sudo "$@"
     else
-        fail "needs root and there is no sudo: type as root: $*"
+        say "this needs root and there is no sudo; type as root: $*"
+        return 1
     fi
 }
 
