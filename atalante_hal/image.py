@@ -177,7 +177,7 @@ class ReceiveImage:
         return bytes((c + 1) & 0xFF for c in self._counter if c is not None) if None not in self._counter else b""
 
 
-class _E2eFields:
+class E2eFields:
     """Where CRC, counter and what the CRC covers lie in the rows of an array of frames: views, made once."""
 
     def __init__(self, frames: Frames, messages: Sequence[Message]) -> None:
@@ -220,7 +220,7 @@ class _Scratch:
         self.words = head.view(np.uint64)
         self.bytes = head.view(np.uint8)
         self.headers = as_words(head)[:, 0]
-        self.e2e = _E2eFields(head, messages)
+        self.e2e = E2eFields(head, messages)
 
 
 class TransmitImage:
@@ -231,7 +231,7 @@ class TransmitImage:
         self.values = np.zeros(self.codec.size)
         self.frames = self.codec.template()
         self._words = self.frames.view(np.uint64)
-        self._e2e = _E2eFields(self.frames, self.codec.messages)
+        self._e2e = E2eFields(self.frames, self.codec.messages)
         rows = len(self.codec.messages)
         # Counters overflow into nothing, as they should.
         self._counters, self._one = np.full(rows, 255, np.uint8), np.ones(rows, np.uint8)

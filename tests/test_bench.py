@@ -1,0 +1,131 @@
+"""`atalante bench`: the shape of what it says, and that a benchmark without work is an error. No figure is judged here."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from atalante_tools import bench
+from atalante_tools.bench import catalogue, wire
+from atalante_tools.bench.catalogue import BENCHMARKS, Benchmark
+from atalante_tools.bench.measure import Effort, Measurement, WorkError, require, timed
+from atalante_tools.cli import cli
+
+KEYS = ["name", "value", "unit", "baseline", "baseline_value", "ratio"]
+#: What issue 2 asks for, by name.
+TARGETS = {
+    "hal_cycle": 1 / 7,
+    "decode_cycle": 8.0,
+    "ring_write": 0.02,
+    "filter_tick": 1 / 20,
+    "emulator_tick": 2.3,
+    "lockstep": 1 / 6,
+}
+
+
+@pytest.fixture(scope="module")
+def lines() -> dict[str, dict[str, Any]]:
+    result = CliRunner().invoke(cli, ["bench", "--quick", "--json"])
+    assert result.exit_code == 0, result.output
+    return {line["name"]: line for line in map(json.loads, result.stdout.splitlines())}
+
+
+def test_one_line_each_in_order(lines: dict[str, dict[str, Any]]) -> None:
+    names = [benchmark.name for benchmark in BENCHMARKS]
+    assert list(lines) == names
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize("benchmark", BENCHMARKS, ids=lambda b: b.name)
+def test_a_line_has_the_keys_scripts_rely_on(benchmark: Benchmark, lines: dict[str, dict[str, Any]]) -> None:
+    line = lines[benchmark.name]
+    assert list(line) == KEYS
+    assert (line["unit"], line["baseline"]) == (benchmark.unit, benchmark.baseline)
+    for key in ("value", "baseline_value", "ratio"):
+        assert math.isfinite(line[key])
+        assert line[key] > 0.0
+    assert line["ratio"] == pytest.approx(line["value"] / line["baseline_value"], rel=1e-12)
+
+
+def test_targets_are_those_of_the_issue() -> None:
+    assert {b.name: b.target for b in BENCHMARKS if b.target is not None} == TARGETS
+
+
+def test_chosen_benchmarks_as_a_table() -> None:
+    result = CliRunner().invoke(cli, ["bench", "--quick", "ring_write", "E2E_CHECK"])
+    assert result.exit_code == 0
+    head, *rows = result.stdout.splitlines()
+    assert head.split()[:6] == ["benchmark", "value", "baseline", "unit", "ratio", "target"]
+    assert [row.split()[0] for row in rows] == ["ring_write", "e2e_check"]
+    assert "0.0200" in rows[0]
+    assert "ring_write (1 of 2)" in result.stderr
+
+
+def test_an_unknown_name_is_a_usage_error_that_lists_the_names() -> None:
+    result = CliRunner().invoke(cli, ["bench", "hal_cykle"])
+    assert result.exit_code == 2
+    assert "hal_cycle" in result.stderr
+    assert "start_up" in result.stderr
+
+
+def test_a_missed_target_is_shown_and_is_no_failure() -> None:
+    benchmark = replace(BENCHMARKS[0], target=0.5)
+    assert "MISSED" in bench.row(benchmark, Measurement(0.6, 1.0))
+    assert "met" in bench.row(benchmark, Measurement(0.5, 1.0))
+
+
+def test_without_a_compiler_nothing_looks_like_a_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wire, "available", lambda: False)
+    result = CliRunner().invoke(cli, ["bench", "--quick", "--json", "decode_cycle"])
+    assert result.exit_code == 0
+    line = json.loads(result.stdout)
+    assert [line[key] for key in KEYS if key != "baseline"] == ["decode_cycle", None, "us", None, None]
+    assert "not measured: install gcc" in result.stderr
+    (decode,) = (b for b in BENCHMARKS if b.name == "decode_cycle")
+    assert "not measured" in bench.row(decode, decode.run(Effort(quick=True)))
+
+
+@pytest.fixture
+def idle(monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(_effort: Effort) -> Measurement:
+        raise WorkError("nothing was done")
+
+    monkeypatch.setattr(catalogue, "BENCHMARKS", (replace(BENCHMARKS[0], run=run),))
+
+
+@pytest.mark.usefixtures("idle")
+def test_a_benchmark_that_did_no_work_fails() -> None:
+    result = CliRunner().invoke(cli, ["bench", "hal_cycle"])
+    assert result.exit_code == 1
+    assert "hal_cycle did not do its work: nothing was done" in result.stderr
+    assert result.stdout == ""
+
+
+def test_blocks_alternate_and_medians_are_taken() -> None:
+    order: list[str] = []
+    figures = {"a": iter([9.0, 1.0, 2.0, 50.0, 3.0, 4.0]), "b": iter([9.0, 10.0, 10.0, 10.0, 99.0, 10.0])}
+
+    def block(name: str) -> float:
+        order.append(name)
+        return next(figures[name])
+
+    measured = Effort(quick=True).interleave(lambda: block("a"), lambda: block("b"))
+    assert "".join(order) == "ab" * 6
+    assert (measured.value, measured.baseline, measured.ratio) == (3.0, 10.0, 0.3)
+
+
+def test_a_timed_block_runs_as_often_as_it_says() -> None:
+    ran: list[int] = []
+    assert timed(lambda: ran.append(1), 7)() >= 0.0
+    assert len(ran) == 7
+
+
+def test_require_names_what_did_not_hold() -> None:
+    require(True, "fine")
+    with pytest.raises(WorkError, match="the robot fell"):
+        require(False, "the robot fell")

@@ -1,0 +1,100 @@
+"""`atalante bench`: how fast the stack is, each figure beside its baseline, measured in the same run.
+
+nodes, generated_c, python_can_hal -> wire, motion, startup -> catalogue -> the table or the JSON lines
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from atalante_tools.names import find
+from atalante_tools.options import json_option
+from atalante_tools.outcome import Failed
+from atalante_tools.terminal import Progress, say, show_json, table
+
+if TYPE_CHECKING:
+    from atalante_tools.bench.catalogue import Benchmark
+    from atalante_tools.bench.measure import Measurement
+
+
+@click.command()
+@click.argument("names", metavar="[NAME]...", nargs=-1)
+@click.option("--quick", is_flag=True, help="A few rounds of each: whether everything works, not how fast it is.")
+@json_option
+def command(names: tuple[str, ...], quick: bool, as_json: bool) -> None:
+    """Measure the stack: value and baseline side by side in short blocks, medians of each. The ratio is the result.
+
+    Absolute figures depend on the machine and on what else runs on it. Every benchmark checks that it did real work; one
+    that did not ends the command with code 1. A missed target does not: it is shown.
+
+    \b
+    Example: atalante bench
+             atalante bench --json hal_cycle decode_cycle
+    """
+    from atalante_tools.bench.catalogue import BENCHMARKS
+    from atalante_tools.bench.measure import Effort, WorkError
+
+    known = [benchmark.name for benchmark in BENCHMARKS]
+    chosen = [BENCHMARKS[find(name, known, "benchmark")] for name in dict.fromkeys(names)] or list(BENCHMARKS)
+    progress = Progress()
+    rows: list[tuple[str, ...]] = [("benchmark", "value", "baseline", "unit", "ratio", "target", "", "baseline is")]
+    for place, benchmark in enumerate(chosen, start=1):
+        where = f"{benchmark.name} ({place} of {len(chosen)})"
+
+        def show(done: int, of: int, where: str = where) -> None:
+            if progress.due():
+                progress.show(f"{where}: round {done} of {of}")
+
+        progress.show(f"{where}: preparing")
+        try:
+            measured = benchmark.run(Effort(quick, show))
+        except WorkError as error:
+            progress.clear()
+            raise Failed(f"{benchmark.name} did not do its work: {error}") from error
+        progress.clear()
+        for remark in measured.remarks:
+            say(f"{benchmark.name}: {remark}")
+        if as_json:
+            show_json(line(benchmark, measured))
+        rows.append(row(benchmark, measured))
+    if not as_json:
+        click.echo(table(rows))
+
+
+def line(benchmark: Benchmark, measured: Measurement) -> dict[str, Any]:
+    """What scripts get; null where nothing was measured."""
+    return {
+        "name": benchmark.name,
+        "value": _in_unit(benchmark, measured.value),
+        "unit": benchmark.unit,
+        "baseline": benchmark.baseline,
+        "baseline_value": _in_unit(benchmark, measured.baseline),
+        "ratio": measured.ratio,
+    }
+
+
+def row(benchmark: Benchmark, measured: Measurement) -> tuple[str, ...]:
+    """What people get."""
+    ratio, target = measured.ratio, benchmark.target
+    if ratio is None:
+        verdict = "not measured"
+    elif target is None:
+        verdict = ""
+    else:
+        verdict = "met" if ratio <= target else "MISSED"
+    figures = [_in_unit(benchmark, seconds) for seconds in (measured.value, measured.baseline)]
+    return (
+        benchmark.name,
+        *("-" if figure is None else f"{figure:.3f}" for figure in figures),
+        benchmark.unit,
+        "-" if ratio is None else f"{ratio:.4f}",
+        "-" if target is None else f"{target:.4f}",
+        verdict,
+        benchmark.baseline,
+    )
+
+
+def _in_unit(benchmark: Benchmark, seconds: float | None) -> float | None:
+    return None if seconds is None else seconds * benchmark.per_second

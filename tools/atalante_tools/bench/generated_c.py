@@ -1,0 +1,154 @@
+"""The C that cantools generates from the DBC, compiled with gcc -O2: what decode and encode are measured against.
+
+`network -> cantools generate_c_source -> driver -> gcc -> ctypes`. The driver goes through all messages of a cycle,
+unpacks each, asks of every signal whether it is in its range and turns it into a double (or the way back): what our codec
+does. It times itself inside C; nothing of Python is in the figure.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_dbc import DBC_FILE, Message
+from atalante_hal.codec import Codec
+from atalante_hal.frame import FRAME_BYTES, Frames
+
+Vector = npt.NDArray[np.float64]
+
+COMPILER = "gcc"
+#: -Bsymbolic: calls inside the library are direct, as in a program of its own.
+OPTIONS = ("-O2", "-fPIC")
+LINK_OPTIONS = ("-shared", "-Wl,-Bsymbolic")
+_HEADER = 8  # bytes of a frame record before the payload
+
+_TIMED = """
+int64_t {name}({parameters}, int64_t repetitions)
+{{
+    struct timespec begin, end;
+    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &begin);
+    for (int64_t i = 0; i < repetitions; i++) {{
+        {body}
+    }}
+    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &end);
+    return (int64_t)(end.tv_sec - begin.tv_sec) * 1000000000 + (end.tv_nsec - begin.tv_nsec);
+}}
+"""
+
+
+def available() -> bool:
+    """Whether there is a compiler."""
+    return shutil.which(COMPILER) is not None
+
+
+class GeneratedC:
+    """Decode and encode of a fixed list of messages in generated C; row i of the frames is messages[i].
+
+    Values are in the order of the codec's.
+
+    Raises:
+        subprocess.CalledProcessError: generator or compiler failed.
+    """
+
+    def __init__(self, codec: Codec) -> None:
+        header, objects = _network()
+        with tempfile.TemporaryDirectory(prefix="atalante-bench-") as folder:
+            driver, network, library = (Path(folder, name) for name in ("driver.c", "net.o", "driver.so"))
+            Path(folder, "net.h").write_bytes(header)
+            network.write_bytes(objects)
+            driver.write_text(_driver(codec))
+            _run([COMPILER, *OPTIONS, *LINK_OPTIONS, "-o", str(library), str(driver), str(network)])
+            loaded = ctypes.CDLL(str(library))
+        self._decode, self._encode = loaded.decode, loaded.encode
+        self._inside = ctypes.c_bool.in_dll(loaded, "all_inside")
+        for function in (self._decode, self._encode):
+            function.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64]
+            function.restype = ctypes.c_int64
+
+    @property
+    def inside(self) -> bool:
+        """Whether the last cycle had every signal in its range."""
+        return self._inside.value
+
+    def decode(self, frames: Frames, out: Vector, repetitions: int) -> float:
+        """Decode all rows `repetitions` times. Returns: seconds a cycle."""
+        return _seconds(self._decode, frames, out, repetitions)
+
+    def encode(self, values: Vector, frames: Frames, repetitions: int) -> float:
+        """Encode all rows `repetitions` times. Returns: seconds a cycle."""
+        return _seconds(self._encode, frames, values, repetitions)
+
+
+@cache
+def _network() -> tuple[bytes, bytes]:
+    """The generated header, and the generated functions compiled: some seconds, so once."""
+    with tempfile.TemporaryDirectory(prefix="atalante-bench-") as folder:
+        generate = [sys.executable, "-m", "cantools", "generate_c_source", "--database-name", "net"]
+        _run([*generate, "-o", folder, str(DBC_FILE)])
+        source, objects = Path(folder, "net.c"), Path(folder, "net.o")
+        _run([COMPILER, *OPTIONS, "-c", "-o", str(objects), str(source)])
+        return Path(folder, "net.h").read_bytes(), objects.read_bytes()
+
+
+def _seconds(function: Any, frames: Frames, values: Vector, repetitions: int) -> float:
+    nanoseconds: int = function(frames.ctypes.data, values.ctypes.data, repetitions)
+    return nanoseconds * 1e-9 / repetitions
+
+
+def _run(command: Sequence[str]) -> None:
+    subprocess.run(command, check=True, capture_output=True, text=True)
+
+
+def _driver(codec: Codec) -> str:
+    lines = ["#define _POSIX_C_SOURCE 199309L", "#include <stdint.h>", "#include <time.h>", '#include "net.h"']
+    lines.append("volatile bool all_inside;")
+    for direction, parameters, one in (
+        ("decode", "const uint8_t *frames, double *values", _decode_one),
+        ("encode", "uint8_t *frames, const double *values", _encode_one),
+    ):
+        lines += [f"static void {direction}_cycle({parameters})", "{", "bool inside = true;"]
+        lines += [one(codec, row, message) for row, message in enumerate(codec.messages)]
+        lines += ["all_inside = inside;", "}"]
+        body = f"{direction}_cycle(frames, values);"
+        lines.append(_TIMED.format(name=direction, parameters=parameters, body=body))
+    return "\n".join(lines)
+
+
+def _decode_one(codec: Codec, row: int, message: Message) -> str:
+    name, body = f"net_{_c_name(message.name)}", ""
+    for signal in message.signals:
+        field = _c_name(signal.name)
+        body += f"  inside &= {name}_{field}_is_in_range(m.{field});\n"
+        body += f"  values[{codec.index(message.name, signal.name)}] = {name}_{field}_decode(m.{field});\n"
+    return f"{{ struct {name}_t m; {name}_unpack(&m, frames + {_payload(row)}, {message.length}u);\n{body}}}"
+
+
+def _encode_one(codec: Codec, row: int, message: Message) -> str:
+    name, body = f"net_{_c_name(message.name)}", ""
+    for signal in message.signals:
+        field = _c_name(signal.name)
+        body += f"  m.{field} = {name}_{field}_encode(values[{codec.index(message.name, signal.name)}]);\n"
+        body += f"  inside &= {name}_{field}_is_in_range(m.{field});\n"
+    return f"{{ struct {name}_t m;\n{body}  {name}_pack(frames + {_payload(row)}, &m, {message.length}u); }}"
+
+
+def _payload(row: int) -> int:
+    return row * FRAME_BYTES + _HEADER
+
+
+def _c_name(name: str) -> str:
+    """CamelCase to snake_case, as cantools does it."""
+    name = re.sub(r"(.)([A-Z][a-z]+)", r"\1_\2", name)
+    name = re.sub(r"(_+)", "_", name)
+    return re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", name).lower()

@@ -1,0 +1,266 @@
+"""The nodes as a recording: frames sealed beforehand, with right counters and checksums, played to a HAL in lock-step.
+
+What the HAL costs is measured without an emulator: a cycle's answer is one copy of bytes. The recording is a swing of the
+gait with a small tracking error, so that the guide filter has to do with the numbers of a walk.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from struct import Struct
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+import atalante_dbc
+from atalante_control.controller import HangController
+from atalante_control.gait import HANG_GAIT, Gait, StepTables, load_gait
+from atalante_control.guide import GuideFilter
+from atalante_control.guide_shapes import CONSTANT
+from atalante_dbc import Message, Network
+from atalante_hal.bus import Stamps
+from atalante_hal.cia402 import DriveState
+from atalante_hal.e2e import COUNTER_BYTE
+from atalante_hal.frame import FRAME_BYTES, Frames, new_frames
+from atalante_hal.hal import Hal
+from atalante_hal.image import TransmitImage
+from atalante_hal.robot import JOINTS, Robot, load_robot
+from atalante_hal.types import Command, State, SupervisorState
+from atalante_tools.bench.measure import require
+
+Vector = npt.NDArray[np.float64]
+
+#: Cycles of the recording: one turn of the alive counters, and how many poses it has.
+TURN = 256
+POSES = 16
+#: Tracking error of the recorded walk [rad], [rad/s]: inside the guide, so that nothing saturates.
+ERROR = 0.01
+ERROR_RATE = 0.05
+ASSISTANCE = 0.5
+_HEADER = 8  # bytes of a frame record before the payload
+_E2E = Struct("<HB")
+
+
+@dataclass(frozen=True)
+class Walk:
+    """What is walked in the recording."""
+
+    network: Network
+    robot: Robot
+    gait: Gait
+    tables: StepTables
+    guide: GuideFilter
+
+
+@cache
+def walk() -> Walk:
+    """The gait of the demo and its guide filter."""
+    network, robot = atalante_dbc.load(), load_robot()
+    gait = load_gait(HANG_GAIT, robot)
+    return Walk(network, robot, gait, gait.tables(), HangController(robot, gait, CONSTANT).guide)
+
+
+def cyclic_messages(network: Network) -> list[Message]:
+    """What the HAL receives in every cycle, in the order of the buses."""
+    return [m for bus in network.buses for m in network.received_by("HAL") if m.bus == bus and m.cycle_ms == 1]
+
+
+def syncs(network: Network) -> list[Message]:
+    """The SYNC of each bus, in the order in which the HAL sends them."""
+    return [m for m in network.sent_by("HAL") if m.name.startswith("SYNC_")]
+
+
+class Recording:
+    """The nodes' answers, cycle by cycle: `play` puts one into memory.
+
+    It is small, so that playing it does not empty the caches: `POSES` payloads, and the checksum of each for each counter.
+
+    Attributes:
+        cyclic: the messages of every cycle, in order.
+        slow: the slower ones, each with its period and phase [cycles].
+        frames: what `play` writes.
+        values: what the cyclic messages say, shape (POSES, signals), order of `Codec(cyclic).signals`.
+    """
+
+    def __init__(self, walk: Walk) -> None:
+        network = walk.network
+        self.cyclic = cyclic_messages(network)
+        image = TransmitImage(self.cyclic)
+        codec, rng = image.codec, np.random.default_rng(0)
+        self.values = np.tile(_walking(walk, image), (POSES, 1))
+        motor = walk.robot.gear * walk.robot.polarity
+        for name, table, error in (("Position", walk.tables.q, ERROR), ("Velocity", walk.tables.qd, ERROR_RATE)):
+            self.values[:, codec.slice(name)] = (table[:POSES] + rng.uniform(-error, error, (POSES, 12))) * motor
+        press = [codec.index("PENDANT_STATE", name) for name in ("Request", "RequestCounter")]
+        self._before = _seal(image, self.values)
+        self.values[:, press] = 1.0  # START, pressed once
+        self._steady = _seal(image, self.values)
+
+        slow = [m for m in network.received_by("HAL") if m.cycle_ms > 1]
+        image = TransmitImage(slow)
+        image.values[image.codec.slice("DbcHash")] = network.hash32
+        image.values[image.codec.slice("NodeState")] = 5  # operational
+        gap = max(m.cycle_ms for m in slow) // len(slow)
+        #: Spread so that all blocks of ten cycles are alike.
+        self.slow = tuple((m, m.cycle_ms, gap * row % m.cycle_ms) for row, m in enumerate(slow))
+        self._slow = _seal(image, image.values[None, :])
+        self._slow_turn = [0] * len(slow)
+        self._due = [
+            [row for row, (_, period, phase) in enumerate(self.slow) if cycle % period == phase]
+            for cycle in range(max(m.cycle_ms for m in slow))
+        ]
+        rows = len(self.cyclic)
+        self.frames = new_frames(rows + len(slow))
+        self._cyclic_memory = self.frames[:rows].view(np.uint8).data
+        self._cyclic_counters, self._cyclic_checksums = _e2e_fields(self.frames[:rows])
+        self._places = [self.frames[rows + i : rows + i + 1].view(np.uint8).data for i in range(len(slow))]
+        self.cycles = 0
+        self.pose = 0  # played last
+
+    def play(self) -> int:
+        """Write the next cycle into `frames`; returns how many there are."""
+        cycle = self.cycles
+        self.cycles = cycle + 1
+        self.pose = cycle % POSES
+        sealed = self._before if cycle < TURN else self._steady
+        self._cyclic_memory[:] = sealed.payloads[self.pose]
+        self._cyclic_counters.fill(cycle % TURN)
+        self._cyclic_checksums[:] = sealed.checksums[cycle % TURN]
+        due = self._due[cycle % len(self._due)]
+        for place, row in zip(self._places, due, strict=False):
+            turn = self._slow_turn[row]
+            self._slow_turn[row] = (turn + 1) % TURN
+            at = row * FRAME_BYTES
+            place[:] = self._slow.payloads[0][at : at + FRAME_BYTES]
+            _E2E.pack_into(place, _HEADER, self._slow.checksums[turn, row], turn)
+        return len(self.cyclic) + len(due)
+
+
+class _Sealed(NamedTuple):
+    payloads: list[bytes]  # of each pose
+    checksums: npt.NDArray[np.uint16]  # shape (TURN, rows), by counter
+
+
+def _seal(image: TransmitImage, values: Vector) -> _Sealed:
+    payloads, checksums = [], []
+    _, of_rows = _e2e_fields(image.frames)
+    for cycle in range(TURN):
+        image.values[:] = values[cycle % len(values)]
+        sealed = image.seal()
+        payloads.append(sealed.tobytes())
+        checksums.append(of_rows.copy())
+    return _Sealed(payloads[: len(values)], np.array(checksums))
+
+
+def _e2e_fields(frames: Frames) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint16]]:
+    """Views of the counters and of the checksums of frames."""
+    octets, halves = (
+        frames.view(np.uint8).reshape(-1, FRAME_BYTES),
+        frames.view(np.uint16).reshape(-1, FRAME_BYTES // 2),
+    )
+    return octets[:, _HEADER + COUNTER_BYTE], halves[:, _HEADER // 2]
+
+
+def _walking(walk: Walk, image: TransmitImage) -> Vector:
+    """Values of the cyclic messages that do not change: everything measured is in its range, everything is well."""
+    codec, rng = image.codec, np.random.default_rng(1)
+    values = np.zeros(codec.size)
+    for name, low, high in (
+        ("Torque", -20.0, 20.0), ("Force", -5.0, 5.0), ("Gyro", -1.0, 1.0), ("Accel", -9.0, 9.0), ("Quaternion", -0.5, 0.5),
+    ):  # fmt: skip
+        places = codec.slice(name)
+        values[places] = rng.uniform(low, high, places.stop - places.start)
+    for place, (_, signal) in enumerate(codec.signals):
+        if signal.name == "Temperature":
+            values[place] = 30.0
+        elif signal.name == "DriveState":
+            values[place] = DriveState.OPERATION_ENABLED
+    for name, value in (("DeadMan", 1.0), ("AssistanceSet", 1.0), ("AssistanceFactor", ASSISTANCE)):
+        values[codec.index("PENDANT_STATE", name)] = value
+    return values
+
+
+class RecordedBus:
+    """The HAL's bus (see `atalante_hal.bus.Bus`) with nothing behind it but the recording: each SYNC plays the next cycle."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.name, self.dropped = "recording", 0
+        self.stamps: Stamps = np.zeros(len(recording.frames), np.int64)
+        self.heard = 0  # frames of the HAL
+        self._recording, self._memory = recording, recording.frames.view(np.uint8).data
+        self._into, self._into_memory = recording.frames, self._memory
+        self._syncs = len(syncs(walk().network))
+        self._synced = False
+
+    def send(self, frames: Frames) -> None:
+        """Count; a batch as long as the SYNCs of a cycle is them."""
+        count = len(frames)
+        self.heard += count
+        if count == self._syncs:
+            self._synced = True
+
+    def receive(self, frames: Frames, timeout: float = 0.0) -> int:
+        """The next cycle, if there was a SYNC since the last."""
+        if not self._synced:
+            return 0
+        self._synced = False
+        if frames is not self._into:
+            self._into, self._into_memory = frames, frames.view(np.uint8).data
+        count = self._recording.play()
+        size = count * FRAME_BYTES
+        self._into_memory[:size] = self._memory[:size]
+        return count
+
+    def close(self) -> None:
+        """Nothing to do."""
+
+
+@dataclass
+class RecordedRig:
+    """A HAL in ACTIVE on recorded nodes."""
+
+    hal: Hal
+    bus: RecordedBus
+    recording: Recording
+
+
+def active_rig() -> RecordedRig:
+    """Build it and bring it to ACTIVE.
+
+    Raises:
+        WorkError: it does not get there.
+    """
+    recording = Recording(walk())
+    bus = RecordedBus(recording)
+    hal = Hal(walk().network, walk().robot, bus)
+    for _ in range(2 * TURN):
+        hal.read()
+        hal.hold()
+    state = hal.state.supervisor
+    require(state is SupervisorState.ACTIVE, f"the HAL on recorded nodes is in {state.name}, not ACTIVE: {hal.reason}")
+    return RecordedRig(hal, bus, recording)
+
+
+class FilterOnly:
+    """A controller that is the guide filter on two joints and nothing else."""
+
+    def __init__(self, walk: Walk) -> None:
+        self._guide, self._cycle = walk.guide, 0
+        self._desired = np.hstack([walk.tables.q, walk.tables.qd])[:POSES, [2, 3, 14, 15]].tolist()
+        self._command = Command(np.zeros(len(JOINTS)), np.full(8, 0.25))
+
+    def update(self, state: State) -> Command:
+        """One cycle."""
+        self.filter(self._command.torque, *state.position[2:4].tolist(), *state.velocity[2:4].tolist())
+        return self._command
+
+    def filter(self, torque: Vector, hip: float, knee: float, hip_rate: float, knee_rate: float) -> None:
+        """Write u_v of the left SH and SK into the torques."""
+        cycle = self._cycle % TURN
+        if not cycle:
+            self._guide.start_step(ASSISTANCE, (0.01, -0.01), (0.05, 0.05))
+        self._cycle += 1
+        q_hip, q_knee, qd_hip, qd_knee = self._desired[cycle % POSES]
+        torque[2:4] = self._guide.tick(cycle, hip - q_hip, hip_rate - qd_hip, knee - q_knee, knee_rate - qd_knee)

@@ -1,0 +1,41 @@
+"""Benchmark of a whole process: how long a newcomer waits for the first cycle."""
+
+from __future__ import annotations
+
+import statistics
+import subprocess
+import sys
+import time
+from typing import Final
+
+from atalante_tools.bench.measure import Effort, Measurement, require
+
+_FIRST_CYCLE: Final = """
+from atalante_tools.options import EMBEDDED, Target
+from atalante_tools.rig import open_hal
+with open_hal(Target(EMBEDDED, "", lockstep=True)) as rig:
+    print(rig.hal.read().cycle)
+"""
+_IMPORT_ALONE: Final = "import pybullet; print(1)"
+
+
+def start_up(effort: Effort) -> Measurement:
+    """From the shell to the first cycle of HAL and emulator in one process, and out again."""
+    ours: list[float] = []
+    theirs: list[float] = []
+    rounds = 1 if effort.quick else 5
+    for done in range(1, rounds + 1):
+        ours.append(_seconds(_FIRST_CYCLE))
+        theirs.append(_seconds(_IMPORT_ALONE))
+        effort.progress(done, rounds)
+    return Measurement(statistics.median(ours), statistics.median(theirs))
+
+
+def _seconds(program: str) -> float:
+    begin = time.perf_counter()
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    seconds = time.perf_counter() - begin
+    require(
+        process.returncode == 0 and process.stdout.split()[-1:] == ["1"], f"the process failed: {process.stderr[-300:]}"
+    )
+    return seconds
