@@ -80,6 +80,7 @@ class WallClock:
         self._deadline += PERIOD
         while (left := self._deadline - time.monotonic()) > 0.0:
             listen(left)
+        listen(0.0)  # after a late wake-up what came before this SYNC is no answer to it
         behind = -left
         self.late = max(self.late, behind)
         if behind > PERIOD:
