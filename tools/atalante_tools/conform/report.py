@@ -29,10 +29,10 @@ def as_object(bench: Bench, result: Result) -> dict[str, Any]:
 
 def heading(bench: Bench, where: str, date: str) -> str:
     """What was examined, against what."""
+    torque = f", at most {bench.limits.torque:g} Nm" if bench.node.kind == "drive" else ""
     return (
         f"ACCEPTANCE PROTOCOL  {bench.node.name} ({bench.node.kind})\n"
-        f"on {where}, {date}\n"
-        f"network {bench.network.hash32:#010x}; a drive may make {bench.limits.torque:g} Nm\n"
+        f"on {where}, {date}; network {bench.network.hash32:#010x}{torque}\n"
     )
 
 
