@@ -259,6 +259,10 @@ def reserved(log: Recording) -> None:
     protect(line, "IMU_TORSO_STATE", line.data[:6] + b"\x81" + line.data[7:])
 
 
+def other_dbc(log: Recording) -> None:
+    set_raw(log.at("LEFT_FH_STATUS"), "LEFT_FH_STATUS", "DbcHash", 0x12345678)
+
+
 def slow_clock(log: Recording) -> None:
     stretch(log, 1.06)
 
@@ -408,6 +412,7 @@ MUTATIONS: dict[str, Callable[[Recording], None]] = {
     "value-table": unnamed_value,
     "reserved-bits": reserved,
     "multiplexer": lambda log: extra_message(log, "7F1", 2),
+    "dbc-hash": other_dbc,
     "cycle-mean": slow_clock,
     "cycle-jitter": jitter,
     "cycle-gap": late_once,
@@ -466,9 +471,19 @@ def test_every_rule_has_a_mutation() -> None:
     assert set(MUTATIONS) == set(RULE_OF)
 
 
-def mutant_of(rule: str, recording: Recording) -> str:
+def speak(log: Recording, hash32: int) -> None:
+    """Let all nodes report the hash of another DBC."""
+    for message in NETWORK.messages:
+        if message.name.endswith("_STATUS"):
+            for line in log.of(message.name):
+                set_raw(line, message.name, "DbcHash", hash32)
+
+
+def mutant_of(rule: str, recording: Recording, plan: Plan) -> str:
     log = recording.copy()
     MUTATIONS[rule](log)
+    if plan.catalogue.hash32 != NETWORK.hash32:
+        speak(log, plan.catalogue.hash32)
     text = text_of(log)
     return text[:-20] if rule == "log-truncated" else text
 
@@ -481,7 +496,9 @@ def test_the_good_log_trips_nothing(
     recording: Recording, network: Plan, extended_network: Plan, tmp_path: Path
 ) -> None:
     for dbc in (network, extended_network):
-        judge, found = validate(text_of(recording), tmp_path / "good.log", dbc)
+        log = recording.copy()
+        speak(log, dbc.catalogue.hash32)
+        judge, found = validate(text_of(log), tmp_path / "good.log", dbc)
         assert found == []
         assert judge.frames == len(recording.lines)
 
@@ -491,7 +508,8 @@ def test_a_mutation_trips_its_rule_alone(
     rule: str, recording: Recording, network: Plan, extended_network: Plan, tmp_path: Path
 ) -> None:
     """In one chunk, and in chunks of 61 cycles: what is carried from chunk to chunk must make no difference."""
-    text, dbc = mutant_of(rule, recording), dbc_of(rule, network, extended_network)
+    dbc = dbc_of(rule, network, extended_network)
+    text = mutant_of(rule, recording, dbc)
     _, found = validate(text, tmp_path / "mutant.log", dbc)
     assert {finding.rule for finding in found} == {rule}, [finding.as_json() for finding in found]
     _, in_pieces = validate(text, tmp_path / "mutant.log", dbc, pieces=1601)

@@ -55,7 +55,7 @@ class Judge:
         self.timing = TimingRules(self.plan, self.findings, self.project)
         self.order = OrderRules(self.plan, self.findings, self.project)
         self.load = LoadRules(self.plan, self.findings, self.project, self.homes)
-        self._values = ValueRules(self.plan, self.findings, self.project)
+        self.values = ValueRules(self.plan, self.findings, self.project)
         self.motion = MotionRules(self.plan, self.findings, self.project)
         self.drives = DriveRules(self.plan, self.findings, self.project)
         self._family_of = {row: family for family in self.plan.families for row in family.rows}
@@ -133,7 +133,7 @@ class Judge:
         decoded: dict[int, Decoded] = {}
         kept = {self._family_of[row].rows.start for row in self.drives.command_rows} | self.drives.drives.keys()
         for family in self.plan.families:
-            of_family = self._values.judge(family, stream)
+            of_family = self.values.judge(family, stream)
             if of_family is not None:
                 self.motion.judge(of_family, stream, steps)
                 if family.rows.start in kept:

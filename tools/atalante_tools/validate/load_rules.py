@@ -136,11 +136,11 @@ class LoadRules:
             return
         width = max(busy.shape[1] for busy in self._busy)
         numbers, places = np.unique(np.concatenate(self._numbers), return_inverse=True)
-        busy = np.zeros((len(numbers), width))
+        busy: npt.NDArray[np.float64] = np.zeros((len(numbers), width))
         np.add.at(busy, places, np.concatenate([np.pad(b, ((0, 0), (0, width - b.shape[1]))) for b in self._busy]))
         window_s = self._window_ns * 1e-9
-        self.begins = numbers * window_s
-        self.load = np.divide(busy, window_s)
+        self.begins = numbers.astype(np.float64) * window_s
+        self.load = np.divide(busy, window_s, out=busy)
         for bus, name in enumerate(self.names(channels)):
             expected = self.expected(bus) if bus < len(self._plan.buses) or not self._plan.is_ours else None
             limit = self._limit if expected is None else self._over * expected

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from atalante_hal.frame import (
     FLAG_BRS,
@@ -45,7 +46,7 @@ FORMATS = {
 #: One frame a line: a file that does not end in a newline breaks off within a frame.
 _LINE_FORMATS = (".asc", ".trc", ".csv")
 _PIECE_BYTES = 1 << 21  # text parsed at once: its arrays stay in the processor's cache
-_CHUNK_FRAMES = 200_000
+_CHUNK_FRAMES = 120_000
 _BLF_HEADER = struct.Struct("<4sLBBBBBBBBQQ")
 _RECORD = struct.Struct("<IBB2x64s")
 
@@ -132,15 +133,14 @@ class Log:
                     got, broken = 0, str(error)
                 self.position = file.tell() if not self._compressed else self.position
                 end = MARGIN + kept + got
-                newlines = np.flatnonzero(text[end - got : end] == ord("\n"))
                 if not got:
                     break
-                if not len(newlines):
+                stop = _behind_last_newline(text, end - got, end)
+                if not stop:
                     kept += got
                     if kept == _PIECE_BYTES:
                         kept, line_too_long = 0, True
                     continue
-                stop = end - got + int(newlines[-1]) + 1
                 parsed = candump.parse(text, MARGIN, stop, self.channels)
                 example = example if unreadable else parsed.first_unreadable
                 unreadable += parsed.unreadable + line_too_long
@@ -335,6 +335,15 @@ def _joined(chunks: list[Chunk]) -> Chunk:
         np.concatenate([c.channels for c in chunks]),
         np.concatenate([c.sent for c in chunks]),
     )
+
+
+def _behind_last_newline(text: npt.NDArray[np.uint8], begin: int, end: int) -> int:
+    """Place behind the last newline of `text[begin:end]`, 0 if there is none; it is nearly always in the last few bytes."""
+    for first in (max(begin, end - 4 * MARGIN), begin):
+        newlines = np.flatnonzero(text[first:end] == ord("\n"))
+        if len(newlines):
+            return first + int(newlines[-1]) + 1
+    return 0
 
 
 def _last_byte(path: Path) -> bytes:

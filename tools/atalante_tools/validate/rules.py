@@ -58,6 +58,8 @@ RULES = (
     Rule("reserved-bits", "Bits that belong to no signal are not what they should be", "SG_ (none)", "bits",
          {"value": 0.0}),
     Rule("multiplexer", "A multiplexer value for which there is no layout", "SG_ M, m", "raw"),
+    Rule("dbc-hash", "A node reports the hash of another DBC than this one", "SG_ DbcHash, CRC-32 of the file", "hash",
+         {"signal": "DbcHash"}),
     # -- time --------------------------------------------------------------------------------------------------------
     Rule("cycle-mean", "The mean cycle time is off", "BA_ GenMsgCycleTime", "ms",
          {"tolerance": 0.05, "min_intervals": 20.0}),

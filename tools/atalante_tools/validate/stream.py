@@ -48,8 +48,10 @@ class Stream:
 
     def span(self, rows: range) -> slice:
         """Frames of neighbouring rows."""
-        first, behind = np.searchsorted(self.rows, [rows.start, rows.stop]).tolist()
-        return slice(first, behind)
+        first, behind = self.present.searchsorted((rows.start, rows.stop)).tolist()
+        if first == behind:
+            return slice(0, 0)
+        return slice(int(self.starts[first]), int(self.stops[behind - 1]))
 
     def of(self, row: int) -> slice:
         """Frames of one row."""
@@ -57,7 +59,7 @@ class Stream:
 
     def bounds(self, family: Family) -> list[tuple[int, int, int]]:
         """(row, first, behind) of each present message of a family, counted within the family's frames."""
-        first, behind = np.searchsorted(self.present, [family.rows.start, family.rows.stop]).tolist()
+        first, behind = self.present.searchsorted((family.rows.start, family.rows.stop)).tolist()
         if first == behind:
             return []
         offset = int(self.starts[first])

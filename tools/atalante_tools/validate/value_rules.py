@@ -23,6 +23,7 @@ from atalante_tools.validate.stream import Stream
 #: Fields of up to this many bits get a table of their named values.
 _TABLE_BITS = 16
 _WORD = 64
+_HASH_BITS = 32
 
 
 @dataclass
@@ -45,8 +46,12 @@ class ValueRules:
 
     def __init__(self, plan: Plan, findings: Findings, project: Project) -> None:
         self._findings = findings
+        self._hash = plan.catalogue.hash32
         pattern = project.number("reserved-bits", "value")
-        self._checks = {family.rows.start: _FamilyChecks(family.codec, pattern) for family in plan.families}
+        self.hash_signal = project.text("dbc-hash", "signal")
+        self._checks = {
+            family.rows.start: _FamilyChecks(family.codec, pattern, self.hash_signal) for family in plan.families
+        }
 
     def judge(self, family: Family, stream: Stream) -> Decoded | None:
         """Decode and judge the frames of a family; None if there are none."""
@@ -60,6 +65,11 @@ class ValueRules:
         self._judge_limits(checks, decoded, stream)
         self._judge_tables(checks, decoded, stream)
         self._judge_reserved(checks, words, decoded, stream)
+        for place in checks.hashes:
+            stranger = decoded.codes[place] != self._hash
+            if bool(stranger.any()):
+                hashes = np.array([f"{code:08X}" for code in decoded.codes[place].tolist()], object)
+                self._report("dbc-hash", decoded, stream, stranger, place, hashes, np.zeros(len(hashes)))
         return decoded
 
     def _report(
@@ -101,6 +111,10 @@ class ValueRules:
                 self._judge_limit(checks, decoded, stream, int(checks.limited[at]))
         for place in checks.special:
             self._judge_special(decoded, stream, place)
+        for place, code in checks.coded.items():
+            outside = decoded.codes[place] == code
+            if bool(outside.any()):
+                self._judge_outside(decoded, stream, place, outside, decoded.codes[place].astype(np.float64))
 
     def _judge_limit(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream, place: int) -> None:
         """A column in which some code is outside: the code for "no value", a named special value, or really wrong."""
@@ -179,7 +193,7 @@ class ValueRules:
 class _FamilyChecks:
     """What can be wrong in the payloads of a family, compiled."""
 
-    def __init__(self, codec: BulkCodec, pattern: float) -> None:
+    def __init__(self, codec: BulkCodec, pattern: float, hash_signal: str) -> None:
         fields = list(enumerate(codec.fields))
         ranged = [(p, f) for p, f in fields if is_limited(f)]
         self.special = [p for p, f in ranged if f.kind == "float" or f.length == _WORD]
@@ -187,7 +201,12 @@ class _FamilyChecks:
         self.limited = np.array(list(self.bounds), np.intp)
         self.low = np.array([low for low, _ in self.bounds.values()], np.int64)
         self.high = np.array([high for _, high in self.bounds.values()], np.int64)
+        #: Codes for "no value" of fields that have no range they could be outside of.
+        self.coded = {
+            p: _as_signed(f, f.invalid_raw) for p, f in fields if f.invalid_raw is not None and (p, f) not in ranged
+        }
         self.tables = {p: _table(f) for p, f in fields if is_enumeration(f)}
+        self.hashes = [p for p, f in fields if is_hash(f, hash_signal)]
         self.pattern = np.uint64(2**64 - 1 if pattern else 0)
         unused = reserved_bits(codec.layout)
         self.reserved = {
@@ -236,6 +255,11 @@ def is_enumeration(named: Field) -> bool:
     if named.minimum is None or named.maximum is None:
         return 0 in named.choices
     return int(named.minimum) in named.choices and int(named.maximum) in named.choices
+
+
+def is_hash(field: Field, signal: str) -> bool:
+    """Whether a node says in this signal which DBC it speaks."""
+    return field.name == signal and field.length == _HASH_BITS and field.kind == "unsigned"
 
 
 def _table(named: Field) -> npt.NDArray[np.bool_] | Sequence[int]:
