@@ -77,6 +77,12 @@ def crc_holds(frame: Frames, data_id: int) -> bool:
     return crc_hqx(data_id.to_bytes(2, "little"), crc_hqx(data[2:], 0xFFFF)) == int.from_bytes(data[:2], "little")
 
 
+def is_good(frame: Frames, message: Message) -> bool:
+    """Whether length, format and CRC are right."""
+    shape = int(frame["len"][0]), int(frame["flags"][0]) & FLAG_FDF
+    return shape == (message.length, FLAG_FDF) and crc_holds(frame, message.data_id)
+
+
 def raw(frame: Frames, message: Message, signal: str) -> int:
     """Code of a signal in a frame."""
     s = message.signal(signal)
@@ -104,6 +110,52 @@ class Desk:
 
     def examine(self, without: Sequence[str] = ()) -> list[Result]:
         return list(examine(self.bench, [r for r in requirements_of(self.bench) if r.id not in without]))
+
+
+#: Takes a frame of the HAL for another: `(frame, message, memory)`; None: as it is. `memory["other"]` is another Data ID.
+Reading = Callable[[Frames, Message, dict], Frames | None]
+
+
+def hear_as(desk: Desk, message: Message, other_data_id: int, change: Reading) -> Desk:
+    """Let the node on the desk read one message of the HAL as another."""
+    memory: dict = {"other": other_data_id}
+
+    def to_node(frame: Frames) -> Frames:
+        if int(frame["can_id"][0]) != message.frame_id:
+            return frame
+        changed = change(frame.copy(), message, memory)
+        return frame if changed is None else changed
+
+    desk.wire.to_node = to_node
+    return desk
+
+
+def no_crc(frame: Frames, message: Message, memory: dict) -> Frames | None:
+    """Take damaged frames for good ones."""
+    if crc_holds(frame, message.data_id) or crc_holds(frame, memory["other"]):
+        return None
+    return protect(frame, message)
+
+
+def no_data_id(frame: Frames, message: Message, memory: dict) -> Frames | None:
+    """Take another message's frames for its own."""
+    return protect(frame, message) if crc_holds(frame, memory["other"]) else None
+
+
+def no_repetition(frame: Frames, message: Message, memory: dict) -> Frames | None:
+    """Take a repeated frame for a new one."""
+    if not is_good(frame, message):
+        return None
+    counter = int(frame["data"][0][2])
+    memory["shift"] = memory.get("shift", 0) + (counter == memory.get("last"))
+    memory["last"] = counter
+    return protect(frame, message, counter=counter + memory["shift"])
+
+
+def no_length(frame: Frames, message: Message, _: dict) -> Frames | None:
+    """Take a frame of another length or format for one of its own."""
+    shape = int(frame["len"][0]), int(frame["flags"][0]) & FLAG_FDF
+    return None if shape == (message.length, FLAG_FDF) else protect(frame, message)
 
 
 def not_passed(results: list[Result]) -> dict[str, Verdict]:

@@ -18,7 +18,22 @@ from atalante_hal.robot import Robot
 from atalante_tools.conform.drive import LEGAL, ROUTES
 from atalante_tools.conform.requirement import Verdict
 
-from .conftest import NO_FRAME, Desk, MakeDesk, crc_holds, not_passed, protect, put, raw
+from .conftest import (
+    NO_FRAME,
+    Desk,
+    MakeDesk,
+    Reading,
+    hear_as,
+    is_good,
+    no_crc,
+    no_data_id,
+    no_length,
+    no_repetition,
+    not_passed,
+    protect,
+    put,
+    raw,
+)
 
 S, C = DriveState, Controlword
 Patch = pytest.MonkeyPatch
@@ -123,38 +138,23 @@ def _replace(robot: Robot, **arrays: np.ndarray) -> Robot:
     return dataclasses.replace(robot, **arrays)
 
 
-def _on_command(
-    change: Callable[[Frames, Message, dict], Frames | None],
-) -> Callable[[MakeDesk, Patch], Desk]:
-    """A drive that reads its command as if it were another: `change(frame, message, memory)`; None: unchanged."""
+def _on_command(change: Reading) -> Callable[[MakeDesk, Patch], Desk]:
+    """A drive that reads its command as if it were another."""
 
     def broken(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
         del monkeypatch
         desk = make_desk(NODE)
-        message = desk.bench.command.message
-        memory: dict = {"other": desk.bench.network.message("COMMAND_RIGHT_LEG").data_id}
-
-        def to_node(frame: Frames) -> Frames:
-            if int(frame["can_id"][0]) != message.frame_id:
-                return frame
-            changed = change(frame.copy(), message, memory)
-            return frame if changed is None else changed
-
-        desk.wire.to_node = to_node
-        return desk
+        other = desk.bench.network.message("COMMAND_RIGHT_LEG").data_id
+        return hear_as(desk, desk.bench.command.message, other, change)
 
     return broken
 
 
-def _is_good(frame: Frames, message: Message) -> bool:
-    return int(frame["len"][0]) == message.length and crc_holds(frame, message.data_id)
-
-
-def _reads(signal: str, read: Callable[[int], int]) -> Callable[[Frames, Message, dict], Frames | None]:
+def _reads(signal: str, read: Callable[[int], int]) -> Reading:
     """Take another code of a signal of the knee."""
 
     def change(frame: Frames, message: Message, _: dict) -> Frames | None:
-        if not _is_good(frame, message):
+        if not is_good(frame, message):
             return None
         code = raw(frame, message, f"SK_{signal}")
         put(frame, message, f"SK_{signal}", read(code))
@@ -170,27 +170,8 @@ def _negated(code: int) -> int:
 # -- E2E ---------------------------------------------------------------------------------------------------------------
 
 
-def _no_crc(frame: Frames, message: Message, memory: dict) -> Frames | None:
-    if crc_holds(frame, message.data_id) or crc_holds(frame, memory["other"]):
-        return None
-    return protect(frame, message)
-
-
-def _no_data_id(frame: Frames, message: Message, memory: dict) -> Frames | None:
-    return protect(frame, message) if crc_holds(frame, memory["other"]) else None
-
-
-def _no_repetition(frame: Frames, message: Message, memory: dict) -> Frames | None:
-    if not _is_good(frame, message):
-        return None
-    counter = int(frame["data"][0][2])
-    memory["shift"] = memory.get("shift", 0) + (counter == memory.get("last"))
-    memory["last"] = counter
-    return protect(frame, message, counter=counter + memory["shift"])
-
-
 def _no_sequence(frame: Frames, message: Message, memory: dict) -> Frames | None:
-    if not _is_good(frame, message):
+    if not is_good(frame, message):
         return None
     counter = int(frame["data"][0][2])
     said = counter + memory.get("shift", 0) & 0xFF
@@ -199,10 +180,6 @@ def _no_sequence(frame: Frames, message: Message, memory: dict) -> Frames | None
         said = memory["said"] + 1 & 0xFF
     memory["said"] = said
     return protect(frame, message, counter=said)
-
-
-def _no_length(frame: Frames, message: Message, _: dict) -> Frames | None:
-    return protect(frame, message) if int(frame["len"][0]) != message.length else None
 
 
 # -- watchdogs and emergencies -----------------------------------------------------------------------------------------
@@ -274,11 +251,11 @@ BROKEN: dict[str, tuple[Callable[[MakeDesk, Patch], Desk], dict[str, Verdict]]] 
     "enables a latched hold": (_with_rule(_enables_a_latched_hold), {"DRIVE-14": F}),
     "does not tell the latch": (_without_emergency(0x8130), {"DRIVE-15": F}),
     "ignores the loss of SYNC": (ignores_the_loss_of_sync, {"DRIVE-16": F}),
-    "checks no CRC": (_on_command(_no_crc), {"DRIVE-17": F}),
-    "checks no Data ID": (_on_command(_no_data_id), {"DRIVE-18": F}),
-    "takes repeated commands": (_on_command(_no_repetition), {"DRIVE-19": F}),
+    "checks no CRC": (_on_command(no_crc), {"DRIVE-17": F}),
+    "checks no Data ID": (_on_command(no_data_id), {"DRIVE-18": F}),
+    "takes repeated commands": (_on_command(no_repetition), {"DRIVE-19": F}),
     "takes commands out of sequence": (_on_command(_no_sequence), {"DRIVE-20": F}),
-    "takes any length": (_on_command(_no_length), {"DRIVE-21": F}),
+    "takes any length": (_on_command(no_length), {"DRIVE-21": F}),
     "does not tell the trip": (_without_emergency(0x4310), {"DRIVE-22": F}),
     "never trips": (never_trips, {"DRIVE-22": F, "DRIVE-23": N}),
     "switches a fault off without reset": (_with_rule(_switches_a_fault_off), {"DRIVE-23": F}),

@@ -15,7 +15,22 @@ from atalante_emulator.pendant import Operator
 from atalante_hal.frame import FLAG_FDF, Frames
 from atalante_tools.conform.requirement import Verdict
 
-from .conftest import NO_FRAME, Desk, MakeDesk, crc_holds, not_passed, protect, put, raw
+from .conftest import (
+    NO_FRAME,
+    Desk,
+    MakeDesk,
+    Reading,
+    hear_as,
+    is_good,
+    no_crc,
+    no_data_id,
+    no_length,
+    no_repetition,
+    not_passed,
+    protect,
+    put,
+    raw,
+)
 
 Patch = pytest.MonkeyPatch
 Break = Callable[[MakeDesk, Patch], Desk]
@@ -137,61 +152,16 @@ def talks_without_sync(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
 # -- what it hears -----------------------------------------------------------------------------------------------------
 
 
-def _hears(kind: str, change: Callable[[Frames, Message, dict], Frames | None], node: str = IMU) -> Break:
-    """A node that takes a message of the HAL for another: `change(frame, message, memory)`; None: unchanged."""
+def _hears(kind: str, change: Reading, node: str = IMU) -> Break:
+    """A node that takes a message of the HAL for another."""
 
     def broken(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
         del monkeypatch
         desk = make_desk(node)
-        message = desk.bench.sync.message if kind == "SYNC" else desk.bench.command.message
-        memory: dict = {"other": desk.bench.sync.message.data_id}
-
-        def to_node(frame: Frames) -> Frames:
-            if int(frame["can_id"][0]) != message.frame_id:
-                return frame
-            changed = change(frame.copy(), message, memory)
-            return frame if changed is None else changed
-
-        desk.wire.to_node = to_node
-        return desk
+        sync = desk.bench.sync.message
+        return hear_as(desk, sync if kind == "SYNC" else desk.bench.command.message, sync.data_id, change)
 
     return broken
-
-
-def _is_good(frame: Frames, message: Message) -> bool:
-    return (int(frame["len"][0]), int(frame["flags"][0]) & FLAG_FDF) == (message.length, FLAG_FDF) and crc_holds(
-        frame, message.data_id
-    )
-
-
-def _no_crc(frame: Frames, message: Message, memory: dict) -> Frames | None:
-    damaged = not crc_holds(frame, message.data_id) and not crc_holds(frame, memory["other"])
-    return protect(frame, message) if damaged else None
-
-
-def _no_repetition(frame: Frames, message: Message, memory: dict) -> Frames | None:
-    if not _is_good(frame, message):
-        return None
-    counter = int(frame["data"][0][2])
-    memory["shift"] = memory.get("shift", 0) + (counter == memory.get("last"))
-    memory["last"] = counter
-    return protect(frame, message, counter=counter + memory["shift"])
-
-
-def _no_length(frame: Frames, message: Message, _: dict) -> Frames | None:
-    return (
-        None
-        if _is_good(frame, message) or (int(frame["len"][0]) == 8 and frame["flags"][0])
-        else protect(frame, message)
-    )
-
-
-def _no_length_of_a_command(frame: Frames, message: Message, _: dict) -> Frames | None:
-    return protect(frame, message) if int(frame["len"][0]) != message.length else None
-
-
-def _no_data_id(frame: Frames, message: Message, memory: dict) -> Frames | None:
-    return protect(frame, message) if crc_holds(frame, memory["other"]) else None
 
 
 def drowns_in_a_flood(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
@@ -303,9 +273,9 @@ def _weak(motors: Haptics, level: np.ndarray, silence: int, cycles: int) -> None
     Haptics.advance(motors, np.minimum(level, 0.96), silence, cycles)
 
 
-def _levels(read: Callable[[list[int]], list[int]]) -> Callable[[Frames, Message, dict], Frames | None]:
+def _levels(read: Callable[[list[int]], list[int]]) -> Reading:
     def change(frame: Frames, message: Message, _: dict) -> Frames | None:
-        if not _is_good(frame, message):
+        if not is_good(frame, message):
             return None
         names = [s.name for s in message.signals if s.name.endswith("_Level")]
         codes = read([raw(frame, message, name) for name in names])
@@ -369,9 +339,9 @@ BROKEN: dict[str, tuple[Break, str]] = {
     "misses a SYNC": (_says("STATE", _one_late_in_life), "NODE-04"),
     "emergency at rest": (raises_an_emergency, "NODE-05"),
     "talks without SYNC": (talks_without_sync, "NODE-06"),
-    "no CRC of SYNC": (_hears("SYNC", _no_crc), "NODE-07"),
-    "answers a repeated SYNC": (_hears("SYNC", _no_repetition), "NODE-08"),
-    "answers any length of SYNC": (_hears("SYNC", _no_length), "NODE-09"),
+    "no CRC of SYNC": (_hears("SYNC", no_crc), "NODE-07"),
+    "answers a repeated SYNC": (_hears("SYNC", no_repetition), "NODE-08"),
+    "answers any length of SYNC": (_hears("SYNC", no_length), "NODE-09"),
     "drowns in a flood": (drowns_in_a_flood, "NODE-10"),
     "counter slips": (_says("STATE", _counter_slips), "NODE-11"),
     "wrong Data ID now and then": (_says("STATE", _other_data_id), "NODE-12"),
@@ -403,10 +373,10 @@ BROKEN: dict[str, tuple[Break, str]] = {
         "HAPTICS-06",
     ),
     "never stops": (_with_motors(_never_stop), "HAPTICS-07"),
-    "no CRC": (_hears("COMMAND", _no_crc, "HAPTICS"), "HAPTICS-08"),
-    "no Data ID": (_hears("COMMAND", _no_data_id, "HAPTICS"), "HAPTICS-09"),
-    "takes repeated levels": (_hears("COMMAND", _no_repetition, "HAPTICS"), "HAPTICS-10"),
-    "takes any length": (_hears("COMMAND", _no_length_of_a_command, "HAPTICS"), "HAPTICS-11"),
+    "no CRC": (_hears("COMMAND", no_crc, "HAPTICS"), "HAPTICS-08"),
+    "no Data ID": (_hears("COMMAND", no_data_id, "HAPTICS"), "HAPTICS-09"),
+    "takes repeated levels": (_hears("COMMAND", no_repetition, "HAPTICS"), "HAPTICS-10"),
+    "takes any length": (_hears("COMMAND", no_length, "HAPTICS"), "HAPTICS-11"),
     "presses by itself": (_pendant(Ghost), "PENDANT-01"),
     "dead-man stuck": (_set("DeadMan", 1.0, "PENDANT"), "PENDANT-02"),
     "START bounces": (_pendant(lambda: Bouncing(starts=False)), "PENDANT-03"),

@@ -8,6 +8,7 @@ Messages the HAL sends are met on their way out, all others on their way in.
 from __future__ import annotations
 
 import difflib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Final
@@ -57,13 +58,23 @@ class FrameFilter:
     Args:
         bus: owned by the caller.
         tap: sees what really was sent and received.
+        step: makes the other end answer, for one that is polled in this process: called before every look at the bus, which
+            then waits for nothing.
         seed: of everything that happens at random.
     """
 
-    def __init__(self, bus: Bus, network: Network, *, tap: FrameTap | None = None, seed: int = 0) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        network: Network,
+        *,
+        tap: FrameTap | None = None,
+        step: Callable[[], object] | None = None,
+        seed: int = 0,
+    ) -> None:
         self.bus, self.tap = bus, tap
         self.faults: list[Fault] = []
-        self._network = network
+        self._network, self._step = network, step
         self._random = np.random.default_rng(seed)
         self._syncs = {m.frame_id for m in network.messages if m.name.startswith("SYNC_")}
         self._cycle = 0
@@ -148,6 +159,9 @@ class FrameFilter:
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
         """As `Bus.receive`."""
+        if self._step is not None:
+            self._step()
+            timeout = 0.0
         count = self.bus.receive(frames, timeout)
         if self.faults or self._late[1]:
             kept = self._through(frames[:count], self._late[1])[: len(frames)]

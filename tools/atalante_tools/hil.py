@@ -41,41 +41,6 @@ class WireTaken(BusError):  # noqa: N818
     """Somebody is on the bus an emulated robot was to be put on."""
 
 
-class SteppedBus:
-    """The HAL's end of a wire whose other end is polled in this process: `step` runs before every look."""
-
-    def __init__(self, bus: Bus, step: Callable[[], object]) -> None:
-        self._bus, self._step = bus, step
-
-    @property
-    def name(self) -> str:
-        """The channel's."""
-        return self._bus.name
-
-    @property
-    def stamps(self) -> Stamps:
-        """Of the bus."""
-        return self._bus.stamps
-
-    @property
-    def dropped(self) -> int:
-        """Of the bus."""
-        return self._bus.dropped
-
-    def send(self, frames: Frames) -> None:
-        """As `Bus.send`."""
-        self._bus.send(frames)
-
-    def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """As `Bus.receive`; there is nobody to wait for."""
-        self._step()
-        return self._bus.receive(frames)
-
-    def close(self) -> None:
-        """Close the bus."""
-        self._bus.close()
-
-
 def open_line(network: Network, target: Target, *, emulated: bool) -> tuple[Bus, Bus | None]:
     """The HAL's bus, and the end for an emulated robot unless a real one is there.
 
@@ -109,12 +74,12 @@ def emulated_robot(network: Network, robot: Robot, theirs: Bus) -> Iterator[Emul
         yield Emulator(network, robot, body, theirs, operator=Operator())
 
 
-def stepped(ours: Bus, emulator: Emulator) -> Bus:
-    """The HAL's end, so that the emulated robot answers whenever the HAL listens."""
+def answering(ours: Bus, emulator: Emulator) -> Callable[[], object] | None:
+    """What makes the emulated robot answer on a wire: to be called whenever the HAL listens. None: the pair does it itself."""
     if isinstance(ours, PairBus):
         ours.step = emulator.poll
-        return ours
-    return SteppedBus(ours, lambda: emulator.poll(_POLL))
+        return None
+    return lambda: emulator.poll(_POLL)
 
 
 class Stepper:

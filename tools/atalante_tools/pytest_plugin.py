@@ -185,12 +185,11 @@ def bus(
 ) -> FrameFilter:
     """The HAL's end of the line, behind its faults; the robot at the other end."""
     from atalante_tools.frame_filter import FrameFilter
-    from atalante_tools.hil import stepped
+    from atalante_tools.hil import answering
 
     ours = _atalante_line[0]
-    if not _is_hil(request):
-        ours = stepped(ours, request.getfixturevalue("emulator"))
-    return FrameFilter(ours, _atalante_network, tap=recorded_run)
+    step = None if _is_hil(request) else answering(ours, request.getfixturevalue("emulator"))
+    return FrameFilter(ours, _atalante_network, tap=recorded_run, step=step)
 
 
 @pytest.fixture

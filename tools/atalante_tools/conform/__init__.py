@@ -54,8 +54,8 @@ def command(
     failed or could not be tested.
 
     \b
-    Examples: atalante conform LEFT_SK
-              atalante conform LEFT_SK -i socketcan -c can0 --torque 1
+    Example: atalante conform LEFT_SK
+             atalante conform LEFT_SK -i socketcan -c can0 --torque 1
     """
     from datetime import datetime
 
