@@ -22,6 +22,8 @@ COMMANDS = {
     "pendant": "Be the operator: start, stop, hold, assistance factor.",
     "status": "Listen to a bus and say what every node says.",
     "doctor": "Is this machine ready, and what to type if not.",
+    "validate": "Judge CAN logs or a live bus by everything the DBC says.",
+    "decode": "The signals of CAN logs as Parquet or MCAP.",
     "conform": "An acceptance test of one node, with this computer in the place of the HAL.",
     "dbc": "Check, print and compare network descriptions, and make C code of one.",
     "bench": "How fast the stack is, with the baseline beside each figure.",

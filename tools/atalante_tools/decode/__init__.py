@@ -1,0 +1,82 @@
+"""`atalante decode`: the signals of CAN logs as Parquet or MCAP, `log -> bulk codec -> columns -> file`, chunk by chunk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from atalante_tools.outcome import FAILED, Failed
+from atalante_tools.terminal import Progress, say
+
+if TYPE_CHECKING:
+    from atalante_tools.decode.signals import Sink
+    from atalante_tools.validate.plan import Plan
+
+_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+
+
+@click.command()
+@click.argument("logs", nargs=-1, required=True, metavar="LOG...", type=click.Path(path_type=Path))
+@click.option(
+    "-o", "--out", required=True, type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
+    help="What to write: .parquet (one row a value) or .mcap (one topic a message, protobuf).",
+)  # fmt: skip
+@click.option("--dbc", type=_FILE, default=None, help="The network; the robot's own unless given.")
+def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
+    """Decode CAN logs (.log of candump, .asc, .blf, .mf4, .trc, .csv) to signals in physical units.
+
+    Nothing is judged: see `atalante validate`. Frames of other identifiers, or too short, are counted and left out.
+
+    \b
+    Example: atalante decode night.log -o night.parquet
+             atalante decode drive.blf --dbc vehicle.dbc -o drive.mcap
+    """
+    from atalante_dbc import DBC_FILE
+    from atalante_dbc.foreign import catalogue
+    from atalante_tools.decode.signals import Decoder
+    from atalante_tools.validate.log import open_log
+    from atalante_tools.validate.plan import Plan
+
+    plan = Plan(catalogue(dbc or DBC_FILE))
+    for refused in plan.refused:
+        say(f"{refused.name} is not decoded: {refused.reason}")
+    sources = [open_log(path) for path in logs]
+    decoder = Decoder(plan)
+    progress = Progress()
+    with _sink(out, plan) as sink:
+        for source in sources:
+            for chunk in source.chunks():
+                for piece in decoder.decode(chunk):
+                    sink.write(piece, source.channels.names)
+                sink.flush()
+                if progress.due():
+                    share = 100.0 * source.position / max(1, source.size)
+                    progress.show(f"{source.path.name}: {share:.0f} %, {decoder.frames} frames, {sink.values} values")
+            progress.clear()
+            for remark in source.remarks:
+                say(remark.sentence)
+    say(f"{out}: {sink.values} values of {decoder.decoded} frames")
+    if decoder.left_out:
+        say(f"left out: {decoder.left_out}")
+    if not decoder.decoded:
+        raise SystemExit(FAILED)
+
+
+def _sink(out: Path, plan: Plan) -> Sink:
+    suffix = out.suffix.lower()
+    try:
+        if suffix == ".parquet":
+            from atalante_tools.decode.parquet import ParquetSink
+
+            return ParquetSink(out, plan)
+        if suffix == ".mcap":
+            from atalante_tools.decode.mcap import McapSink
+
+            return McapSink(out, plan)
+    except ModuleNotFoundError as error:
+        raise Failed(f"a {suffix} file needs {error.name}: type `pip install 'atalante-hal[decode]'`") from error
+    except OSError as error:
+        raise Failed(f"{out} cannot be written: {error.strerror}") from error
+    raise click.UsageError(f"{out} must end in .parquet or .mcap")
