@@ -15,7 +15,7 @@ from atalante_emulator.emulator import EmulatorParameters
 from atalante_hal.cia402 import Controlword, DriveState, next_state
 from atalante_hal.frame import Frames
 from atalante_hal.robot import Robot
-from atalante_tools.conform.drive import LEGAL, ROUTES
+from atalante_tools.conform.axis import LEGAL, ROUTES
 from atalante_tools.conform.requirement import Verdict
 
 from .conftest import (

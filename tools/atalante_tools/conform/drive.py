@@ -1,8 +1,4 @@
-"""What a drive owes its joint: CiA 402, torque within the limit, and the latched hold when its HAL is not heard.
-
-The expectations are written down here from IEC 61800-7-201 and the fault matrix, not taken from `atalante_hal.cia402`, which the
-emulated drive uses too.
-"""
+"""What a drive owes its joint: CiA 402, torque within the limit, and the latched hold when its HAL is not heard."""
 
 from __future__ import annotations
 
@@ -12,7 +8,17 @@ from typing import Final
 
 from atalante_hal.cia402 import Controlword, DriveState
 from atalante_hal.frame import Frames
-from atalante_hal.robot import JOINTS
+from atalante_tools.conform.axis import (
+    FOLLOW,
+    LEGAL,
+    ROUTES,
+    Axis,
+    always,
+    mean_torque,
+    names_of,
+    state_of,
+    torque_of,
+)
 from atalante_tools.conform.bench import Bench, NotTested
 from atalante_tools.conform.frames import Heard
 from atalante_tools.conform.requirement import Outcome, Requirement
@@ -22,36 +28,10 @@ _S, _C = DriveState, Controlword
 CIA402: Final = "IEC 61800-7-201"
 E2E: Final = "AUTOSAR E2E Profile 5"
 
-#: (state, command) -> next state, with the number of the standard's transition; no other command moves.
-LEGAL: Final[dict[tuple[DriveState, Controlword], tuple[int, DriveState]]] = {
-    (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN): (2, _S.READY_TO_SWITCH_ON),
-    (_S.READY_TO_SWITCH_ON, _C.SWITCH_ON): (3, _S.SWITCHED_ON),
-    (_S.SWITCHED_ON, _C.ENABLE_OPERATION): (4, _S.OPERATION_ENABLED),
-    (_S.OPERATION_ENABLED, _C.SWITCH_ON): (5, _S.SWITCHED_ON),  # the command is DISABLE OPERATION here
-    (_S.SWITCHED_ON, _C.SHUTDOWN): (6, _S.READY_TO_SWITCH_ON),
-    (_S.READY_TO_SWITCH_ON, _C.DISABLE_VOLTAGE): (7, _S.SWITCH_ON_DISABLED),
-    (_S.READY_TO_SWITCH_ON, _C.QUICK_STOP): (7, _S.SWITCH_ON_DISABLED),
-    (_S.OPERATION_ENABLED, _C.SHUTDOWN): (8, _S.READY_TO_SWITCH_ON),
-    (_S.OPERATION_ENABLED, _C.DISABLE_VOLTAGE): (9, _S.SWITCH_ON_DISABLED),
-    (_S.SWITCHED_ON, _C.DISABLE_VOLTAGE): (10, _S.SWITCH_ON_DISABLED),
-    (_S.SWITCHED_ON, _C.QUICK_STOP): (10, _S.SWITCH_ON_DISABLED),
-    (_S.OPERATION_ENABLED, _C.QUICK_STOP): (11, _S.QUICK_STOP_ACTIVE),
-    (_S.QUICK_STOP_ACTIVE, _C.DISABLE_VOLTAGE): (12, _S.SWITCH_ON_DISABLED),
-    (_S.QUICK_STOP_ACTIVE, _C.ENABLE_OPERATION): (16, _S.OPERATION_ENABLED),
-}
-#: States a command can bring about, each with the way there from SWITCH ON DISABLED.
-ROUTES: Final[dict[DriveState, tuple[Controlword, ...]]] = {
-    _S.SWITCH_ON_DISABLED: (),
-    _S.READY_TO_SWITCH_ON: (_C.SHUTDOWN,),
-    _S.SWITCHED_ON: (_C.SHUTDOWN, _C.SWITCH_ON),
-    _S.OPERATION_ENABLED: (_C.SHUTDOWN, _C.SWITCH_ON, _C.ENABLE_OPERATION),
-    _S.QUICK_STOP_ACTIVE: (_C.SHUTDOWN, _C.SWITCH_ON, _C.ENABLE_OPERATION, _C.QUICK_STOP),
-}
-
 #: Controlwords outside the range: known ones with the highest bit set, as a sloppy mask would let through, and the last.
 UNKNOWN: Final = (0x82, 0x86, 0x87, 0x8F, 0xFE)
-#: Cycles a drive may take for a transition, and for a quick stop.
-FOLLOW, STOP = 50, 5
+#: Cycles a drive may take for a quick stop.
+STOP: Final = 5
 #: Cycles for which a command that must not move is repeated.
 _STAY: Final = 8
 #: Cycles from a command to the state frame that shows it, at the most, when nothing has to switch.
@@ -236,130 +216,13 @@ def requirements(bench: Bench) -> list[Requirement]:
     ]
 
 
-class Axis:
-    """The joint of a drive under test: commands to it, the other five of its leg switched off."""
-
-    def __init__(self, bench: Bench) -> None:
-        self.bench = bench
-        self.joint = [joint.upper() for joint in JOINTS].index(bench.node.name)
-        self._prefix = bench.node.name.rsplit("_", 1)[1]
-        self._own = bench.network.message(bench.command.message.name)
-        self.other_data_id = next(
-            m.data_id for m in bench.network.sent_by("HAL") if m.length == self._own.length and m is not self._own
-        )
-
-    def signal(self, name: str) -> str:
-        """A signal of the command, this joint's."""
-        return f"{self._prefix}_{name}"
-
-    def word(
-        self,
-        controlword: Controlword,
-        torque: float = 0.0,
-        limit: float | None = None,
-        *,
-        raw: dict[str, int] | None = None,
-        counter: int | None = None,
-        data_id: int | None = None,
-        length: int | None = None,
-        flip: int | None = None,
-    ) -> Frames:
-        """A command. `raw` names this joint's quantities; see `Outgoing.frame` for the defects."""
-        values = {
-            self.signal("Controlword"): float(controlword),
-            self.signal("TargetTorque"): torque,
-            self.signal("MaxTorque"): self.bench.limits.torque if limit is None else limit,
-        }
-        codes = {self.signal(name): code for name, code in (raw or {}).items()}
-        return self.bench.command.frame(values, raw=codes, counter=counter, data_id=data_id, length=length, flip=flip)
-
-    def push(
-        self,
-        *,
-        counter: int | None = None,
-        data_id: int | None = None,
-        length: int | None = None,
-        flip: int | None = None,
-    ) -> Frames:
-        """A defective command that would make all the torque there may be."""
-        push = self.bench.limits.torque
-        return self.word(_C.ENABLE_OPERATION, push, counter=counter, data_id=data_id, length=length, flip=flip)
-
-    def run(
-        self, cycles: int, controlword: Controlword, torque: float = 0.0, limit: float | None = None
-    ) -> list[Heard]:
-        """The same command for some cycles; the states heard."""
-        return [h for _ in range(cycles) for h in self.send(self.word(controlword, torque, limit))]
-
-    def send(self, command: Frames) -> list[Heard]:
-        """One cycle with a command; the states heard."""
-        return self.bench.states(self.bench.cycle(command))
-
-    def follow(self, controlword: Controlword, goal: DriveState, cycles: int = FOLLOW) -> int | None:
-        """Repeat a command until the drive is in `goal`; cycles it took, None if it never was."""
-        for number in range(1, cycles + 1):
-            if any(state_of(h) == goal for h in self.send(self.word(controlword))):
-                return number
-        return None
-
-    def go(self, goal: DriveState) -> None:
-        """Bring the drive to a state, by the way of the standard.
-
-        Raises:
-            NotTested: it does not follow.
-        """
-        if self.follow(_C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED) is None:
-            self.follow(_C.FAULT_RESET, _S.SWITCH_ON_DISABLED)
-        state = _S.SWITCH_ON_DISABLED
-        for controlword in ROUTES[goal]:
-            state = LEGAL[state, controlword][1]
-            if self.follow(controlword, state) is None:
-                raise NotTested(f"the drive cannot be brought to {state.name}")
-
-    def enable(self) -> None:
-        """OPERATION ENABLED with no torque. Raises `NotTested`."""
-        self.go(_S.OPERATION_ENABLED)
-        self.run(4, _C.ENABLE_OPERATION)
-
-
-def state_of(heard: Heard) -> int:
-    """DriveState of a state frame."""
-    return int(heard.values["DriveState"])
-
-
-def name_of(state: int) -> str:
-    """As the standard calls it."""
-    try:
-        return DriveState(state).name
-    except ValueError:
-        return f"{state:#04x}, which is no state"
-
-
-def torque_of(heard: list[Heard]) -> float:
-    """Largest measured torque [Nm], with its sign; 0 without frames."""
-    return max((h.values["Torque"] for h in heard), key=abs, default=0.0)
-
-
-def mean_torque(heard: list[Heard]) -> float:
-    """Mean of the measured torque [Nm]; NaN without frames."""
-    return sum(h.values["Torque"] for h in heard) / len(heard) if heard else math.nan
-
-
-def _names(heard: list[Heard]) -> str:
-    return " -> ".join(dict.fromkeys(name_of(state_of(h)) for h in heard)) or "no state frame"
-
-
-def _always(heard: list[Heard], state: DriveState) -> bool:
-    return bool(heard) and all(state_of(h) == state for h in heard)
-
-
 # -- CiA 402 -----------------------------------------------------------------------------------------------------------
 
 
 def starts_disabled(bench: Bench) -> Outcome:
     """DRIVE-01."""
     heard = bench.states(bench.heard) or bench.states(bench.idle(10))
-    return Outcome(_always(heard, _S.SWITCH_ON_DISABLED), _names(heard))
+    return Outcome(always(heard, _S.SWITCH_ON_DISABLED), names_of(heard))
 
 
 def makes_legal_transitions(bench: Bench) -> Outcome:
@@ -369,8 +232,8 @@ def makes_legal_transitions(bench: Bench) -> Outcome:
         axis.go(state)
         took = axis.follow(controlword, goal)
         stayed = axis.run(_STAY, controlword)
-        if took is None or not _always(stayed, goal):
-            wrong.append(f"{number} ({state.name}, {controlword.name}): {_names(stayed)}")
+        if took is None or not always(stayed, goal):
+            wrong.append(f"{number} ({state.name}, {controlword.name}): {names_of(stayed)}")
         slowest = max(slowest, took or FOLLOW)
     text = f"wrong: {'; '.join(wrong)}" if wrong else f"all, the slowest in {slowest} cycles"
     return Outcome(not wrong, text)
@@ -386,8 +249,8 @@ def refuses_illegal_transitions(bench: Bench) -> Outcome:
                 continue
             tried += 1
             heard = axis.run(_STAY, controlword)
-            if not _always(heard, state):
-                wrong.append(f"({state.name}, {controlword.name}): {_names(heard)}")
+            if not always(heard, state):
+                wrong.append(f"({state.name}, {controlword.name}): {names_of(heard)}")
                 axis.go(state)
     return Outcome(not wrong, f"obeyed: {'; '.join(wrong)}" if wrong else f"all {tried} refused")
 
@@ -410,7 +273,7 @@ def holds_its_position(bench: Bench) -> Outcome:
     heard = axis.run(100, _C.QUICK_STOP)
     positions = [h.values["Position"] / bench.robot.gear[axis.joint] for h in heard]
     gave = max(positions) - min(positions) if positions else math.inf
-    return Outcome(gave <= _GIVE and _always(heard, _S.QUICK_STOP_ACTIVE), f"moved {math.degrees(gave):.2f} degrees")
+    return Outcome(gave <= _GIVE and always(heard, _S.QUICK_STOP_ACTIVE), f"moved {math.degrees(gave):.2f} degrees")
 
 
 # -- torque ------------------------------------------------------------------------------------------------------------
@@ -464,8 +327,8 @@ def takes_the_largest_limit(bench: Bench) -> Outcome:
     most = bench.command.message.signal(axis.signal("MaxTorque")).maximum
     heard = axis.run(12, _C.ENABLE_OPERATION, wanted, most)
     made = mean_torque(heard[2 * _SHOWN :])
-    passed = abs(made - usual) <= _NOISE and _always(heard, _S.OPERATION_ENABLED)
-    return Outcome(passed, f"{made:+.2f} Nm as against {usual:+.2f} Nm, {_names(heard)}")
+    passed = abs(made - usual) <= _NOISE and always(heard, _S.OPERATION_ENABLED)
+    return Outcome(passed, f"{made:+.2f} Nm as against {usual:+.2f} Nm, {names_of(heard)}")
 
 
 # -- commands that are none --------------------------------------------------------------------------------------------
@@ -478,8 +341,8 @@ def ignores_unknown_controlwords(bench: Bench) -> Outcome:
         axis.go(state)
         for code in UNKNOWN:
             heard = [*axis.send(axis.word(stay, raw={"Controlword": code})), *axis.run(2 * _SHOWN, stay)]
-            if not _always(heard, state):
-                wrong.append(f"{code} in {state.name}: {_names(heard)}")
+            if not always(heard, state):
+                wrong.append(f"{code} in {state.name}: {names_of(heard)}")
     return Outcome(not wrong, f"acted on {'; '.join(wrong)}" if wrong else "all refused")
 
 
@@ -498,8 +361,8 @@ def ignores_invalid_codes(bench: Bench) -> Outcome:
             heard += axis.send(axis.word(_C.ENABLE_OPERATION, wanted, limit, raw={quantity: code}))
         heard += axis.run(2 * _SHOWN, _C.ENABLE_OPERATION, 0.0, limit)
         most = torque_of(heard)
-        passed &= abs(most) <= _NOISE and _always(heard, _S.OPERATION_ENABLED)
-        found.append(f"{quantity}: {most:+.2f} Nm, {_names(heard)}")
+        passed &= abs(most) <= _NOISE and always(heard, _S.OPERATION_ENABLED)
+        found.append(f"{quantity}: {most:+.2f} Nm, {names_of(heard)}")
     return Outcome(passed, "; ".join(found))
 
 
@@ -512,11 +375,11 @@ def _ignores(bad: Callable[[Axis, int], Frames]) -> Callable[[Bench], Outcome]:
         heard = [h for number in range(2) for h in axis.send(bad(axis, number))]
         heard += axis.run(2 * _SHOWN, _C.ENABLE_OPERATION)
         most = torque_of(heard)
-        if abs(most) > _NOISE or not _always(heard, _S.OPERATION_ENABLED):
-            return Outcome(False, f"acted on: {most:+.2f} Nm, {_names(heard)}")
+        if abs(most) > _NOISE or not always(heard, _S.OPERATION_ENABLED):
+            return Outcome(False, f"acted on: {most:+.2f} Nm, {names_of(heard)}")
         axis.run(4, _C.ENABLE_OPERATION)
         heard = [h for number in range(2 * LATCHED) for h in axis.send(bad(axis, number))]
-        fed = _always(heard, _S.OPERATION_ENABLED)
+        fed = always(heard, _S.OPERATION_ENABLED)
         return Outcome(not fed, f"{most:+.2f} Nm; {'fed the watchdog' if fed else 'latched without a good one'}")
 
     return test
@@ -529,7 +392,7 @@ def ignores_a_jump(bench: Bench) -> Outcome:
     heard = axis.send(axis.push(counter=(bench.command.counter + 100) & 0xFF))
     heard += axis.run(2 * _SHOWN, _C.ENABLE_OPERATION)
     most = torque_of(heard)
-    return Outcome(abs(most) <= _NOISE and _always(heard, _S.OPERATION_ENABLED), f"{most:+.2f} Nm, {_names(heard)}")
+    return Outcome(abs(most) <= _NOISE and always(heard, _S.OPERATION_ENABLED), f"{most:+.2f} Nm, {names_of(heard)}")
 
 
 # -- when the HAL is not heard -----------------------------------------------------------------------------------------
@@ -543,8 +406,8 @@ def rides_through(bench: Bench) -> Outcome:
     heard = bench.states([h for _ in range(RIDDEN) for h in bench.cycle()])
     heard += axis.run(2 * _SHOWN, _C.ENABLE_OPERATION, wanted)
     least = min((h.values["Torque"] for h in heard), default=math.nan)
-    passed = _always(heard, _S.OPERATION_ENABLED) and least >= before - _NOISE
-    return Outcome(passed, f"at least {least:+.2f} of {before:+.2f} Nm, {_names(heard)}")
+    passed = always(heard, _S.OPERATION_ENABLED) and least >= before - _NOISE
+    return Outcome(passed, f"at least {least:+.2f} of {before:+.2f} Nm, {names_of(heard)}")
 
 
 def latches(bench: Bench) -> Outcome:
@@ -554,7 +417,7 @@ def latches(bench: Bench) -> Outcome:
     heard = bench.states([h for _ in range(LATCHED) for h in bench.cycle()])
     heard += axis.run(2 * _SHOWN, _C.ENABLE_OPERATION)
     stopped = any(state_of(h) == _S.QUICK_STOP_ACTIVE for h in heard)
-    return Outcome(stopped, _names(heard))
+    return Outcome(stopped, names_of(heard))
 
 
 def releases_only_when_acknowledged(bench: Bench) -> Outcome:
@@ -563,8 +426,8 @@ def releases_only_when_acknowledged(bench: Bench) -> Outcome:
     _latch(axis)
     for controlword in (_C.ENABLE_OPERATION, _C.SHUTDOWN, _C.SWITCH_ON, _C.FAULT_RESET, _C.ENABLE_OPERATION):
         heard = axis.run(_STAY, controlword)
-        if not _always(heard, _S.QUICK_STOP_ACTIVE):
-            return Outcome(False, f"{controlword.name} alone: {_names(heard)}")
+        if not always(heard, _S.QUICK_STOP_ACTIVE):
+            return Outcome(False, f"{controlword.name} alone: {names_of(heard)}")
     axis.run(FOLLOW, _C.QUICK_STOP)
     took = axis.follow(_C.ENABLE_OPERATION, _S.OPERATION_ENABLED)
     text = "stays after QUICK_STOP and ENABLE_OPERATION" if took is None else f"enabled {took} cycles after both"
@@ -592,8 +455,8 @@ def latches_without_sync(bench: Bench) -> Outcome:
         bench.silent_cycle()
     long = axis.run(2 * _SHOWN, _C.ENABLE_OPERATION)
     # Whether it stays in the hold is DRIVE-14.
-    passed = _always(short, _S.OPERATION_ENABLED) and any(state_of(h) == _S.QUICK_STOP_ACTIVE for h in long)
-    return Outcome(passed, f"after 3 ms {_names(short)}, after 20 ms {_names(long)}")
+    passed = always(short, _S.OPERATION_ENABLED) and any(state_of(h) == _S.QUICK_STOP_ACTIVE for h in long)
+    return Outcome(passed, f"after 3 ms {names_of(short)}, after 20 ms {names_of(long)}")
 
 
 def _latch(axis: Axis) -> None:
@@ -632,14 +495,14 @@ def leaves_fault_when_reset(bench: Bench) -> Outcome:
     """DRIVE-23."""
     axis = Axis(bench)
     heard = axis.run(_SHOWN, _C.ENABLE_OPERATION)
-    if not _always(heard[-1:], _S.FAULT):
+    if not always(heard[-1:], _S.FAULT):
         raise NotTested("the drive is not in FAULT; see DRIVE-22")
     bench.technician.please(Action.COOL, bench.node.name)
     for controlword in Controlword:
         if controlword is not _C.FAULT_RESET:
             heard = axis.run(_STAY, controlword)
-            if not _always(heard, _S.FAULT):
-                return Outcome(False, f"{controlword.name}: {_names(heard)}")
+            if not always(heard, _S.FAULT):
+                return Outcome(False, f"{controlword.name}: {names_of(heard)}")
 
     def is_reset(heard: list[Heard]) -> bool:
         return any(state_of(h) == _S.SWITCH_ON_DISABLED for h in bench.states(heard))

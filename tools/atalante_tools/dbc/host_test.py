@@ -15,6 +15,7 @@ from cantools.database.can.c_source import camel_to_snake_case
 
 from atalante_dbc import Message, Signal
 from atalante_hal.e2e import check_counter
+from atalante_tools.dbc.e2e_c import invalid_name
 from atalante_tools.dbc.vectors import MAGIC, Vectors, behind_header
 from atalante_tools.outcome import Failed
 
@@ -290,8 +291,6 @@ def _receive(build: Build, message: Message, received: tuple[Signal, ...], other
 
 
 def _send(build: Build, message: Message) -> str:
-    from atalante_tools.dbc.c_code import invalid_name
-
     prefix = build.c_name(message)
     lines = []
     for signal in behind_header(message):
