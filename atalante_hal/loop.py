@@ -102,6 +102,9 @@ def run(
     late_in_row = 0
     active = False
     controller_record, telemetry = hal.controller_record, controller.telemetry
+    # What lives now lives as long as the run: the collector need not look at it again and again.
+    gc.collect()
+    gc.freeze()
     start = time.perf_counter()
     try:
         while True:
@@ -133,6 +136,7 @@ def run(
     finally:
         statistics.cycles = len(costs)
         statistics.wall = time.perf_counter() - start
+        gc.unfreeze()
         hal.stop()
     return statistics
 
@@ -150,14 +154,12 @@ def _judge_lateness(hal: Hal, statistics: Statistics, late: float, in_row: int) 
 
 
 def realtime(priority: int = 50) -> list[str]:
-    """Ask for a quiet process: SCHED_FIFO, locked memory, no garbage collection of what exists now.
+    """Ask for a quiet process: SCHED_FIFO and locked memory.
 
     Returns:
         One sentence for each wish the system refused, with what to type.
     """
     refused = []
-    gc.collect()
-    gc.freeze()
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except PermissionError:

@@ -68,6 +68,7 @@ class Gravity:
         )
         self._q = pinocchio.neutral(self._model)
         self._down = np.zeros(3)
+        self._attitude: Sequence[float] = ()
 
     def torque(self, position: Vector, pelvis: Sequence[float]) -> Vector:
         """Torques that hold the exoskeleton still.
@@ -79,12 +80,14 @@ class Gravity:
         Returns:
             Shape (12,) [Nm], overwritten by the next call.
         """
-        w, x, y, z = pelvis
-        down = self._down
-        down[0] = -_GRAVITY * 2.0 * (x * z - w * y)
-        down[1] = -_GRAVITY * 2.0 * (y * z + w * x)
-        down[2] = -_GRAVITY * (1.0 - 2.0 * (x * x + y * y))
-        self._model.gravity.linear = down
+        if pelvis != self._attitude:  # handing it to Pinocchio costs as much as the torques
+            self._attitude = pelvis
+            w, x, y, z = pelvis
+            down = self._down
+            down[0] = -_GRAVITY * 2.0 * (x * z - w * y)
+            down[1] = -_GRAVITY * 2.0 * (y * z + w * x)
+            down[2] = -_GRAVITY * (1.0 - 2.0 * (x * x + y * y))
+            self._model.gravity.linear = down
         if self._ordered:
             return pinocchio.computeGeneralizedGravity(self._model, self._data, position)  # type: ignore[no-any-return]
         self._q[self._into] = position
