@@ -259,8 +259,8 @@ def _identifiers(lines: _Lines, frames: npt.NDArray[np.void]) -> npt.NDArray[np.
         upper = codes[:, 0] << 28 | codes[:, 1] << 24 | codes[:, 2] << 20 | codes[:, 3] << 16 | codes[:, 4] << 12
         whole = upper | number
         errors = (whole & np.uint32(ID_ERROR)) != 0
-        regular &= ~lines.extended | ((codes < 16).all(axis=1) & (errors | (whole <= _ALL_BITS)))
-        wide = np.where(errors, whole & np.uint32(_ALL_BITS | ID_ERROR), whole | np.uint32(ID_EXTENDED))
+        regular &= ~lines.extended | ((codes < 16).all(axis=1) & (whole <= _ALL_BITS | ID_ERROR))
+        wide = np.where(errors, whole, whole | np.uint32(ID_EXTENDED))
         number = np.where(lines.extended, wide, number)
     regular &= lines.extended | (number <= _STANDARD)
     frames["can_id"] = number
@@ -318,9 +318,9 @@ def _read_line(line: bytes, chunk: Chunk, place: int, channels: Channels) -> boo
     if len(data) > 64 or (len(match[4]) == 3 and number > _STANDARD):
         return False
     if len(match[4]) == 8:
-        number = number & (_ALL_BITS | ID_ERROR) if number & ID_ERROR else number | ID_EXTENDED
-        if number & ID_REMOTE:
+        if number > _ALL_BITS | ID_ERROR:
             return False
+        number |= 0 if number & ID_ERROR else ID_EXTENDED
     frame = np.zeros(1, chunk.frames.dtype)
     frame["can_id"] = number | (ID_REMOTE if match[8] else 0)
     frame["len"] = int(match[9] or 0) if match[8] else len(data)

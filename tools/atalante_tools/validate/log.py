@@ -7,6 +7,7 @@ and everything that can be read is delivered.
 from __future__ import annotations
 
 import gzip
+import io
 import logging
 import os
 import struct
@@ -14,7 +15,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -127,14 +128,11 @@ class Log:
         broken = ""
         with self._open() as file:
             while True:
-                try:
-                    got = file.readinto(memory[MARGIN + kept : MARGIN + _PIECE_BYTES])  # type: ignore[attr-defined]
-                except (OSError, EOFError, zlib.error) as error:
-                    got, broken = 0, str(error)
+                got, broken = _fill(file, memory[MARGIN + kept : MARGIN + _PIECE_BYTES])
                 self.position = file.tell() if not self._compressed else self.position
                 end = MARGIN + kept + got
                 if not got:
-                    break
+                    break  # at the end, or nothing more can be read: `broken` says so again
                 stop = _behind_last_newline(text, end - got, end)
                 if not stop:
                     kept += got
@@ -180,8 +178,8 @@ class Log:
     def _compressed(self) -> bool:
         return self.path.suffix.lower() == ".gz"
 
-    def _open(self) -> IO[bytes]:
-        return gzip.open(self.path, "rb") if self._compressed else self.path.open("rb", buffering=0)  # type: ignore[return-value]
+    def _open(self) -> io.RawIOBase | gzip.GzipFile:
+        return gzip.GzipFile(self.path) if self._compressed else io.FileIO(self.path)
 
     # -- python-can --------------------------------------------------------------------------------------------------
 
@@ -335,6 +333,22 @@ def _joined(chunks: list[Chunk]) -> Chunk:
         np.concatenate([c.channels for c in chunks]),
         np.concatenate([c.sent for c in chunks]),
     )
+
+
+def _fill(file: io.RawIOBase | gzip.GzipFile, memory: memoryview) -> tuple[int, str]:
+    """Read until the memory is full or the file ends; returns the bytes read and, if none could be read any more, why."""
+    if not isinstance(file, gzip.GzipFile):
+        return file.readinto(memory) or 0, ""
+    total = 0
+    while total < len(memory):
+        try:
+            got = file.readinto1(memory[total:])
+        except (OSError, EOFError, zlib.error) as error:
+            return total, "" if total else str(error)
+        if not got:
+            break
+        total += got
+    return total, ""
 
 
 def _behind_last_newline(text: npt.NDArray[np.uint8], begin: int, end: int) -> int:
