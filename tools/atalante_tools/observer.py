@@ -15,6 +15,8 @@ from atalante_hal.supervisor import Condition
 #: Signals that hold a node's own state, in the order in which they tell more.
 _STATES: Final = ("HalState", "DriveState", "ImuState", "FootState", "NodeState")
 MS: Final = 1000.0
+#: A node older than this does not speak any more, however slow the cycle is [ms].
+GONE: Final = 500
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,7 @@ class Observer:
             assistance_factor=self._value("HAL_STATUS", "AssistanceFactor"),
             overruns=None if overruns is None else int(overruns),
             conditions=tuple(str(c.name) for c in Condition(int(conditions or 0))),
-            dead_man=None if dead_man is None or self._late(pendant) else bool(dead_man),
+            dead_man=None if dead_man is None or self._age(pendant) > GONE else bool(dead_man),
             nodes=tuple(self._node(node) for node in self._network.nodes),
             joints=tuple(self._joint(index) for index in range(len(JOINTS))),
             load={bus: (self._busy[bus] / seconds, self._worst[bus]) for bus in self._network.buses},

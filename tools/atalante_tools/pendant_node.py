@@ -15,6 +15,7 @@ from atalante_dbc import Network
 from atalante_hal.bus import Bus, BusFull
 from atalante_hal.e2e import COUNTER_BYTE, Check
 from atalante_hal.frame import Frames, new_frames
+from atalante_hal.hal import PERIOD
 from atalante_hal.image import ReceiveImage, TransmitImage
 from atalante_hal.types import SupervisorState
 
@@ -152,10 +153,10 @@ class PendantNode:
             self.refused = True
             return
         self._send(self._tx.seal())
-        self.spoken += 1
         if self.spoken % self._status_cycles == 0:
-            self._status.values[self._uptime_at] = self.spoken // 1000
+            self._status.values[self._uptime_at] = self.spoken * PERIOD
             self._send(self._status.seal())
+        self.spoken += 1
 
     def _send(self, frames: Frames) -> None:
         with suppress(BusFull):  # the HAL notices what it does not hear

@@ -133,10 +133,12 @@ def render(report: Report, target: Target) -> str:
 
 
 def _headline(report: Report, target: Target) -> str:
+    from atalante_tools.observer import GONE
+
     if report.supervisor is None:
         return f"{target}: no HAL (no SYNC was heard)"
     hal = next(n for n in report.nodes if n.kind == "master")
-    if hal.late:
+    if hal.age_ms is not None and hal.age_ms > GONE:
         return (
             f"{target}: the HAL has been silent for {hal.age_ms} ms; it was {report.supervisor} in cycle {report.cycle}"
         )
