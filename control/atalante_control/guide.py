@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from struct import Struct
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +32,8 @@ Vector = npt.NDArray[np.float64]
 _ROWS = 8
 #: Columns of its left factor: Phi11 and Phi12 of SH, of SK, and what the disturbance adds to each rollout.
 _TERMS = 8
+#: Phi terms of all rows.
+_STATE_TERMS = Struct(f"{4 * _ROWS}d").pack_into
 
 
 @dataclass(frozen=True)
@@ -139,12 +142,16 @@ class GuideFilter:
         self._limits = [(1.0 - config.reserve) * policy.torque_limit for policy in config.policies]
         self._rows_scale[4:] = np.repeat(1.0 / np.array(self._limits), 2)[:, None]
         self._out = np.empty(_ROWS * lags)
+        self._out_cells = memoryview(self._out.data).cast("B").cast("d")  # an element of it, for half the price
         self._views = [self._view(cycle) for cycle in range(self.horizon + 1)]
         # Kp e + Kd e' along a rollout, in terms of Phi11 and Phi12: e' of the state y is e of the state A y.
         self._torque_of = [
             (p.kp, p.kd, p.kp - p.kd * p.kd / p.inertia, -p.kd * p.kp / p.inertia) for p in config.policies
         ]
-        self._z = np.zeros((_ROWS, _TERMS))
+        self._backup = [(p.kp, p.kd, p.torque_limit) for p in config.policies]
+        # Left factor of the product, by terms: the first four are written every cycle, in one go.
+        terms = np.zeros((_TERMS, _ROWS))
+        self._z, self._state_terms = terms.T, memoryview(terms.data).cast("B")
         self._z[range(4), range(4, 8)] = 1.0
         for joint, policy in enumerate(config.policies):
             self._z[4 + 2 * joint, 4 + 2 * joint] = self._z[5 + 2 * joint, 5 + 2 * joint] = policy.kp
@@ -152,7 +159,6 @@ class GuideFilter:
             (policy.kd * high / policy.inertia, -policy.kd * low / policy.inertia)
             for policy, (low, high) in zip(config.policies, config.disturbance, strict=True)
         ]
-        self._cells = memoryview(self._z.data).cast("B").cast("d")
         self._monotone = all(p.monotone for p in config.policies)
         drifts = [free_drift(p, deadbeat, q, after, self.time, uf) for p, q, after, uf in parts]
         self._limited = LimitedRollouts(
@@ -221,54 +227,60 @@ class GuideFilter:
         return self._p.copy()
 
     def _act(self, joint: int, e: float, ed: float, fresh: bool) -> float:
-        policy, bounds, config = self.config.policies[joint], self.bounds, self.config
-        ratio = max(self._ratio[joint], e / bounds[0], -e / bounds[1])
-        h = 1.0 - ratio * ratio
-        rate = 0.0
+        upper, lower = self.bounds
+        ratio, now = self._ratio[joint], e / upper if e > 0.0 else -e / lower
+        if now > ratio:
+            ratio = now
+        h, rate = 1.0 - ratio * ratio, 0.0
         if not fresh:
             rate = self._dh[joint]
             rate += self._smoothing * ((h - self.h[joint]) / PERIOD - rate)
         self._dh[joint], self.h[joint] = rate, h
-        self.gates[joint] = weight = damped_gate(gate(h, self._xi), rate, config.zeta)
-        u, limit = -policy.kp * e - policy.kd * ed, policy.torque_limit
+        self.gates[joint] = weight = damped_gate(gate(h, self._xi), rate, self.config.zeta)
+        kp, kd, limit = self._backup[joint]
+        u = -kp * e - kd * ed
         return weight * (limit if u > limit else -limit if u < -limit else u)
 
     def _load(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> None:
         """x - P(t) into the product's left factor: both joints, both signs, error rows and torque rows."""
         p0, p1, p2, p3 = self._p[cycle].tolist()
-        cells, (hip, knee), (hip_push, knee_push) = self._cells, self._torque_of, self._push
-        y, yd = e_hip - p0, ed_hip - p1
-        cells[0], cells[1], cells[8], cells[9] = y, yd, -y, -yd
-        t, td = hip[0] * y + hip[1] * yd, hip[2] * yd + hip[3] * y
-        cells[32], cells[33], cells[40], cells[41] = t, td + hip_push[0], -t, hip_push[1] - td
-        y, yd = e_knee - p2, ed_knee - p3
-        cells[18], cells[19], cells[26], cells[27] = y, yd, -y, -yd
-        t, td = knee[0] * y + knee[1] * yd, knee[2] * yd + knee[3] * y
-        cells[50], cells[51], cells[58], cells[59] = t, td + knee_push[0], -t, knee_push[1] - td
+        (h0, h1, h2, h3), (k0, k1, k2, k3) = self._torque_of
+        (hip_up, hip_down), (knee_up, knee_down) = self._push
+        e, ed, f, fd = e_hip - p0, ed_hip - p1, e_knee - p2, ed_knee - p3
+        t, td, u, ud = h0 * e + h1 * ed, h2 * ed + h3 * e, k0 * f + k1 * fd, k2 * fd + k3 * f
+        _STATE_TERMS(
+            self._state_terms, 0,
+            e, -e, 0.0, 0.0, t, -t, 0.0, 0.0,
+            ed, -ed, 0.0, 0.0, td + hip_up, hip_down - td, 0.0, 0.0,
+            0.0, 0.0, f, -f, 0.0, 0.0, u, -u,
+            0.0, 0.0, fd, -fd, 0.0, 0.0, ud + knee_up, knee_down - ud,
+        )  # fmt: skip
 
     def _predict(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> None:
         """Largest ratio to the bound ahead, of each joint, into `_ratio`."""
         flow, p, scale, out, bounds = self._views[cycle]
         self._load(cycle, e_hip, ed_hip, e_knee, ed_knee)
-        np.dot(self._z, flow, out=out)
-        np.add(out, p, out=out)
-        np.multiply(out, scale, out=out)
+        np.dot(self._z, flow, out)
+        np.add(out, p, out)
+        np.multiply(out, scale, out)
         # argmax and eight reads cost half of a maximum along the rows.
         i0, i1, i2, i3, i4, i5, i6, i7 = out.argmax(1).tolist()
-        a, b, c, d = float(out[0, i0]), float(out[1, i1]), float(out[2, i2]), float(out[3, i3])
-        self._ratio[0], self._ratio[1] = a if a > b else b, c if c > d else d
-        self.bounds = bounds.tolist()
-        hip, knee = self.config.policies
         if not self._monotone:
             np.abs(out[4:], out=out[4:])
             i4, i5, i6, i7 = out[4:].argmax(1).tolist()
-        hip_torques, knee_torques = (float(out[4, i4]), float(out[5, i5])), (float(out[6, i6]), float(out[7, i7]))
-        now = (hip.kp * e_hip + hip.kd * ed_hip) / self._limits[0]
-        if hip_torques[0] > 1.0 or hip_torques[1] > 1.0 or now > 1.0 or now < -1.0:
-            self._ratio[0] = self._saturated(0, cycle, e_hip, ed_hip, now, (a, b), hip_torques)
-        now = (knee.kp * e_knee + knee.kd * ed_knee) / self._limits[1]
-        if knee_torques[0] > 1.0 or knee_torques[1] > 1.0 or now > 1.0 or now < -1.0:
-            self._ratio[1] = self._saturated(1, cycle, e_knee, ed_knee, now, (c, d), knee_torques)
+        at, n = self._out_cells, out.shape[1]
+        a, b, c, d = at[i0], at[n + i1], at[2 * n + i2], at[3 * n + i3]
+        self.bounds = bounds.tolist()
+        ratio, torques = self._ratio, (at[4 * n + i4], at[5 * n + i5], at[6 * n + i6], at[7 * n + i7])
+        ratio[0], ratio[1] = a if a > b else b, c if c > d else d
+        (hip_kp, hip_kd, _), (knee_kp, knee_kd, _) = self._backup
+        limit, other_limit = self._limits
+        hip = (hip_kp * e_hip + hip_kd * ed_hip) / limit
+        knee = (knee_kp * e_knee + knee_kd * ed_knee) / other_limit
+        if hip > 1.0 or hip < -1.0 or torques[0] > 1.0 or torques[1] > 1.0:
+            ratio[0] = self._saturated(0, cycle, e_hip, ed_hip, hip, (a, b), torques[:2])
+        if knee > 1.0 or knee < -1.0 or torques[2] > 1.0 or torques[3] > 1.0:
+            ratio[1] = self._saturated(1, cycle, e_knee, ed_knee, knee, (c, d), torques[2:])
 
     def _saturated(
         self,
@@ -278,7 +290,7 @@ class GuideFilter:
         ed: float,
         now: float,
         ratios: tuple[float, float],
-        torques: tuple[float, float],
+        torques: tuple[float, ...],
     ) -> float:
         """Largest ratio where a rollout saturates.
 
