@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import threading
@@ -19,19 +20,9 @@ import atalante_tools.hil  # noqa: F401
 
 pytest_plugins = ["pytester"]
 
-#: The README's example.
-EXAMPLE = """\
-from atalante_hal.types import SupervisorState
-
-
-def test_four_lost_states_are_ridden_through_and_five_end_in_hold(loop, faults):
-    loop.until(SupervisorState.ACTIVE)
-    faults.drop("LEFT_SK_STATE", frames=4)
-    assert loop.run(20).supervisor is SupervisorState.ACTIVE
-    faults.drop("LEFT_SK_STATE", frames=5)
-    assert loop.run(20).supervisor is SupervisorState.HOLD
-    assert "NODE_TIMEOUT" in loop.codes
-"""
+#: The example of the README, as it stands there.
+README = Path(__file__).parent.parent / "README.md"
+(EXAMPLE,) = re.findall(r"<!-- example: pytest -->\n```python\n(.*?)```", README.read_text(), re.DOTALL)
 VIRTUAL = ("--can-interface", "virtual", "--can-channel")
 
 

@@ -33,7 +33,7 @@ BENCHMARKS: Final = (
         "hal_cycle",
         wire.hal_cycle,
         "us",
-        "the same cycle with python-can, cantools and the same filter",
+        "the same cycle with python-can (virtual), cantools and the same filter",
         1 / 7,
     ),
     Benchmark(

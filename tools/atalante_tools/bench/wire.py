@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Final
 
@@ -29,14 +30,29 @@ _COMPARED: Final = (
 
 def hal_cycle(effort: Effort) -> Measurement:
     """Receive, E2E, decode, filter on two joints, limiter, encode, send."""
-    from atalante_tools.bench.python_can_hal import PythonCanHal
+    from atalante_tools.bench.python_can_hal import PythonCanHal, VirtualNodes
 
     rig, ours = _hal()
-    theirs = PythonCanHal(walk(), Recording(walk()), FilterOnly(walk()))
-    for _ in range(2 * _BLOCK):
-        theirs.cycle()
+    recording = Recording(walk())
+    nodes, theirs = VirtualNodes(recording), PythonCanHal(walk(), recording, FilterOnly(walk()))
+
+    def our_block() -> float:
+        rig.bus.prepare(_BLOCK)
+        begun = time.perf_counter()
+        for _ in range(_BLOCK):
+            ours()
+        return (time.perf_counter() - begun) / _BLOCK
+
+    def their_block() -> float:
+        frames = nodes.answer(_BLOCK)
+        begun = time.perf_counter()
+        for count in frames:
+            theirs.cycle(count)
+        return (time.perf_counter() - begun) / _BLOCK
+
+    their_block(), their_block()
     heard, played, cycles = rig.bus.heard, rig.recording.cycles, rig.hal.state.cycle
-    measured = effort.interleave(timed(ours, _BLOCK), timed(theirs.cycle, _BLOCK))
+    measured = effort.interleave(our_block, their_block)
     _check_hal(rig)
     sent, answered = rig.bus.heard - heard, rig.recording.cycles - played
     elapsed = rig.hal.state.cycle - cycles
@@ -44,8 +60,11 @@ def hal_cycle(effort: Effort) -> Measurement:
         answered == elapsed and sent >= 7 * elapsed, f"{sent} frames sent and {answered} answers in {elapsed} cycles"
     )
     require(theirs.refused == 0, f"the baseline refused {theirs.refused} frames")
+    while rig.recording.pose != recording.pose:
+        theirs.cycle(*nodes.answer(1))
     _check_same_state(rig, theirs)
     theirs.bus.shutdown()
+    nodes.close()
     return measured
 
 
@@ -165,8 +184,6 @@ def _check_same_state(rig: RecordedRig, theirs: object) -> None:
     from atalante_tools.bench.python_can_hal import PythonCanHal
 
     assert isinstance(theirs, PythonCanHal)
-    while rig.recording.pose != theirs.recording.pose:
-        theirs.cycle()
     state = rig.hal.state
     for name in _COMPARED:
         require(
