@@ -81,7 +81,7 @@ class Codec:
         exact = all(c == round(c) and round(c) * s.factor == s.offset for c, s in zip(in_codes, signals, strict=True))
         self._base = np.array([low + exact * c for (low, _), c in zip(limits, in_codes, strict=True)]) * at_place
         self._weight = self._factor / at_place
-        self._add_offset = self._has_offset and not exact
+        self._separate_offset = self._has_offset and not exact
         self._raw = np.empty(self.size, np.uint64)
         self._outside = np.empty(self.size, np.bool_)
         self._all_inside = bytes(self.size)
@@ -99,8 +99,8 @@ class Codec:
         self._scaled = np.empty(self.size)
         self._bits = self._scaled.view(np.uint64)
         self._sorted = np.empty(self.size, np.uint64)
-        self._round = np.full(self.size, _ROUND)
-        self._lowest = self._round.view(np.uint64) + _words(low for low, _ in limits)
+        self._round = np.array([_ROUND - exact * code for code in in_codes])
+        self._lowest = np.full(self.size, _ROUND).view(np.uint64) + _words(low for low, _ in limits)
         self._range = _words(high - low for low, high in limits)
         self._distance = np.empty(self.size, np.uint64)
         self._beyond = np.empty(self.size, np.bool_)
@@ -169,7 +169,7 @@ class Codec:
             wrapped = self._raw > self._top
             out[wrapped] -= self._turn[wrapped]
         np.multiply(out, self._weight, out)
-        if self._add_offset:
+        if self._separate_offset:
             np.add(out, self._offset, out)
 
     def decode(self, frames: Frames, out: Vector) -> bool:
@@ -195,7 +195,8 @@ class Codec:
     def pack(self, values: Vector, words: Words) -> None:
         """As `encode`, into a flat view of the frames made beforehand. Shape (rows * 9,)."""
         scaled, bits = self._scaled, self._bits
-        np.divide(np.subtract(values, self._offset, scaled) if self._has_offset else values, self._factor, scaled)
+        shifted = np.subtract(values, self._offset, scaled) if self._separate_offset else values
+        np.divide(shifted, self._factor, scaled)
         np.add(scaled, self._round, scaled)
         # One comparison for both ends, infinities and NaN: as numbers of bits all are far beyond the maximum.
         np.subtract(bits, self._lowest, self._distance)
@@ -215,5 +216,5 @@ class Codec:
             if self._no_invalid[i]:
                 message, signal = self.signals[i]
                 raise ValueError(f"{message.name}.{signal.name} is NaN and has no invalid code in the DBC")
-        np.add(np.clip(codes, self._raw_min, self._raw_max), self._round, self._scaled)
+        np.add(np.clip(codes, self._raw_min, self._raw_max), _ROUND, self._scaled)
         self._bits[no_value] = self._invalid[no_value]
