@@ -26,7 +26,9 @@ BOUNDS = np.stack([np.linspace(0.07, 0.03, HORIZON + 1), np.full(HORIZON + 1, 0.
 DEVIATION, RATE = (0.03, -0.02), (0.2, -0.4)
 ARGUMENTS = [
     (policy, DEADBEAT, nominal, following, TIME)
-    for policy, nominal, following in zip(POLICIES, GAIT.coefficients[2:4], GAIT.mirrored().coefficients[2:4], strict=True)
+    for policy, nominal, following in zip(
+        POLICIES, GAIT.coefficients[2:4], GAIT.mirrored().coefficients[2:4], strict=True
+    )
 ]
 DRIFTS = [free_drift(*arguments) for arguments in ARGUMENTS]
 
@@ -40,7 +42,9 @@ def table(parts: list[tuple[np.ndarray, ...]]) -> np.ndarray:
 SOLUTION, DRIFT = table([forced_response(*arguments) for arguments in ARGUMENTS]), table(DRIFTS)
 
 
-def march(joint: int, side: int, cycle: int, e: float, ed: float, limit: float, substeps: int = 4) -> tuple[float, float]:
+def march(
+    joint: int, side: int, cycle: int, e: float, ed: float, limit: float, substeps: int = 4
+) -> tuple[float, float]:
     """Largest ratio and torque by small steps; the known drift is added exactly."""
     policy, external, sign = POLICIES[joint], DISTURBANCE[joint][1 - side], -1.0 if side else 1.0
     drift, h = DRIFT[:, 2 * joint : 2 * joint + 2], PERIOD / substeps

@@ -125,7 +125,7 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
                         "congestion_control": {"block": {"wait_before_close": 100_000}},
                     }
                 }
-            }
+            },
         },
         "access_control": {
             "enabled": True,
