@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from atalante_dbc.foreign import Field, Layout
 from atalante_hal.e2e import CRC_BYTES, crc, data_id_bytes
-from atalante_hal.frame import Frames, as_words
+from atalante_hal.frame import FRAME_BYTES, Frames, as_words
 
 Words = npt.NDArray[np.uint64]
 Mask = npt.NDArray[np.bool_]
@@ -243,11 +243,11 @@ def crc_differences(frames: Frames, length: int) -> npt.NDArray[np.uint16]:
         frames: records whose payloads have `length` bytes and begin with the CRC, low byte first.
     """
     data_id_length = len(data_id_bytes(0))
-    payload = frames.view(np.uint16).reshape(len(frames), -1)[:, 4:]
+    payload = frames.view(np.uint16).reshape(-1, FRAME_BYTES // 2)[:, 4:]
     found: npt.NDArray[np.uint16] = payload[:, 0].copy()
     for pair in range(1, length // 2):
         found ^= _pair_table(length - 2 * pair - 2 + data_id_length).take(payload[:, pair])
     if length % 2:
-        last = frames.view(np.uint8).reshape(len(frames), -1)[:, 8 + length - 1]
+        last = frames.view(np.uint8).reshape(-1, FRAME_BYTES)[:, 8 + length - 1]
         found ^= _byte_table(data_id_length).take(last)
     return found

@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from atalante_hal.bulk import crc_differences
 from atalante_hal.e2e import COUNTER_BYTE
+from atalante_hal.frame import FRAME_BYTES
 from atalante_tools.validate.findings import Findings
 from atalante_tools.validate.plan import Plan, Rows
 from atalante_tools.validate.stream import Stream
@@ -86,7 +87,7 @@ class Counters:
 
     def steps(self, stream: Stream) -> Steps:
         """Counter steps of each frame; `NO_STEPS - 1` where there is nothing to compare with. Shape (n,)."""
-        counters = stream.frames.view(np.uint8).reshape(len(stream), -1)[:, _HEADER_BYTES + COUNTER_BYTE].copy()
+        counters = stream.frames.view(np.uint8).reshape(-1, FRAME_BYTES)[:, _HEADER_BYTES + COUNTER_BYTE].copy()
         steps = counter_steps(counters, stream.before(counters, self._last))
         steps[stream.starts[~self._seen[stream.present]]] = NO_STEPS - 1
         if not bool(self._protected[stream.present].all()):

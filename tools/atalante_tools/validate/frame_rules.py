@@ -44,10 +44,11 @@ class FrameRules:
         self._plan, self._findings, self._homes, self._keeps_flags = plan, findings, homes, keeps_flags
         layouts = plan.layouts
         #: What the DBC says about FDF and BRS: 0, 1, or `UNKNOWN` where it says nothing.
-        self._fd = np.array([UNKNOWN if m.fd is None else int(m.fd) for m in layouts], np.int8)
-        self._switch = np.array(
-            [UNKNOWN if m.bit_rate_switch is None else int(m.bit_rate_switch) for m in layouts], np.int8
-        )
+        fd = [UNKNOWN if m.fd is None else int(m.fd) for m in layouts]
+        switch = [UNKNOWN if m.bit_rate_switch is None else int(m.bit_rate_switch) for m in layouts]
+        # One more than there are messages: rows of frames that are none are looked up as well.
+        self._fd, self._switch = np.array([*fd, UNKNOWN], np.int8), np.array([*switch, UNKNOWN], np.int8)
+        self._length, self._sender = np.append(plan.lengths, 0), np.append(plan.sender_of_row, UNKNOWN)
         #: Node that recorded the log; None: not known yet, "": several or none.
         self.recorder: str | None = None
         self.direction_seen = False
@@ -116,7 +117,7 @@ class FrameRules:
         lengths = part.frames["len"]
         is_fd = ((part.frames["flags"] & FLAG_FDF) != 0) | (not self._keeps_flags)
         legal = np.where(is_fd, _FD_LENGTH[lengths], _CLASSIC_LENGTH[lengths])
-        expected: npt.NDArray[np.int64] = self._plan.lengths[np.where(decodable, of, 0)]
+        expected: npt.NDArray[np.int64] = self._length[np.where(decodable, of, 0)]
         self._report("length-legal", part, of, decodable & ~legal, lengths)
         wrong = decodable & legal & (lengths != expected)
         self._report("length", part, of, wrong, lengths, np.abs(lengths.astype(np.int64) - expected))
@@ -127,7 +128,7 @@ class FrameRules:
         """A log in which one node marks what it sent: nobody else may send that node's messages."""
         sent = chunk.sent == SENT
         known = (rows >= 0) & (rows < len(self._plan.layouts))
-        of_sender = self._plan.sender_of_row[np.where(known, rows, 0)]
+        of_sender = self._sender[np.where(known, rows, 0)]
         if self.recorder is None:
             self.direction_seen = self.direction_seen or bool((chunk.sent != NOT_SAID).any())
             senders = of_sender[sent & known]

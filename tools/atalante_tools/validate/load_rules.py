@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE
+from atalante_hal.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE, as_words
 from atalante_tools.validate.buses import Homes
 from atalante_tools.validate.chunk import Chunk
 from atalante_tools.validate.findings import Findings
@@ -44,7 +44,8 @@ class LoadRules:
         self._data = catalogue.data_bitrate or self._nominal
         self._window_ns = int(project.number("bus-load", "window_s") * 1e9)
         self._over, self._limit = project.number("bus-load", "over_nominal"), project.number("bus-load", "limit")
-        self._of_row = np.array([self._layout_time(row) for row in range(len(plan.layouts))] or [0.0])
+        self._of_row = np.array([self._layout_time(row) for row in range(len(plan.layouts))] + [0.0])
+        self._bus_of_row = np.append(plan.bus_of_row, 0)
         self._numbers: list[npt.NDArray[np.int64]] = []  # of the windows of each chunk
         self._busy: list[npt.NDArray[np.float64]] = []  # seconds on the wire, (windows, buses)
         #: After `finish`: begin [s] of each window that has a frame, and the load of each bus as a share, shape (windows, buses).
@@ -79,7 +80,7 @@ class LoadRules:
         if not self.judged or not len(chunk):
             return
         known = (rows >= 0) & (rows < len(self._plan.layouts))
-        headers = chunk.frames.view(np.uint64).reshape(len(chunk), -1)[:, 0]
+        headers = as_words(chunk.frames)[:, 0]
         at = np.where(known, rows, 0)
         seconds = self._of_row[at]
         usual = known & (headers == self._plan.headers[rows])
@@ -124,7 +125,7 @@ class LoadRules:
         if not self._plan.is_ours or not bool((of_channel == UNKNOWN).any()):
             return fixed
         by_message = known & (of_channel[chunk.channels] == UNKNOWN)
-        return np.where(by_message, self._plan.bus_of_row[rows], fixed)
+        return np.where(by_message, self._bus_of_row[rows], fixed)
 
     def names(self, channels: list[str]) -> list[str]:
         """Name of each column of `load`."""

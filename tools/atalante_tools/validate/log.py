@@ -6,13 +6,16 @@ and everything that can be read is delivered.
 
 from __future__ import annotations
 
+import gc
 import gzip
 import io
 import logging
 import os
 import struct
+import sys
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -49,6 +52,8 @@ _LINE_FORMATS = (".asc", ".trc", ".csv")
 _PIECE_BYTES = 1 << 21  # text parsed at once: its arrays stay in the processor's cache
 _CHUNK_FRAMES = 120_000
 _BLF_HEADER = struct.Struct("<4sLBBBBBBBBQQ")
+#: First bytes of an MDF file.
+_MDF = b"MDF     "
 _RECORD = struct.Struct("<IBB2x64s")
 
 
@@ -184,35 +189,53 @@ class Log:
     # -- python-can --------------------------------------------------------------------------------------------------
 
     def _python_can(self) -> Iterator[Chunk]:
-        import can
-
         from atalante_hal.bus.replay import UNREADABLE
 
         batch, count, broken = _Batch(), 0, ""
         complaints = _Complaints()
         ends_within = self.suffix in _LINE_FORMATS and not self._compressed and _last_byte(self.path) not in b"\r\n"
-        logging.getLogger("can").addHandler(complaints)
-        try:
-            with can.LogReader(self.path) as reader:
-                source = getattr(reader, "file", None)
-                messages = iter(reader)
-                held: can.Message | None = next(messages, None)
-                while held is not None:
-                    message, held = held, next(messages, None)
-                    if held is None and ends_within:
-                        break
-                    batch.add(message, self.channels, self.keeps_direction)
-                    count += 1
-                    if batch.count == _CHUNK_FRAMES:
-                        self.position = _position(source)
-                        yield batch.take()
-        except UNREADABLE as error:
-            broken = " ".join(str(error).split()) or type(error).__name__
-        finally:
-            logging.getLogger("can").removeHandler(complaints)
+        with _quiet_asammdf(), complaints.heard():
+            try:
+                with self._messages() as (messages, position):
+                    held = next(messages, None)
+                    while held is not None:
+                        message, held = held, next(messages, None)
+                        if held is None and ends_within:
+                            break
+                        batch.add(message, self.channels, self.keeps_direction)
+                        count += 1
+                        if batch.count == _CHUNK_FRAMES:
+                            self.position = position()
+                            yield batch.take()
+            except (*UNREADABLE, _mdf_error()) as error:
+                broken = " ".join(str(error).split()) or type(error).__name__
+            if broken and self.suffix == ".mf4":
+                gc.collect()  # the half-opened file, while its complaint is not heard
         if batch.count:
             yield batch.take()
         self._remark_python_can(count, broken, ends_within, complaints)
+
+    @contextmanager
+    def _messages(self) -> Iterator[tuple[Iterator[Any], Callable[[], int]]]:
+        """The messages of the log, and how to ask how far the file is read.
+
+        python-can does not close a file that its reader refuses: it is opened here, but for .mf4, which asammdf opens.
+        """
+        import can
+        from can.io.generic import BinaryIOMessageReader
+
+        reader_type = can.io.player.MESSAGE_READERS[self.suffix]
+        if self.suffix == ".mf4":
+            if (kind := _first_bytes(self.path, len(_MDF))) != _MDF:
+                raise ValueError(f"the file begins with {kind!r}, not with {_MDF!r}")
+            with reader_type(self.path) as reader:
+                yield iter(reader), lambda: 0
+            return
+        with self.path.open("rb") as raw, ExitStack() as stack:
+            file: Any = stack.enter_context(gzip.GzipFile(fileobj=raw)) if self._compressed else raw
+            if not issubclass(reader_type, BinaryIOMessageReader):
+                file = stack.enter_context(io.TextIOWrapper(file, encoding="utf-8", errors="replace"))
+            yield iter(stack.enter_context(reader_type(file))), raw.tell
 
     def _remark_python_can(self, count: int, broken: str, ends_within: bool, complaints: _Complaints) -> None:
         if broken and not count:
@@ -256,6 +279,22 @@ def open_log(path: Path) -> Log:
     if suffix == ".mf4":
         _require_asammdf(path)
     return Log(path, suffix, path.stat().st_size)
+
+
+@contextmanager
+def _quiet_asammdf() -> Iterator[None]:
+    """asammdf's file object cannot be deleted when opening it failed, and Python would print a traceback about that."""
+    before = sys.unraisablehook
+
+    def hook(failure: sys.UnraisableHookArgs) -> None:
+        if getattr(failure.object, "__qualname__", "") != "MDF4.__del__":
+            before(failure)
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
 
 
 def _require_asammdf(path: Path) -> None:
@@ -317,6 +356,15 @@ class _Complaints(logging.Handler):
         self.count = 0
         self.first = ""
 
+    @contextmanager
+    def heard(self) -> Iterator[None]:
+        """Listen to python-can."""
+        logging.getLogger("can").addHandler(self)
+        try:
+            yield
+        finally:
+            logging.getLogger("can").removeHandler(self)
+
     def emit(self, record: logging.LogRecord) -> None:
         self.first = self.first or " ".join(record.getMessage().split())
         self.count += 1
@@ -360,6 +408,21 @@ def _behind_last_newline(text: npt.NDArray[np.uint8], begin: int, end: int) -> i
     return 0
 
 
+def _mdf_error() -> type[Exception]:
+    """What asammdf raises on a damaged file, or nothing that could be raised here without it."""
+    try:
+        from asammdf.blocks.utils import MdfException
+    except ImportError:
+        return EOFError
+    found: type[Exception] = MdfException
+    return found
+
+
+def _first_bytes(path: Path, count: int) -> bytes:
+    with path.open("rb") as file:
+        return file.read(count)
+
+
 def _last_byte(path: Path) -> bytes:
     with path.open("rb") as file:
         file.seek(0, os.SEEK_END)
@@ -377,13 +440,6 @@ def _missing_bytes(path: Path) -> int:
         return 0
     size: int = _BLF_HEADER.unpack(header)[-2]
     return max(0, size - path.stat().st_size)
-
-
-def _position(source: Any) -> int:
-    try:
-        return int(source.tell())
-    except (AttributeError, OSError, ValueError):
-        return 0
 
 
 def _shown(line: bytes) -> str:

@@ -52,7 +52,7 @@ class Plan:
         count = len(self.layouts)
         headers = [header_word(_can_id(m), m.length, _flags(m)) for m in self.layouts]
         #: First word of a frame of each row as it should be; a refused message's never is.
-        self.headers = np.array([*headers, *([0] * len(self.refused))], np.uint64)
+        self.headers = np.array([*headers, *([0] * len(self.refused)), 0], np.uint64)  # the last is that of `UNKNOWN`
         self.lengths = np.array([m.length for m in self.layouts], np.int64)
         self.cycle_ns = np.array([1e6 * (m.cycle_ms or 0.0) if m.cyclic else 0.0 for m in self.layouts])
         self.timeout_ns = np.array([1e6 * (m.timeout_ms or 0.0) for m in self.layouts])

@@ -1,0 +1,537 @@
+"""`atalante validate` from outside: log formats, damaged logs, live buses, reports, the rules file, what was not judged."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+import atalante_dbc
+from atalante_dbc.foreign import catalogue
+from atalante_hal.codec import Codec
+from atalante_hal.e2e import crc, data_id_bytes
+from atalante_hal.frame import FRAME, Frames, new_frames
+from atalante_tools.cli import cli
+from atalante_tools.validate.chunk import NOT_SAID, Chunk
+from atalante_tools.validate.judge import Judge
+from atalante_tools.validate.log import LogError, open_log
+from atalante_tools.validate.plan import Plan
+from atalante_tools.validate.project import ProjectError, load_project
+from atalante_tools.validate.report import report, text
+from atalante_tools.validate.rules import RULES
+from atalante_tools.validate.timing_rules import BINS, jitter_p99
+
+NETWORK = atalante_dbc.load()
+HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: A B\n\n'
+BEGIN = 1_700_000_000.0
+
+#: A network of somebody else: classic CAN, no bus, no E2E, cycle times.
+FOREIGN = (
+    HEAD
+    + """BO_ 256 Speed: 8 A
+ SG_ Wheel : 7|16@0+ (0.01,0) [0|300] "km/h" B
+ SG_ Gear : 16|4@1+ (1,0) [0|5] "" B
+ SG_ Raw : 24|8@1+ (1,0) [0|255] "" B
+
+BO_ 512 Event: 2 B
+ SG_ Code : 0|16@1+ (1,0) [0|0] "" A
+
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 10000;
+BA_DEF_ BO_ "GenMsgSendType" ENUM "cyclic","event";
+BA_DEF_ "Baudrate" INT 0 1000000;
+BA_DEF_DEF_ "GenMsgCycleTime" 0;
+BA_DEF_DEF_ "GenMsgSendType" "event";
+BA_DEF_DEF_ "Baudrate" 500000;
+BA_ "GenMsgCycleTime" BO_ 256 10;
+BA_ "GenMsgSendType" BO_ 256 0;
+VAL_ 256 Gear 0 "P" 1 "R" 2 "N" 3 "D" 5 "S" ;
+"""
+)
+
+
+def node_frames(cycles: int) -> list[can.Message]:
+    """What the node LEFT_FH says for a while: its state every millisecond, its status every 100."""
+    noise = np.random.default_rng(0)
+    found = []
+    for cycle in range(cycles):
+        for name in ("LEFT_FH_STATE", "LEFT_FH_STATUS"):
+            message = NETWORK.message(name)
+            if cycle % message.cycle_ms:
+                continue
+            codec, frames = Codec([message]), new_frames(1)
+            values = np.zeros(codec.size)
+            values[codec.index(name, "Counter")] = cycle // message.cycle_ms % 256
+            if name == "LEFT_FH_STATE":
+                values[codec.index(name, "DriveState")] = 0x40
+                values[codec.index(name, "Temperature")] = 25
+                values[codec.index(name, "Torque")] = noise.normal(0.0, 0.1)
+            else:
+                values[codec.index(name, "NodeState")] = 5
+                values[codec.index(name, "DbcHash")] = NETWORK.hash32
+            codec.encode(values, frames)
+            payload = frames["data"][0, : message.length].tobytes()
+            protected = crc(payload[2:], data_id_bytes(message.data_id)).to_bytes(2, "little") + payload[2:]
+            found.append(
+                can.Message(
+                    timestamp=BEGIN + cycle * 1e-3 + message.frame_id * 1e-7,
+                    arbitration_id=message.frame_id,
+                    is_extended_id=False,
+                    is_fd=True,
+                    bitrate_switch=True,
+                    data=protected,
+                    channel=0,
+                )
+            )
+    return found
+
+
+MESSAGES = node_frames(400)
+
+
+def write(path: Path, messages: list[can.Message]) -> Path:
+    with can.Logger(path) as logger:
+        for message in messages:
+            logger.on_message_received(message)
+    return path
+
+
+def run(*arguments: object) -> Result:
+    """The command as a user types it; an exception that is no exit code is a defect."""
+    result = CliRunner().invoke(cli, [str(argument) for argument in arguments])
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result
+
+
+def rules_of(result: Result) -> set[str]:
+    return {json.loads(line)["rule"] for line in result.stdout.splitlines()}
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    return Plan(catalogue(atalante_dbc.DBC_FILE))
+
+
+@pytest.fixture
+def good(tmp_path: Path) -> Path:
+    return write(tmp_path / "good.log", MESSAGES)
+
+
+# -- formats ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".mf4", ".log.gz", ".asc.gz"])
+def test_every_format_is_judged_the_same(suffix: str, tmp_path: Path) -> None:
+    damaged = [m for m in MESSAGES if m.arbitration_id != 0x181 or not 0.2 <= m.timestamp - BEGIN <= 0.201]
+    damaged[50].data[5] ^= 1
+    try:
+        path = write(tmp_path / f"night{suffix}", damaged)
+    finally:
+        damaged[50].data[5] ^= 1
+    result = run("validate", path, "--node", "LEFT_FH", "--json")
+    found = {json.loads(line)["rule"]: json.loads(line) for line in result.stdout.splitlines()}
+    assert set(found) == {"crc", "counter-lost"}
+    assert found["counter-lost"]["message"] == "LEFT_FH_STATE"
+    assert found["counter-lost"]["worst"] == "1 lost"
+    assert result.exit_code == 1
+
+
+def test_csv_has_no_flags_and_the_report_says_so(tmp_path: Path) -> None:
+    result = run("validate", write(tmp_path / "night.csv", MESSAGES), "--node", "LEFT_FH")
+    assert result.exit_code == 0
+    assert "frame-fdf, frame-brs, frame-esi: this log format does not keep CAN FD flags" in result.stdout
+
+
+def test_trc(tmp_path: Path) -> None:
+    """python-can writes no CAN FD into .trc; a classic network does."""
+    dbc = tmp_path / "foreign.dbc"
+    dbc.write_text(FOREIGN)
+    messages = [
+        can.Message(timestamp=BEGIN + 0.01 * k, arbitration_id=256, is_extended_id=False, data=bytes(8), channel="1")
+        for k in range(50)
+    ]
+    result = run("validate", write(tmp_path / "night.trc", messages), "--dbc", dbc, "--json")
+    assert rules_of(result) == set()
+    assert result.exit_code == 0
+
+
+# -- damaged logs ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_truncated_line_is_not_judged_and_everything_before_it_is(good: Path) -> None:
+    good.write_bytes(good.read_bytes()[:-10])
+    result = run("validate", good, "--node", "LEFT_FH")
+    assert "ends within a line" in result.stdout
+    assert f"{len(MESSAGES) - 1} frames" in result.stdout
+    assert result.exit_code == 1
+
+
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # asammdf leaves a damaged file open
+@pytest.mark.parametrize("suffix", [".asc", ".blf", ".mf4", ".log", ".csv"])
+@pytest.mark.parametrize("share", [0.0, 0.03, 0.5, 0.97])
+def test_a_broken_off_log_gets_a_sentence(suffix: str, share: float, tmp_path: Path) -> None:
+    path = write(tmp_path / f"night{suffix}", MESSAGES)
+    whole = path.read_bytes()
+    cut = int(share * len(whole))
+    path.write_bytes(whole[: cut - (whole[cut - 1 : cut] == b"\n")])  # at the end of a line nobody could notice
+    result = run("validate", path, "--node", "LEFT_FH")
+    assert result.exit_code == 1
+    output = result.stdout + result.stderr
+    assert any(word in output for word in ("log-truncated", "log-empty", "cannot be read")), output
+
+
+@pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".mf4", ".trc", ".csv"])
+@pytest.mark.parametrize("content", [b"", b"\n", b"no log at all\n", bytes(range(256)) * 20])
+def test_what_is_no_log_gets_a_sentence(suffix: str, content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / f"strange{suffix}"
+    path.write_bytes(content)
+    result = run("validate", path)
+    assert result.exit_code == 1
+    output = result.stdout + result.stderr
+    assert "log-empty" in output or "cannot be read" in output, output
+    assert "Traceback" not in output
+
+
+def test_an_unsorted_log_is_sorted_and_judged(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    lines = write(tmp_path / "sorted.log", MESSAGES).read_text().splitlines()
+    shuffled = tmp_path / "shuffled.log"
+    shuffled.write_text("".join(f"{lines[k]}\n" for k in generator.permutation(len(lines)).tolist()))
+    result = run("validate", shuffled, "--node", "LEFT_FH", "--json")
+    assert rules_of(result) == {"log-unsorted"}
+    assert "not in order of time" in result.stderr
+
+
+def test_the_same_frames_on_two_channels(tmp_path: Path) -> None:
+    """A gateway, or a recording of both ends: the second copy is on the wrong bus, and the first is judged as always."""
+    twice = [m for message in MESSAGES for m in (message, _on(message, 1))]
+    result = run("validate", write(tmp_path / "twice.blf", twice), "--node", "LEFT_FH", "--json")
+    assert rules_of(result) == {"wrong-bus"}
+
+
+def _on(message: can.Message, channel: int) -> can.Message:
+    copy = message.__copy__()
+    copy.channel = channel
+    return copy
+
+
+def test_several_logs_one_of_which_is_missing(good: Path, tmp_path: Path) -> None:
+    result = run("validate", tmp_path / "none.log", good, tmp_path / "none.txt", "--node", "LEFT_FH")
+    assert result.exit_code == 1
+    assert "there is no log" in result.stderr
+    assert "no suffix of a CAN log" in result.stderr
+    assert f"{len(MESSAGES)} frames" in result.stdout
+
+
+def test_open_log_says_what_is_valid(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"use one of \.log, \.asc, \.blf"):
+        open_log(tmp_path / "night.pcap")
+
+
+# -- reports ---------------------------------------------------------------------------------------------------------------
+
+
+def test_json_objects_have_exactly_the_promised_keys(good: Path) -> None:
+    result = run("validate", good, "--json")
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    assert lines
+    for line in lines:
+        assert set(line) == {"rule", "message", "node", "count", "first_s", "last_s", "worst"}
+        assert line["rule"] == "never-seen"
+        assert line["first_s"] == pytest.approx(BEGIN, abs=1.0)
+    # One node on the desk, on one channel: its bus is taken to be left_leg, and the rest of that bus is missing.
+    assert {line["node"] for line in lines} == {"HAL", *(f"LEFT_{j}" for j in ("TH", "SH", "SK", "SA", "HA"))}
+
+
+def test_junit(good: Path, tmp_path: Path) -> None:
+    path = tmp_path / "result.xml"
+    run("validate", good, "--junit", path)
+    (suite,) = ET.parse(path).getroot()
+    cases = {case.get("name"): case for case in suite}
+    assert set(cases) == {rule.id for rule in RULES}
+    failure = cases["never-seen"].find("failure")
+    assert failure is not None
+    assert "LEFT_TH_STATE" in (failure.text or "")
+    assert cases["crc"].find("failure") is None
+    assert cases["sender"].find("skipped") is not None
+    assert (suite.get("failures"), suite.get("tests")) == ("1", str(len(RULES)))
+
+
+class _Outside(HTMLParser):
+    """Everything a page would ask somebody else for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.asked: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.asked += [f"{tag} {name}={value}" for name, value in attrs if name in ("src", "href", "action", "srcset")]
+
+
+def test_html_has_the_plots_and_asks_nobody(good: Path, tmp_path: Path) -> None:
+    lines = good.read_text().splitlines(keepends=True)
+    good.write_text("".join(lines[:200] + lines[203:]))
+    path = tmp_path / "night.html"
+    run("validate", good, "--html", path, "--node", "LEFT_FH")
+    page = path.read_text()
+    parser = _Outside()
+    parser.feed(page)
+    assert parser.asked == []
+    assert parser.tags.count("svg") == 4  # load, gaps, two histograms
+    assert parser.tags.count("circle") == 1
+    assert "rect" in parser.tags
+    for rule in RULES:
+        assert rule.id in page
+    assert "url(" not in page
+
+
+def test_a_report_that_cannot_be_written(good: Path, tmp_path: Path) -> None:
+    result = run("validate", good, "--node", "LEFT_FH", "--html", tmp_path / "no" / "where.html")
+    assert result.exit_code == 1
+    assert "cannot be written" in result.stderr
+
+
+def test_text_explains_the_rules_that_were_broken(good: Path) -> None:
+    result = run("validate", good)
+    assert "never-seen: A cyclic message that is not in the log at all [BA_ GenMsgCycleTime]" in result.stdout
+    assert "LEFT_TH_STATE" in result.stdout
+
+
+def test_list_rules() -> None:
+    result = run("validate", "--list-rules")
+    assert result.exit_code == 0
+    for rule in RULES:
+        assert rule.id in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ((), "name one or more logs, or a bus"),
+        (("a.log", "-i", "virtual", "-c", "x"), "name one or more logs, or a bus"),
+        (("-i", "virtual"), "virtual needs a channel"),
+        (("a.log", "--node", "NOBODY"), "no message of the DBC is sent by 'NOBODY'"),
+    ],
+)
+def test_usage(arguments: tuple[str, ...], sentence: str) -> None:
+    result = run("validate", *arguments)
+    assert result.exit_code == 2
+    assert sentence in result.stderr
+
+
+# -- what was not judged ---------------------------------------------------------------------------------------------------
+
+
+def test_a_foreign_network_is_judged_as_far_as_its_dbc_goes(tmp_path: Path) -> None:
+    dbc = tmp_path / "foreign.dbc"
+    dbc.write_text(FOREIGN)
+    messages = [
+        can.Message(
+            timestamp=BEGIN + 0.01 * k,
+            arbitration_id=256,
+            is_extended_id=False,
+            data=(40_000 if k == 5 else 12_000).to_bytes(2, "big") + bytes([4 if k == 7 else 3]) + bytes(5),
+        )
+        for k in range(60)
+        if k not in (20, 21, 22)
+    ]
+    result = run("validate", write(tmp_path / "drive.log", messages), "--dbc", dbc, "--json")
+    found = {json.loads(line)["rule"]: json.loads(line) for line in result.stdout.splitlines()}
+    assert set(found) == {"range", "value-table", "cycle-gap"}
+    assert found["range"]["worst"] == "Wheel = 400 km/h"
+    assert found["value-table"]["worst"] == "Gear = 4 raw"
+    assert found["cycle-gap"]["worst"] == "40 ms"
+    for sentence in (
+        "messages without E2EDataId",
+        "the DBC has no attribute Bus",
+        "no cyclic message SYNC",
+        "no message has a signal DriveState",
+        "no rule looked at the values of these signals (1): Speed.Raw",
+        "not in the log, and need not be (1): Event",
+    ):
+        assert sentence in result.stderr
+
+
+def test_refused_messages_are_named(tmp_path: Path) -> None:
+    dbc = tmp_path / "foreign.dbc"
+    dbc.write_text(HEAD + 'BO_ 1 Long: 16 A\n SG_ S : 0|65@1+ (1,0) [0|0] "" B\n')
+    messages = [
+        can.Message(timestamp=BEGIN + k, arbitration_id=1, is_extended_id=False, is_fd=True, data=bytes(16))
+        for k in range(3)
+    ]
+    result = run("validate", write(tmp_path / "drive.log", messages), "--dbc", dbc)
+    assert result.exit_code == 1
+    assert "unsupported" in result.stdout
+    assert "S has 65 bits" in result.stdout
+
+
+def test_no_log_is_called_good_without_saying_what_was_not_judged(good: Path) -> None:
+    result = run("validate", good, "--node", "LEFT_FH")
+    assert result.exit_code == 0
+    assert "LEFT_FH_STATUS.FirmwareVersion" in result.stdout
+    assert result.stdout.splitlines()[-1] == "no findings; what is listed as not judged was not looked at"
+
+
+def test_j1939_groups_of_several_senders_have_no_common_cycle(tmp_path: Path) -> None:
+    dbc = Path(__file__).with_name("foreign") / "j1939.dbc"
+    messages = [
+        can.Message(
+            timestamp=BEGIN + k * 0.005, arbitration_id=0x18FEF100 + k % 2, is_extended_id=True, data=b"\xff" * 8
+        )
+        for k in range(20)
+    ]
+    result = run("validate", write(tmp_path / "truck.log", messages), "--dbc", dbc)
+    assert "parameter groups that several addresses send (1): CCVS" in result.stdout
+    assert "unknown-id" not in result.stdout
+
+
+# -- the project's rules file ----------------------------------------------------------------------------------------------
+
+
+def test_silenced_findings_are_reported_as_silenced(good: Path, tmp_path: Path) -> None:
+    rules = tmp_path / "rules.toml"
+    rules.write_text(
+        '[[silence]]\nrule = "never-seen"\nmessage = "LEFT_*"\nreason = "one drive on the desk"\n'
+        '[[silence]]\nrule = "never-seen"\nmessage = "*_LEFT_LEG"\nreason = "no master"\n'
+    )
+    junit = tmp_path / "result.xml"
+    result = run("validate", good, "--rules", rules, "--junit", junit)
+    assert result.exit_code == 0
+    assert "never-seen LEFT_TH_STATE, 1 times: one drive on the desk" in result.stdout
+    assert "never-seen SYNC_LEFT_LEG, 1 times: no master" in result.stdout
+    assert "silenced for LEFT_TH_STATE: one drive on the desk" in junit.read_text()
+
+
+def test_thresholds_change_what_is_found(good: Path, tmp_path: Path) -> None:
+    rules = tmp_path / "rules.toml"
+    rules.write_text("[cycle-fast]\ncycles = 2.5\n[step]\nFirmwareVersion = 1.0\n")
+    result = run("validate", good, "--rules", rules, "--node", "LEFT_FH", "--json")
+    assert rules_of(result) == {"cycle-fast"}
+
+
+def test_channels_can_be_named(tmp_path: Path) -> None:
+    rules = tmp_path / "rules.toml"
+    rules.write_text('[channels]\n0 = "right_leg"\n')
+    path = write(tmp_path / "night.blf", MESSAGES)
+    result = run("validate", path, "--rules", rules, "--node", "LEFT_FH", "--json")
+    assert rules_of(result) <= {"never-seen"}
+    rules.write_text('[channels]\n0 = "middle_leg"\n')
+    result = run("validate", path, "--rules", rules)
+    assert result.exit_code == 2
+    assert "names the bus 'middle_leg'; the DBC has left_leg" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ("[no-rule]\nx = 1\n", "there is no rule 'no-rule'"),
+        ("[crc]\nx = 1\n", "crc has no threshold"),
+        ("[cycle-gap]\nx = 1\n", "cycle-gap has no threshold 'x'; it has cycles"),
+        ("[cycle-gap]\ncycles = -1\n", "not negative"),
+        ("[cycle-gap]\ncycles = 'two'\n", "is a number"),
+        ("[cycle-gap]\ncycles = nan\n", "is a number"),
+        ("[stuck]\ngroups = 'Gyro'\n", "list of names"),
+        ("[velocity]\nposition = 3\n", "is a name"),
+        ("[[silence]]\nrule = 'crc'\n", "needs a reason"),
+        ("[[silence]]\nrule = 'crc'\nreason = ' '\n", "needs a reason"),
+        ("[[silence]]\nrule = 'what'\nreason = 'x'\n", "names one of the rules"),
+        ("[[silence]]\nrule = 'crc'\nwhy = 'x'\n", "has the keys rule, message, reason"),
+        ("silence = 1\n", "list of tables"),
+        ("channels = 1\n", "name of a bus"),
+        ("[", "cannot be read as TOML"),
+    ],
+)
+def test_a_wrong_rules_file_is_refused_by_key(content: str, sentence: str, tmp_path: Path) -> None:
+    path = tmp_path / "rules.toml"
+    path.write_text(content)
+    with pytest.raises(ProjectError, match=sentence):
+        load_project(path)
+
+
+# -- live ------------------------------------------------------------------------------------------------------------------
+
+
+def test_a_live_bus(plan: Plan) -> None:
+    """A node that sends while the command listens; one frame is damaged."""
+    sender = can.Bus(interface="virtual", channel="validate", protocol=can.CanProtocol.CAN_FD)
+    done = threading.Event()
+
+    def send() -> None:
+        number = 0
+        while not done.is_set():
+            message = MESSAGES[number % len(MESSAGES)].__copy__()
+            if number == 60:
+                message.data = bytearray(message.data)
+                message.data[5] ^= 1
+            sender.send(message)
+            number += 1
+            time.sleep(0.001)
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        result = run("validate", "-i", "virtual", "-c", "validate", "--node", "LEFT_FH", "--for", "1.2", "--json")
+    finally:
+        done.set()
+        thread.join()
+        sender.shutdown()
+    assert result.exit_code == 1
+    assert "crc" in rules_of(result)
+    assert "dropped:" not in result.stderr
+
+
+def test_a_bus_that_is_not_there() -> None:
+    result = run("validate", "-i", "nonsense", "-c", "x")
+    assert result.exit_code == 3
+
+
+# -- kernels ---------------------------------------------------------------------------------------------------------------
+
+
+def test_jitter_is_the_distance_from_the_median() -> None:
+    histogram = np.zeros(BINS, np.int64)
+    histogram[100] = 990
+    histogram[130] = 10
+    assert jitter_p99(histogram) == 0.0
+    histogram[130] = 20
+    assert jitter_p99(histogram) == pytest.approx(0.3)
+    shifted = np.roll(histogram, 17)
+    assert jitter_p99(shifted) == pytest.approx(0.3)
+
+
+def test_nothing_is_judged_in_an_empty_log(plan: Plan) -> None:
+    judge = Judge(plan)
+    judge.judge(Chunk(np.zeros(0, FRAME), np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros(0, np.int8)), [])
+    judge.finish()
+    result = report("nothing", judge)
+    assert result.findings == ()
+    assert text(result).splitlines()[-1] == "nothing was judged"
+
+
+def test_no_garbage_raises(plan: Plan) -> None:
+    """Any bytes at all in the records of a chunk are judged without an exception."""
+    generator = np.random.default_rng(0)
+    for count in (1, 2, 700):
+        judge = Judge(plan)
+        for _ in range(3):
+            frames: Frames = generator.integers(0, 256, count * FRAME.itemsize, dtype=np.uint8).view(FRAME)
+            known = generator.integers(0, 2, count) > 0
+            ids = np.array([m.frame_id for m in NETWORK.messages], np.uint32)
+            frames["can_id"] = np.where(known, generator.choice(ids, count), frames["can_id"])
+            frames["flags"] = np.where(generator.integers(0, 2, count) > 0, 5, frames["flags"])
+            frames["len"] = generator.choice([8, 12, 16, 24, 32, 48, 3, 200], count)
+            stamps = np.sort(generator.integers(0, 10**9, count))
+            channels = generator.integers(0, 2, count).astype(np.uint8)
+            judge.judge(Chunk(frames, stamps, channels, np.full(count, NOT_SAID, np.int8)), ["a", "b"])
+        judge.finish()
+        assert judge.frames == 3 * count
+        assert len(judge.findings) > 0
