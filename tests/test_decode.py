@@ -1,0 +1,248 @@
+"""`atalante decode` against cantools: every value in Parquet and in MCAP, for our network and for foreign ones."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import can
+import cantools
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from click.testing import CliRunner, Result
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from mcap.reader import make_reader
+
+import atalante_dbc
+from atalante_dbc.foreign import catalogue
+from atalante_tools.cli import cli
+from atalante_tools.decode.mcap import encode
+
+COLLECTION = sorted(Path(__file__).with_name("foreign").glob("*.dbc"))
+BEGIN = 1_700_000_000.0
+
+#: What a decoder may say about one signal of one message, in order of time.
+Series = dict[tuple[str, str], list[tuple[float, Any]]]
+
+
+def run(*arguments: object) -> Result:
+    result = CliRunner().invoke(cli, [str(argument) for argument in arguments])
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result
+
+
+def random_log(dbc: Path, path: Path, count: int) -> tuple[Path, Series]:
+    """A log of random payloads, and what cantools makes of it."""
+    generator = np.random.default_rng(count)
+    database = cantools.database.load_file(dbc, strict=False)
+    layouts = catalogue(dbc).layouts
+    expected: Series = defaultdict(list)
+    with can.Logger(path) as logger:
+        for number in range(count):
+            layout = layouts[number % len(layouts)]
+            data = generator.integers(0, 256, layout.length, dtype=np.uint8).tobytes()
+            stamp = BEGIN + number * 1e-4
+            logger.on_message_received(
+                can.Message(
+                    timestamp=stamp,
+                    arbitration_id=layout.frame_id,
+                    is_extended_id=layout.extended,
+                    is_fd=layout.length > 8 or bool(layout.fd),
+                    data=data,
+                    channel="can1",
+                )
+            )
+            for name, value in _decode(database.get_message_by_name(layout.name), data).items():
+                expected[layout.name, name].append((stamp, value))
+    return path, expected
+
+
+def _decode(message: Any, data: bytes) -> dict[str, Any]:
+    """What cantools decodes; with an undefined multiplexer, the signals that are always there."""
+    try:
+        return dict(message.decode(data, decode_choices=False))
+    except cantools.database.DecodeError:
+        return {}
+
+
+def check(found: Series, expected: Series) -> int:
+    compared = 0
+    for key, series in expected.items():
+        by_time = {round(stamp, 5): value for stamp, value in found[key]}
+        for stamp, value in series:
+            ours = by_time[round(stamp, 5)]
+            if value != value:
+                assert ours != ours
+            elif isinstance(value, int):
+                assert ours == value, (key, ours, value)
+            else:
+                assert ours == pytest.approx(value, rel=1e-9)
+            compared += 1
+    return compared
+
+
+def read_parquet(path: Path) -> Series:
+    found: Series = defaultdict(list)
+    for row in pq.read_table(path).to_pylist():
+        value = row["value"] if row["integer"] is None else int(row["integer"])
+        found[row["message"], row["signal"]].append((row["time"].value * 1e-9, value))
+    return found
+
+
+def read_mcap(path: Path) -> Series:
+    found: Series = defaultdict(list)
+    kinds: dict[int, Any] = {}
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            assert schema is not None
+            if schema.id not in kinds:
+                files = descriptor_pb2.FileDescriptorSet.FromString(schema.data)
+                pool = descriptor_pool.DescriptorPool()
+                for proto in files.file:
+                    pool.Add(proto)
+                kinds[schema.id] = message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
+            assert channel.topic == f"/can/{schema.name.rsplit('.')[-1]}"
+            decoded = kinds[schema.id].FromString(message.data)
+            for field, value in decoded.ListFields():
+                found[schema.name.rsplit(".")[-1], field.name].append((message.log_time * 1e-9, value))
+    return found
+
+
+@pytest.mark.parametrize("dbc", [*COLLECTION, atalante_dbc.DBC_FILE], ids=lambda path: path.stem)
+def test_parquet_like_cantools(dbc: Path, tmp_path: Path) -> None:
+    log, expected = random_log(dbc, tmp_path / "random.log", 300)
+    result = run("decode", log, "--dbc", dbc, "-o", tmp_path / "out.parquet")
+    assert result.exit_code == 0
+    assert check(read_parquet(tmp_path / "out.parquet"), expected) > 200
+
+
+@pytest.mark.parametrize("dbc", [*COLLECTION, atalante_dbc.DBC_FILE], ids=lambda path: path.stem)
+def test_mcap_like_cantools(dbc: Path, tmp_path: Path) -> None:
+    log, expected = random_log(dbc, tmp_path / "random.log", 300)
+    result = run("decode", log, "--dbc", dbc, "-o", tmp_path / "out.mcap")
+    assert result.exit_code == 0
+    found = read_mcap(tmp_path / "out.mcap")
+    wide = {("WholeScaled", "Wide")}  # integers beyond 64 bits are doubles in protobuf
+    assert check(found, {k: v for k, v in expected.items() if k not in wide}) > 200
+
+
+def test_columns_of_the_table(tmp_path: Path) -> None:
+    log, _ = random_log(atalante_dbc.DBC_FILE, tmp_path / "random.log", 200)
+    run("decode", log, "-o", tmp_path / "out.parquet")
+    table = pq.read_table(tmp_path / "out.parquet")
+    assert table.column_names == ["time", "channel", "message", "signal", "value", "integer", "text"]
+    metadata = pq.read_schema(tmp_path / "out.parquet").metadata
+    assert metadata[b"unit:LEFT_FH_STATE.Position"] == b"rad"
+    assert metadata[b"dbc"] == b"atalante.dbc"
+    only = pq.read_table(tmp_path / "out.parquet", filters=[("signal", "==", "Request")]).to_pylist()
+    names = {0: "NONE", 1: "START", 2: "STOP", 3: "HOLD"}
+    assert only
+    for row in only:
+        assert row["text"] == names.get(int(row["value"]))
+        assert row["channel"] == "can1"
+
+
+def test_several_logs_and_what_is_left_out(tmp_path: Path) -> None:
+    log, expected = random_log(atalante_dbc.DBC_FILE, tmp_path / "first.log", 200)
+    values = sum(map(len, expected.values()))
+    second = tmp_path / "second.log"
+    second.write_text(
+        log.read_text()
+        + "(1700000001.000000) can1 7FF##100\n"
+        + "(1700000001.000000) can1 181##10011\n"
+        + "(1700000001.000000) can1 181#R\n"
+        + "(1700000001.000000) can1 20000004#0000000000000000\n"
+        + "no frame\n"
+    )
+    result = run("decode", log, second, "-o", tmp_path / "out.parquet")
+    assert result.exit_code == 0
+    assert f"{2 * values} values of 400 frames" in result.stderr
+    for sentence in (
+        "1 frames of identifiers that the DBC does not have",
+        "2 frames that carry no data",
+        "1 frames shorter than their message",
+        "1 lines that are no CAN frame",
+    ):
+        assert sentence in result.stderr
+    assert pq.read_metadata(tmp_path / "out.parquet").num_rows == 2 * values
+
+
+def test_several_chunks_and_channels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from atalante_tools.validate import log as log_module
+
+    monkeypatch.setattr(log_module, "_PIECE_BYTES", 4096)
+    monkeypatch.setattr(log_module, "_CHUNK_FRAMES", 50)
+    log, expected = random_log(atalante_dbc.DBC_FILE, tmp_path / "random.log", 400)
+    lines = log.read_text().replace("can1", "can0", 70)
+    log.write_text(lines)
+    run("decode", log, "-o", tmp_path / "out.parquet")
+    run("decode", log, "-o", tmp_path / "out.mcap")
+    assert pq.read_metadata(tmp_path / "out.parquet").num_row_groups > 3
+    check(read_parquet(tmp_path / "out.parquet"), expected)
+    channels = {row["channel"] for row in pq.read_table(tmp_path / "out.parquet").to_pylist()}
+    assert channels == {"can0", "can1"}
+    with (tmp_path / "out.mcap").open("rb") as file:
+        stamps, topics = [], set()
+        for _, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            stamps.append(message.log_time)
+            topics.add(channel.topic)
+    assert stamps == sorted(stamps)
+    assert {"/can/LEFT_FH_STATE", "/can/can1/LEFT_FH_STATE"} <= topics
+
+
+def test_nothing_to_decode(tmp_path: Path) -> None:
+    log = tmp_path / "empty.log"
+    log.write_text("(1700000001.000000) can1 7FF##100\n")
+    assert run("decode", log, "-o", tmp_path / "out.parquet").exit_code == 1
+    assert run("decode", log, "-o", tmp_path / "out.mcap").exit_code == 1
+    assert pq.read_metadata(tmp_path / "out.parquet").num_rows == 0
+
+
+@pytest.mark.parametrize(
+    ("out", "code", "sentence"),
+    [
+        ("out.txt", 2, "must end in .parquet or .mcap"),
+        ("no/out.parquet", 1, "cannot be written"),
+        ("no/out.mcap", 1, "cannot be written"),
+    ],
+)
+def test_a_wrong_target_gets_a_sentence(out: str, code: int, sentence: str, tmp_path: Path) -> None:
+    log, _ = random_log(atalante_dbc.DBC_FILE, tmp_path / "random.log", 100)
+    result = run("decode", log, "-o", tmp_path / out)
+    assert result.exit_code == code
+    assert sentence in result.stderr
+
+
+def test_a_missing_log_gets_a_sentence(tmp_path: Path) -> None:
+    result = run("decode", tmp_path / "none.log", "-o", tmp_path / "out.parquet")
+    assert result.exit_code == 1
+    assert "there is no log" in result.stderr
+    assert not (tmp_path / "out.parquet").exists()
+
+
+def test_refused_messages_are_named(tmp_path: Path) -> None:
+    dbc = tmp_path / "foreign.dbc"
+    dbc.write_text('VERSION ""\nBS_:\nBU_: A\n\nBO_ 1 Long: 16 A\n SG_ S : 0|65@1+ (1,0) [0|0] "" A\n')
+    log = tmp_path / "a.log"
+    log.write_text("(1.000000) can0 001##1" + "00" * 16 + "\n")
+    result = run("decode", log, "--dbc", dbc, "-o", tmp_path / "out.parquet")
+    assert "Long is not decoded: S has 65 bits" in result.stderr
+    assert "1 frames of messages that are not supported" in result.stderr
+
+
+def test_encoding_of_many_fields() -> None:
+    """Field numbers above 15 take two bytes of tag, above 2047 three."""
+    numbers = [1, 15, 16, 300, 2047, 2048]
+    files = descriptor_pb2.FileDescriptorProto(name="m.proto", package="p")
+    message = files.message_type.add(name="M")
+    for number in numbers:
+        message.field.add(name=f"f{number}", number=number, type=16, label=1)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(files)
+    kind = message_factory.GetMessageClass(pool.FindMessageTypeByName("p.M"))
+    values = np.arange(3, dtype=np.int64) - 1
+    for row, payload in enumerate(encode([(n, values * n) for n in numbers], 3)):
+        decoded = kind.FromString(payload)
+        assert [getattr(decoded, f"f{n}") for n in numbers] == [(row - 1) * n for n in numbers]
