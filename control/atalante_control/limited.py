@@ -160,10 +160,18 @@ class LimitedRollouts:
                 break
         end = outer or inner
 
-        peak, curvature = 0.0, a + (rows[cycle + end][column + 1] - zd) / (end * PERIOD)
+        peak = 0.0
         if sign * ed > 0.0 > sign * found[1]:
-            turn = min(end, round(-ed / curvature / PERIOD))
-            peak = sign * state(turn)[0] / float(self._bounds[cycle + turn, 0 if sign > 0.0 else 1])
+            # Where e' is zero, by false position: the maximum is flat, twice is enough.
+            left, right, rate_left, rate_right = 0, end, ed, found[1]
+            for _ in range(2):
+                turn = left + round((right - left) * rate_left / (rate_left - rate_right))
+                then, rate, _ = state(turn)
+                peak = max(peak, sign * then / float(self._bounds[cycle + turn, 0 if sign > 0.0 else 1]))
+                if sign * rate > 0.0:
+                    left, rate_left = turn, rate
+                else:
+                    right, rate_right = turn, rate
         return found[0], found[1], cycle + end, peak
 
 
