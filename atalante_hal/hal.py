@@ -268,7 +268,10 @@ class Hal:
     def hold(self) -> Vector:
         """Send the HOLD frame; drives being enabled for a start get the next step of their state machine instead."""
         np.copyto(self._tx.values, self._hold_values)
-        if self._start_wanted and self.state.supervisor in (SupervisorState.READY, SupervisorState.HOLD):
+        if self._start_wanted and self.state.supervisor is SupervisorState.FAULT:
+            # The operator acknowledged: clear the drives that have a fault, the others go on holding.
+            self._tx_control[self.state.drive_state == DriveState.FAULT] = Controlword.FAULT_RESET
+        elif self._start_wanted and self.state.supervisor in (SupervisorState.READY, SupervisorState.HOLD):
             self._tx_control[:] = [controlword_towards_operation(int(s)) for s in self.state.drive_state.tolist()]
             # What the drive holds with now, so that nothing sags between its hold and the controller's first torque.
             self._limiter.restart(self.state.torque)

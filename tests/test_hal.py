@@ -197,16 +197,18 @@ def test_a_drive_that_leaves_operation_is_noticed_at_once(rig):
     assert "right_TH" in rig.hal.reason
 
 
-def test_a_drive_fault_is_latched(rig):
+def test_a_drive_fault_is_latched_until_the_operator_starts_again(rig):
     rig.until(S.ACTIVE)
-    at = rig.emulator.signals.index("RIGHT_TH_STATE", "DriveState")
-    rig.emulator.before_send.append(lambda _, values: values.__setitem__(at, DriveState.FAULT))
-    assert rig.cycle().supervisor is S.FAULT
-    rig.emulator.before_send.clear()
+    drives = rig.emulator.drives
+    drives.state[7] = DriveState.FAULT
+    drives._states_changed()
+    assert rig.run(2).supervisor is S.FAULT
     assert rig.run(100).supervisor is S.FAULT
+    assert drives.state[7] is DriveState.FAULT
+    assert set(drives.state) == {DriveState.FAULT, DriveState.QUICK_STOP_ACTIVE}
     rig.operator.start()
-    rig.run(3)
-    assert rig.hal.state.supervisor in (S.HOLD, S.ACTIVE)
+    assert rig.until(S.ACTIVE, 30).supervisor is S.ACTIVE
+    assert [c for c in rig.codes() if c in S.__members__] == ["READY", "ACTIVE", "FAULT", "HOLD", "ACTIVE"]
 
 
 def test_nodes_that_speak_another_dbc_keep_the_robot_out_of_ready(make_rig, network):
