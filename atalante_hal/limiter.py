@@ -30,13 +30,9 @@ class Limiter:
         self._low = np.empty_like(self._step)
         self._high = np.empty_like(self._step)
         self._finite = np.empty(self._step.shape, np.bool_)
-        self._asked = np.empty((2, len(self._step)))
-        self._allowed = np.stack([self._step, self._torque_max])
-        self._within = np.empty(self._asked.shape, np.bool_)
-        # Change and size of a torque side by side, to be asked about together: what each is counted from.
-        self._origin = np.zeros((2, len(self._step)))
+        self._allowed = list(zip(self._step.tolist(), self._torque_max.tolist(), strict=True))
         #: What was sent last; the rate limit counts from here. Shape (12,) [Nm].
-        self.last = self._origin[0]
+        self.last = np.zeros_like(self._step)
 
     def apply(self, torque: Vector) -> Limited:
         """Limit a command; the result is in `last`.
@@ -44,10 +40,10 @@ class Limiter:
         Args:
             torque: shape (12,) [Nm], not changed.
         """
-        asked = self._asked
-        np.subtract(torque, self._origin, asked)
-        np.absolute(asked, asked)
-        if np.less_equal(asked, self._allowed, self._within).tobytes() == _ALL_WITHIN:
+        for asked, last, (step, largest) in zip(torque.tolist(), self.last.tolist(), self._allowed, strict=True):
+            if not (-step <= asked - last <= step and -largest <= asked <= largest):
+                break
+        else:
             self.last[:] = torque
             return _AS_ASKED
         if np.isfinite(torque, out=self._finite).tobytes() != _ALL_TRUE:
@@ -68,7 +64,6 @@ class Limiter:
 
 
 _ALL_TRUE = b"\1" * 12
-_ALL_WITHIN = b"\1" * 24
 _NOT_FINITE = Limited(finite=False, clamped=False)
 _AS_ASKED = Limited(finite=True, clamped=False)
 _CLAMPED = Limited(finite=True, clamped=True)
