@@ -1,0 +1,220 @@
+"""How fast a log is judged, beside what others need to decode it: lines of `atalante bench`.
+
+The log is a run of the emulated robot in ACTIVE, repeated until it is 1.3 million frames long, with counters and checksums that
+go on over the seams: every rule has to find it clean.
+"""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.bulk import crc_differences, crc_of_zeros
+from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES
+from atalante_hal.frame import FRAME_BYTES, Frames, new_frames
+from atalante_tools.bench.measure import Block, Effort, Measurement, require
+from atalante_tools.validate.plan import Plan
+from atalante_tools.validate.project import Project
+
+#: Cycles recorded (whole periods of every message), and how often they are repeated: 50,000 cycles, 1.3 million frames.
+_CYCLES, _REPEATED = 2000, 25
+_QUICK_CYCLES, _QUICK_REPEATED = 300, 1
+#: Frames that python-can and cantools get in a block: they take their time.
+_SLICE = 30_000
+_MS = 1_000_000  # ns
+_BEGIN = 1_700_000_000 * 1000 * _MS
+_HEADER_BYTES = 8
+_LENGTHS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64])
+
+
+def judge_log(effort: Effort) -> Measurement:
+    """Read, decode and judge a candump log by all rules; the baseline reads and decodes it. CPU seconds a frame."""
+    import can
+    import cantools
+    from cantools.database.can import Database
+
+    with _log(effort) as (path, frames):
+        database = cantools.database.load_file(_dbc())
+        assert isinstance(database, Database)
+
+        def baseline() -> float:
+            begin, count = time.process_time(), 0
+            with can.LogReader(path) as reader:
+                for message in itertools.islice(reader, _SLICE):
+                    database.decode_message(message.arbitration_id, bytes(message.data))
+                    count += 1
+            return (time.process_time() - begin) / count
+
+        return effort.interleave(_judging(path, frames), baseline, share=0.02)
+
+
+def judge_against_mdf(effort: Effort) -> Measurement:
+    """The same work; the baseline is asammdf decoding the same frames from MF4, where nothing is parsed and nothing judged."""
+    try:
+        from asammdf import MDF
+    except ImportError:
+        return Measurement(None, None, ("asammdf and canmatrix are not installed: pip install asammdf canmatrix",))
+    with _log(effort) as (path, frames):
+        mdf = path.with_suffix(".mf4")
+        _write_mdf(mdf, frames)
+
+        def baseline() -> float:
+            begin = time.process_time()
+            source = MDF(mdf)
+            found = source.extract_bus_logging({"CAN": [(_dbc(), 0)]})
+            require(len(found.groups) > 40, f"asammdf found {len(found.groups)} messages")
+            elapsed = time.process_time() - begin
+            found.close()
+            source.close()
+            return elapsed / len(frames)
+
+        return effort.interleave(_judging(path, frames), baseline, share=0.02)
+
+
+def _judging(path: Path, frames: Frames) -> Block:
+    from atalante_dbc.foreign import catalogue
+    from atalante_tools.validate.run import judge_log
+
+    plan = Plan(catalogue(_dbc()))
+
+    def block() -> float:
+        begin = time.process_time()
+        result = judge_log(path, plan, Project())
+        elapsed = time.process_time() - begin
+        require(result.judge.frames == len(frames), f"{result.judge.frames} of {len(frames)} frames were judged")
+        require(not result.findings, f"the log is not clean: {[f.as_json() for f in result.findings][:3]}")
+        return elapsed / len(frames)
+
+    return block
+
+
+def _dbc() -> Path:
+    from atalante_dbc import DBC_FILE
+
+    return DBC_FILE
+
+
+# -- the log ---------------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _log(effort: Effort) -> Iterator[tuple[Path, Frames]]:
+    """A candump log in a temporary folder, and its frames."""
+    cycles, repeated = (_QUICK_CYCLES, _QUICK_REPEATED) if effort.quick else (_CYCLES, _REPEATED)
+    frames, cycle, sent = _repeat(*_record(cycles), cycles, repeated)
+    with tempfile.TemporaryDirectory(prefix="atalante-bench-") as folder:
+        path = Path(folder) / "run.log"
+        _write(path, frames, _BEGIN + cycle * _MS, sent)
+        yield path, frames
+
+
+class _Tap:
+    """Every frame of the HAL, with cycle and direction."""
+
+    def __init__(self) -> None:
+        self.cycle = 0
+        self.taken: list[tuple[Frames, int, bool]] = []
+
+    def sent(self, frames: Frames) -> None:
+        self.taken.append((frames.copy(), self.cycle, True))
+
+    def received(self, frames: Frames, count: int) -> None:
+        self.taken.append((frames[:count].copy(), self.cycle, False))
+
+
+def _record(cycles: int) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    """The robot holding its pose in ACTIVE: frames, their cycle from 0, and which ones the HAL sent."""
+    from atalante_hal.types import Command, SupervisorState
+    from atalante_tools.options import EMBEDDED, Target
+    from atalante_tools.rig import open_hal
+
+    tap, no_vibration = _Tap(), np.zeros(8)
+    with open_hal(Target(EMBEDDED, "", True), tap=tap) as rig:
+        hal, held = rig.hal, 0
+        anchor = hal.state.position.copy()
+        while held < cycles:
+            tap.cycle = held
+            state = hal.read()
+            if state.supervisor is SupervisorState.ACTIVE:
+                hal.write(Command(hal.robot.hold_kp * (anchor - state.position), no_vibration))
+                held += 1
+            else:
+                anchor = state.position.copy()
+                hal.hold()
+                tap.taken.clear()
+            require(hal.state.cycle < cycles + 2000, "the robot is ACTIVE")
+    taken = tap.taken
+    frames = np.concatenate([f for f, _, _ in taken])
+    counts = [len(f) for f, _, _ in taken]
+    return frames, np.repeat([c for _, c, _ in taken], counts), np.repeat([s for _, _, s in taken], counts)
+
+
+def _repeat(
+    frames: Frames, cycle: npt.NDArray[np.int64], sent: npt.NDArray[np.bool_], cycles: int, times: int
+) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    """The recording over and over, with alive counters and checksums as if it had been one run."""
+    whole = new_frames(len(frames) * times)
+    whole.view("<u8").reshape(times, -1)[:] = frames.view("<u8")
+    octets = whole.view(np.uint8).reshape(-1, FRAME_BYTES)
+    from atalante_dbc import load
+
+    for message in load().messages:
+        rows = np.flatnonzero(whole["can_id"] == message.frame_id)
+        if not len(rows):
+            continue
+        of = octets[rows]
+        of[:, _HEADER_BYTES + COUNTER_BYTE] = np.arange(len(rows))
+        of[:, _HEADER_BYTES : _HEADER_BYTES + CRC_BYTES] = 0
+        right = crc_differences(of.reshape(-1).view(whole.dtype), message.length)
+        right ^= np.uint16(crc_of_zeros(message.length, message.data_id))
+        of[:, _HEADER_BYTES : _HEADER_BYTES + CRC_BYTES] = right[:, None].view(np.uint8)
+        octets[rows] = of
+    offset = np.repeat(np.arange(times) * cycles, len(frames))
+    return whole, np.tile(cycle, times) + offset, np.tile(sent, times)
+
+
+def _write(path: Path, frames: Frames, stamps: npt.NDArray[np.int64], sent: npt.NDArray[np.bool_]) -> None:
+    """Frames as candump writes them, a channel a bus."""
+    from atalante_dbc import load
+
+    head = {m.frame_id: f"{m.bus} {m.frame_id:03X}##1" for m in load().messages}
+    data, lines = frames["data"].tobytes().hex().upper(), []
+    columns = (frames["can_id"].tolist(), frames["len"].tolist(), stamps.tolist(), sent.tolist())
+    for place, (can_id, length, stamp, ours) in enumerate(zip(*columns, strict=True)):
+        seconds, rest = divmod(stamp // 1000, 10**6)
+        payload = data[128 * place : 128 * place + 2 * length]
+        lines.append(f"({seconds}.{rest:06d}) {head[can_id]}{payload} {'T' if ours else 'R'}\n")
+    path.write_text("".join(lines))
+
+
+def _write_mdf(path: Path, frames: Frames) -> None:
+    """The same frames as MF4 bus logging, the way python-can lays it out."""
+    from asammdf import MDF, Signal
+    from asammdf.blocks.v4_blocks import SourceInformation
+    from asammdf.blocks.v4_constants import BUS_TYPE_CAN, SOURCE_BUS
+    from can.io.mf4 import STD_DTYPE
+
+    samples = np.zeros(len(frames), STD_DTYPE)
+    for name, column in (
+        ("BusChannel", 1),
+        ("ID", frames["can_id"]),
+        ("DataLength", frames["len"]),
+        ("DLC", np.searchsorted(_LENGTHS, frames["len"])),
+        ("DataBytes", frames["data"]),
+        ("EDL", 1),
+        ("BRS", 1),
+    ):
+        samples[f"CAN_DataFrame.{name}"] = column
+    file = MDF(version="4.10")
+    source = SourceInformation(source_type=SOURCE_BUS, bus_type=BUS_TYPE_CAN)
+    stamps = np.arange(len(frames)) * 4e-5
+    file.append(Signal(name="CAN_DataFrame", samples=samples, timestamps=stamps, source=source))
+    file.save(path, overwrite=True)
+    file.close()
