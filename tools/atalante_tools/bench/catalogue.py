@@ -73,7 +73,7 @@ BENCHMARKS: Final = (
         "emulator_tick",
         motion.emulator_tick,
         "us",
-        "PyBullet alone: the same torques, step and reads",
+        "PyBullet's share of the same tick: torques, step and reads",
         2.3,
     ),
     Benchmark(
