@@ -207,12 +207,10 @@ class Hal:
 
     def _prepare_hold(self) -> None:
         """The HOLD frame: quick stop to every drive, no torque, motors still."""
-        self._tx_torque[:] = 0.0
-        self._tx_control[:] = Controlword.QUICK_STOP
-        self._tx_level[:] = 0.0
-        self._hold_values = self._tx.values.copy()
+        self._holding = True  # the command values are those of `hold`
+        self._tx_control.fill(Controlword.QUICK_STOP)
+        self._tx_state.fill(self.state.supervisor)
         self._no_level = np.zeros_like(self._tx_level)
-        self._enable = np.full_like(self._tx_control, Controlword.ENABLE_OPERATION)
         self._seal()
         self._written = True
 
@@ -262,12 +260,17 @@ class Hal:
         np.maximum(command.vibration, self._no_level, out=self._level_command)  # the codec cuts at 1
         self._torque_command[:] = self._tx_torque[:] = self._limiter.last
         self._tx_level[:] = self._level_command
-        self._tx_control[:] = self._enable
+        if self._holding:
+            self._tx_control.fill(Controlword.ENABLE_OPERATION)
+            self._holding = False
         return self._send_command()
 
     def hold(self) -> Vector:
         """Send the HOLD frame; drives being enabled for a start get the next step of their state machine instead."""
-        np.copyto(self._tx.values, self._hold_values)
+        self._holding = True
+        self._tx_torque.fill(0.0)
+        self._tx_control.fill(Controlword.QUICK_STOP)
+        self._tx_level.fill(0.0)
         if self._start_wanted and self.state.supervisor is SupervisorState.FAULT:
             # The operator acknowledged: clear the drives that have a fault, the others go on holding.
             self._tx_control[self.state.drive_state == DriveState.FAULT] = Controlword.FAULT_RESET
@@ -312,7 +315,6 @@ class Hal:
     # -- bus ---------------------------------------------------------------------------------------------------------
 
     def _seal(self) -> None:
-        self._tx_state.fill(float(self.state.supervisor))
         self._tx_cycle.fill(float((self.state.cycle + 1) & 0xFFFFFFFF))
         self._tx.seal()
 
@@ -439,6 +441,7 @@ class Hal:
     def _enter(self, before: SupervisorState, after: SupervisorState) -> None:
         state = self.state
         state.supervisor = after
+        self._tx_state.fill(after)
         if after is SupervisorState.ACTIVE:
             self._start_wanted = 0
             self._limiter.restart(state.torque)

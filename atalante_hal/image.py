@@ -233,8 +233,8 @@ class TransmitImage:
         self._words = self.frames.view(np.uint64)
         self._e2e = E2eFields(self.frames, self.codec.messages)
         rows = len(self.codec.messages)
-        # Counters overflow into nothing, as they should.
-        self._counters, self._one = np.full(rows, 255, np.uint8), np.ones(rows, np.uint8)
+        self._counters = [0xFF] * rows
+        self._in_step = True  # all rows have the counter of the first: none was ever sealed alone
         self._singles = [self.frames[row : row + 1] for row in range(rows)]
 
     def seal(self) -> Frames:
@@ -244,19 +244,27 @@ class TransmitImage:
             ValueError: NaN for a signal without an invalid code.
         """
         self.codec.pack(self.values, self._words)
-        np.add(self._counters, self._one, self._counters)
-        self._e2e.counters[:] = self._counters
+        if self._in_step:
+            counter = self._counters[0] = (self._counters[0] + 1) & 0xFF
+            self._e2e.counters.fill(counter)
+        else:
+            self._counters = [(counter + 1) & 0xFF for counter in self._counters]
+            self._e2e.counters[:] = self._counters
         self._e2e.crcs[:] = self._e2e.checksums()
         return self.frames
 
     def seal_row(self, row: int) -> Frames:
         """As `seal` for one row alone, the counters of the others stay. Shape (1,)."""
         self.codec.pack(self.values, self._words)
-        self._counters[row : row + 1] += 1
+        self.resume(row, self._counter_of(row) + 1 & 0xFF)
         self._e2e.counters[:] = self._counters
         self._e2e.crcs[:] = self._e2e.checksums()
         return self._singles[row]
 
     def resume(self, row: int, counter: int) -> None:
         """Go on after the frame with this alive counter, which another sender of the row sent."""
-        self._counters[row] = counter
+        self._counters = [self._counter_of(other) for other in range(len(self._counters))]
+        self._counters[row], self._in_step = counter, False
+
+    def _counter_of(self, row: int) -> int:
+        return self._counters[0 if self._in_step else row]
