@@ -222,6 +222,37 @@ def _on(message: can.Message, channel: int) -> can.Message:
     return copy
 
 
+def test_a_babbling_node_with_ever_new_identifiers(plan: Plan) -> None:
+    """Thousands of identifiers are a hundred findings and the rest in one, in no time."""
+    generator = np.random.default_rng(0)
+    frames = new_frames(20_000)
+    frames["can_id"] = generator.integers(0, 1 << 29, len(frames)).astype(np.uint32) | np.uint32(1 << 31)
+    frames["can_id"][:500] = 0x7E0
+    judge = Judge(plan)
+    stamps = np.arange(len(frames), dtype=np.int64) * 1000
+    judge.judge(Chunk(frames, stamps, np.zeros(len(frames), np.uint8), np.full(len(frames), NOT_SAID, np.int8)), ["a"])
+    judge.finish()
+    found = [finding for finding in judge.findings.all() if finding.rule == "unknown-id"]
+    assert len(found) == 101
+    assert sum(finding.count for finding in found) == len(frames)
+    assert max(found, key=lambda f: f.count if f.message != "(others)" else 0).message == "0x7e0"
+
+
+def test_many_channel_names_are_no_overflow(tmp_path: Path) -> None:
+    path = tmp_path / "names.log"
+    path.write_text("".join(f"({k}.000000) ch{k} 7FF#00\n" for k in range(400)))
+    result = run("validate", path)
+    assert "400 frames" in result.stdout
+
+
+def test_candump_on_the_terminal_is_no_log(tmp_path: Path) -> None:
+    path = tmp_path / "terminal.log"
+    path.write_text("  vcan0  181   [8]  11 22 33 44 55 66 77 88\n" * 3)
+    result = run("validate", path)
+    assert result.exit_code == 1
+    assert "a .log is what `candump -l` writes" in result.stdout
+
+
 def test_several_logs_one_of_which_is_missing(good: Path, tmp_path: Path) -> None:
     result = run("validate", tmp_path / "none.log", good, tmp_path / "none.txt", "--node", "LEFT_FH")
     assert result.exit_code == 1

@@ -17,6 +17,7 @@ from atalante_hal.frame import Frames
 from atalante_hal.types import Command, SupervisorState
 from atalante_tools.options import Target
 from atalante_tools.rig import open_hal
+from atalante_tools.validate.coverage import unjudged, unseen_signals
 from atalante_tools.validate.findings import Finding
 from atalante_tools.validate.judge import Judge
 from atalante_tools.validate.log import open_log
@@ -501,6 +502,36 @@ def test_the_good_log_trips_nothing(
         judge, found = validate(text_of(log), tmp_path / "good.log", dbc)
         assert found == []
         assert judge.frames == len(recording.lines)
+
+
+def test_all_buses_on_one_channel(recording: Recording, network: Plan, tmp_path: Path) -> None:
+    """candump on vcan0: no finding, and the report says that buses and senders could not be told apart."""
+    log = recording.copy()
+    text = text_of(log)
+    for bus in NETWORK.buses:
+        text = text.replace(f" {bus} ", " vcan0 ")
+    text = text.replace(" T\n", "\n").replace(" R\n", "\n")
+    judge, found = validate(text, tmp_path / "vcan.log", network)
+    assert found == []
+    rules = {rule for item in unjudged(judge) for rule in item.rules}
+    assert {"wrong-bus", "sender"} <= rules
+    judge, _ = validate(text_of(log), tmp_path / "named.log", network)
+    assert not {"wrong-bus", "sender"} & {rule for item in unjudged(judge) for rule in item.rules}
+
+
+def test_every_signal_is_judged_or_said_not_to_be(recording: Recording, network: Plan, tmp_path: Path) -> None:
+    """A signal on which no mutation could ever be found is in the list of those that no rule looked at."""
+    judge, _ = validate(text_of(recording), tmp_path / "good.log", network)
+    unseen = {f"{layout.name}.{name}" for layout, name in unseen_signals(judge)}
+    assert "SYNC_LEFT_LEG.Cycle" in unseen
+    assert "PENDANT_STATE.RequestCounter" in unseen
+    for seen in (
+        "LEFT_FH_STATE.Position",
+        "LEFT_FH_STATE.DriveState",
+        "COMMAND_LEFT_LEG.FH_Controlword",
+        "HAL_STATUS.DbcHash",
+    ):
+        assert seen not in unseen
 
 
 @pytest.mark.parametrize("rule", RULE_OF)

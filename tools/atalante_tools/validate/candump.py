@@ -26,6 +26,7 @@ Places = npt.NDArray[np.intp]
 #: Bytes that must be readable before and behind the text: the widest window that is looked at.
 MARGIN = 160
 _NEWLINE, _RETURN, _SPACE, _OPEN, _CLOSE, _HASH, _DOT = b"\n\r ()#."
+_MOST_CHANNELS = 256
 _NAME_BYTES = 16  # longest channel name read at once; Linux allows 15
 _LONGEST = 2 * 64  # hexadecimal digits
 _STANDARD, _ALL_BITS = 0x7FF, 0x1FFF_FFFF
@@ -54,8 +55,10 @@ class Channels:
     names: list[str] = field(default_factory=list)
 
     def index(self, name: str) -> int:
-        """Number of a channel, a new one for a name not seen before."""
+        """Number of a channel, a new one for a name not seen before; only damage makes more of them than a byte counts."""
         if name not in self.names:
+            if len(self.names) == _MOST_CHANNELS:
+                return _MOST_CHANNELS - 1
             self.names.append(name)
         return self.names.index(name)
 

@@ -14,7 +14,9 @@ from atalante_tools.validate.rules import RULE_OF
 
 Stamps = npt.NDArray[np.int64]
 #: Messages told apart by an identifier or a channel that somebody else chose are unbounded; more than this many are one.
-_MOST = 200
+MOST = 100
+OTHERS = "(others)"
+_UNBOUNDED = ("unknown-id",)
 
 
 @dataclass
@@ -134,8 +136,9 @@ class Findings:
 
     def _merge(self, found: Finding) -> None:
         key = (found.rule, found.message, found.signal)
-        if key not in self._found and sum(rule == found.rule for rule, _, _ in self._found) >= _MOST:
-            found.message, found.node, found.signal = "(others)", "", ""
+        full = sum(rule == found.rule for rule, _, _ in self._found) >= MOST
+        if found.rule in _UNBOUNDED and key not in self._found and full:
+            found.message = OTHERS
             key = (found.rule, found.message, "")
         known = self._found.setdefault(key, found)
         if known is found:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from atalante_hal.frame import FD_LENGTHS, FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_REMOTE, as_words
 from atalante_tools.validate.buses import Homes
 from atalante_tools.validate.chunk import NOT_SAID, SENT, Chunk
-from atalante_tools.validate.findings import Findings
+from atalante_tools.validate.findings import MOST, OTHERS, Findings
 from atalante_tools.validate.plan import UNKNOWN, Plan, Rows
 
 Places = npt.NDArray[np.intp]
@@ -23,7 +23,7 @@ _FD_LENGTH = np.isin(np.arange(256), FD_LENGTHS)
 _CLASSIC_LENGTH = np.arange(256) <= 8
 #: linux/can/error.h: class "problem of a controller", and in byte 1 its receive or transmit buffer overflow.
 _CONTROLLER, _OVERFLOW = 0x4, 0x3
-_HEADER_BYTES = 8
+_NUMBER = 0x1FFF_FFFF
 #: Share of the frames marked as sent that must be one node's for the log to be that node's.
 _RECORDER = 0.99
 
@@ -169,17 +169,21 @@ class FrameRules:
     def _report_unknown(self, part: Chunk) -> Rows:
         """Identifiers of no message; returns the rows of those that have one with the other identifier length."""
         can_ids = part.frames["can_id"] & np.uint32(~ID_REMOTE & 0xFFFFFFFF)
-        found = np.full(len(part), UNKNOWN, np.int16)
-        for can_id in np.unique(can_ids).tolist():
-            where = can_ids == can_id
-            row = self._plan.row_in_other_format(can_id)
-            if row == UNKNOWN:
-                number = f"{can_id & 0x1FFFFFFF:#x}"
-                self._findings.add("unknown-id", number, part.stamps[where], shown=[number], badness=np.zeros(1))
-            else:
-                found[where] = row
-                self._findings.add_rows("frame-ide", found[where], part.stamps[where])
+        found = self._plan.rows_in_other_format(can_ids)
+        twins = found != UNKNOWN
+        if bool(twins.any()):
+            self._findings.add_rows("frame-ide", found[twins], part.stamps[twins])
+        strange, stamps = can_ids[~twins] & np.uint32(_NUMBER), part.stamps[~twins]
+        numbers, counts = np.unique(strange, return_counts=True)
+        named = numbers[np.argsort(-counts, kind="stable")[:MOST]]
+        for number in named.tolist():
+            self._add_unknown(f"{number:#x}", stamps[strange == number])
+        if len(named) < len(numbers):
+            self._add_unknown(OTHERS, stamps[~np.isin(strange, named)])
         return found
+
+    def _add_unknown(self, name: str, stamps: npt.NDArray[np.int64]) -> None:
+        self._findings.add("unknown-id", name, stamps, shown=[name], badness=np.zeros(1))
 
     def _report_errors(self, part: Chunk) -> None:
         if not len(part):

@@ -117,7 +117,8 @@ class Log:
                 first_backwards,
             )
         if not frames:
-            self._remark("log-empty", f"{self.path} holds no CAN frame that can be read", 1, -1)
+            hint = "; a .log is what `candump -l` writes" if self.suffix == ".log" and self.size else ""
+            self._remark("log-empty", f"{self.path} holds no CAN frame that can be read{hint}", 1, -1)
 
     def _remark(self, rule: str, sentence: str, count: int, stamp: int) -> None:
         self.remarks.append(Remark(rule, sentence, count, stamp))

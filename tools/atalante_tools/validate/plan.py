@@ -126,12 +126,13 @@ class Plan:
             rows[left] = table.find(numbers[left] & mask)
         return rows
 
-    def row_in_other_format(self, can_id: int) -> int:
-        """Row that has the same number with the other identifier length, `UNKNOWN` if none has."""
-        number = can_id & _ALL_BITS
-        if can_id & ID_EXTENDED:
-            return int(self._standard[number]) if number < _STANDARD else UNKNOWN
-        return int(self._extended.find(np.array([number], np.uint32))[0])
+    def rows_in_other_format(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
+        """Rows that have the same number with the other identifier length, `UNKNOWN` where none has. Shape (n,)."""
+        numbers = can_ids & np.uint32(_ALL_BITS)
+        short = self._standard[np.where(numbers < _STANDARD, numbers, 0)]
+        short[numbers >= _STANDARD] = UNKNOWN
+        is_extended = (can_ids & np.uint32(ID_EXTENDED)) != 0
+        return np.where(is_extended, short, self._extended.find(numbers))
 
 
 class _Table:
