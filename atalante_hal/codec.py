@@ -104,6 +104,11 @@ class Codec:
         self._range = _words(high - low for low, high in limits)
         self._distance = np.empty(self.size, np.uint64)
         self._beyond = np.empty(self.size, np.bool_)
+        # Decoding one row alone: place of the value, bits, largest code, range, scale.
+        self._one_by_one: list[list[tuple[int, int, int, int, int, int, float, float]]] = [[] for _ in self.messages]
+        for i, (row, s, (low, high)) in enumerate(zip(self.row_of.tolist(), signals, limits, strict=True)):
+            plan = (i, s.start, (1 << s.length) - 1, largest[i], low, high, s.factor, s.offset)
+            self._one_by_one[row].append(plan)
         self._invalid = np.array([s.invalid_raw or 0 for s in signals], np.uint64)
         self._no_invalid = [s.invalid_raw is None for s in signals]
 
@@ -181,6 +186,29 @@ class Codec:
         inside = self.extract(frames.view(np.uint64))
         self.scale(out)
         return inside
+
+    def decode_row(self, row: int, payload: bytes, out: Vector) -> bool:
+        """The values of one message alone, signal by signal: for a handful of signals cheaper than array operations.
+
+        Args:
+            payload: of the message's length.
+            out: shape (size,), DBC units; other messages' values and those of a message outside its range stay.
+
+        Returns:
+            Whether every signal is inside its DBC range.
+        """
+        bits = int.from_bytes(payload, "little")
+        values = []
+        for place, start, mask, largest, low, high, factor, offset in self._one_by_one[row]:
+            code = bits >> start & mask
+            if code > largest:  # of a signed signal: negative
+                code -= mask + 1
+            if not low <= code <= high:
+                return False
+            values.append((place, code * factor + offset))
+        for place, value in values:
+            out[place] = value
+        return True
 
     def encode(self, values: Vector, frames: Frames) -> None:
         """Write physical values into the payloads; reserved bits become 0. Shape (size,), DBC units.

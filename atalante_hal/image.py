@@ -121,16 +121,14 @@ class ReceiveImage:
         return True
 
     def accept_each(self, frames: Frames, count: int) -> list[int]:
-        """Slow path: judge frames one by one in order of arrival, commit the good ones and decode. Call `new_cycle` before.
+        """Slow path: judge frames one by one in order of arrival, decode and commit the good ones. Call `new_cycle` before.
 
         Returns:
             Places in `frames[:count]` of the frames that are no message of this image.
         """
         self._synchronise_counters()
         foreign: list[int] = []
-        before, age_before, checks = self._words.copy(), self.age.copy(), self.check
-        words = as_words(frames)
-        committed = False
+        checks, words = self.check, as_words(frames)
         for place, header in enumerate(words[:count, 0].tolist()):
             row = self._row_of_header.get(header)
             if row is None:
@@ -142,19 +140,13 @@ class ReceiveImage:
                 continue
             payload = words[place].tobytes()[_HEADER_BYTES : _HEADER_BYTES + self._lengths[row]]
             result = self._judge(row, payload)
+            if result <= _FRESH and not self.codec.decode_row(row, payload, self.values):
+                result = Check.RANGE
             if result <= _FRESH:
                 self._words[row * WORDS : (row + 1) * WORDS] = words[place]
                 self.age[row] = 0
-                committed = True
             if result <= _FRESH or checks[row] > _FRESH:
                 checks[row] = result
-        if committed and not self.codec.extract(self._words):
-            for row in self.codec.rows_outside():
-                self.check[row], self.age[row] = Check.RANGE, age_before[row]
-                self._words[row * WORDS : (row + 1) * WORDS] = before[row * WORDS : (row + 1) * WORDS]
-            self.codec.extract(self._words)
-        if committed:
-            self.codec.scale(self.values)
         return foreign
 
     def _judge(self, row: int, payload: bytes) -> Check:
