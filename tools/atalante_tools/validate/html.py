@@ -16,8 +16,9 @@ from atalante_tools.validate.timing_rules import BINS, BINS_A_CYCLE
 
 Vector = npt.NDArray[np.float64]
 
-_WIDTH, _HEIGHT = 720, 190
-_LEFT, _RIGHT, _TOP, _BOTTOM = 64, 12, 12, 34
+_WIDTH, _HEIGHT = 760, 200
+_LEFT, _RIGHT, _TOP, _BOTTOM = 64, 28, 24, 36
+_LETTER = 7.0  # width of a character of the legend
 _COLOURS = ("#1b6ca8", "#c8553d", "#4f772d", "#7b4b94", "#b08900", "#3d5a6c", "#8d5524", "#555555")
 _POINTS = 720  # of a curve; more cannot be told apart
 _HISTOGRAMS = 12
@@ -138,32 +139,48 @@ class _Axes:
         )
 
     def legend(self, names: Sequence[str]) -> None:
+        """As many names as there is room for."""
         across = float(_LEFT)
         for number, name in enumerate(names):
+            width = 26 + _LETTER * len(name)
+            if across + width > _WIDTH - 2 * _LETTER:
+                self._shapes.append(f"<text x='{across:.0f}' y='11'>...</text>")
+                return
             colour = _COLOURS[number % len(_COLOURS)]
             self._shapes.append(
-                f"<rect x='{across:.0f}' y='1' width='9' height='9' fill='{colour}'/>"
-                f"<text x='{across + 13:.0f}' y='10'>{escape(name)}</text>"
+                f"<rect x='{across:.0f}' y='2' width='9' height='9' fill='{colour}'/>"
+                f"<text x='{across + 13:.0f}' y='11'>{escape(name)}</text>"
             )
-            across += 30 + 6.5 * len(name)
+            across += width
 
     def svg(self) -> str:
         (x0, y0), (x1, y1) = (self.at(self._x[0], self._y[0]).split(","), self.at(self._x[1], self._y[1]).split(","))
-        parts = [f"<svg viewBox='0 0 {_WIDTH} {_HEIGHT}' width='{_WIDTH}' height='{_HEIGHT}' role='img'>"]
+        parts = [
+            f"<svg viewBox='0 0 {_WIDTH} {_HEIGHT}' width='{_WIDTH}' height='{_HEIGHT}' role='img' font-size='11'>"
+        ]
         parts.append(f"<path d='M{x0},{y1} L{x0},{y0} L{x1},{y0}' fill='none' stroke='#888'/>")
-        for value in np.linspace(self._y[0], self._y[1], 3).tolist():
+        for value in _ticks(*self._y, 4):
             across, up = self.at(self._x[0], value).split(",")
             parts.append(
-                f"<text x='{float(across) - 6:.1f}' y='{float(up) + 4:.1f}' text-anchor='end'>{value:.4g}</text>"
+                f"<text x='{float(across) - 6:.1f}' y='{float(up) + 4:.1f}' text-anchor='end'>{value:g}</text>"
             )
-        for value in np.linspace(self._x[0], self._x[1], 7).tolist():
+        for value in _ticks(*self._x, 8):
             across, up = self.at(value, self._y[0]).split(",")
-            parts.append(f"<text x='{across}' y='{float(up) + 14:.1f}' text-anchor='middle'>{value:.6g}</text>")
+            parts.append(f"<text x='{across}' y='{float(up) + 14:.1f}' text-anchor='middle'>{value:g}</text>")
         parts.append(
             f"<text x='{_WIDTH - _RIGHT}' y='{_HEIGHT - 4}' text-anchor='end'>{escape(self._labels[0])}</text>"
         )
         parts.append(f"<text x='4' y='{_HEIGHT - 4}'>{escape(self._labels[1])}</text>")
         return "".join([*parts, *self._shapes, "</svg>"])
+
+
+def _ticks(low: float, high: float, most: int) -> list[float]:
+    """At most so many round numbers (1, 2 or 5 and zeros) from `low` to `high`."""
+    rough = (high - low) / most or 1.0
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(power * unit for unit in (1.0, 2.0, 5.0, 10.0) if power * unit >= rough * (1 - 1e-9))
+    first = math.ceil(low / step - 1e-9)
+    return [round(number * step, 12) for number in range(first, math.floor(high / step + 1e-9) + 1)]
 
 
 def _load_plot(result: Report) -> str:
@@ -173,7 +190,9 @@ def _load_plot(result: Report) -> str:
     load, begins = 100.0 * load[1:-1], begins[1:-1] - (result.judge.begin or 0) * 1e-9
     names = result.judge.load.names(result.judge.channels)
     used = [bus for bus in range(load.shape[1]) if load[:, bus].any()]
-    axes = _Axes((float(begins[0]), float(begins[-1])), (0.0, max(60.0, float(load.max()))), "time [s]", "load [%]")
+    axes = _Axes(
+        (float(begins[0]), float(begins[-1])), (0.0, max(60.0, 1.1 * float(load.max()))), "time [s]", "load [%]"
+    )
     for number, bus in enumerate(used):
         x, y = _thinned(begins, load[:, bus])
         axes.line(x, y, _COLOURS[number % len(_COLOURS)], names[bus])
@@ -197,7 +216,7 @@ def _gap_plot(result: Report) -> str:
     begin = (result.judge.begin or 0) * 1e-9
     rows = sorted({row for _, row, _ in gaps})
     largest = max(lost for _, _, lost in gaps)
-    axes = _Axes((0.0, result.duration_s or 1.0), (0.0, float(largest)), "time [s]", "frames missing")
+    axes = _Axes((0.0, result.duration_s or 1.0), (0.0, 1.1 * largest), "time [s]", "frames missing")
     for stamp, row, lost in gaps[:: max(1, len(gaps) // 4000)]:
         name = result.judge.plan.name(row)
         at = stamp * 1e-9 - begin
@@ -221,7 +240,7 @@ def _histograms(result: Report) -> list[str]:
         width = cycle / BINS_A_CYCLE
         axes = _Axes(
             (first * width, last * width),
-            (0.0, math.log10(1 + int(counts.max()))),
+            (0.0, 1.1 * math.log10(1 + int(counts.max()))),
             "interval [ms]",
             "log10 (1 + count)",
         )
