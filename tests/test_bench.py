@@ -25,6 +25,8 @@ TARGETS = {
     "filter_tick": 1 / 20,
     "emulator_tick": 2.3,
     "lockstep": 1 / 6,
+    "judge_log": 1 / 20,
+    "judge_against_mdf": 1.0,
 }
 
 

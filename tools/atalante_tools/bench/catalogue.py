@@ -8,6 +8,7 @@ from typing import Final
 
 from atalante_tools.bench import motion, startup, wire
 from atalante_tools.bench.measure import Effort, Measurement
+from atalante_tools.validate import benchmark
 
 _UNITS: Final = {"us": 1e6, "s": 1.0}
 
@@ -82,6 +83,20 @@ BENCHMARKS: Final = (
         "s",
         "real time: a simulated second of the whole stack in the air",
         1 / 6,
+    ),
+    Benchmark(
+        "judge_log",
+        benchmark.judge_log,
+        "us",
+        "python-can and cantools reading and decoding the same candump log, a frame",
+        1 / 20,
+    ),
+    Benchmark(
+        "judge_against_mdf",
+        benchmark.judge_against_mdf,
+        "us",
+        "asammdf decoding the same frames from MF4, a frame",
+        1.0,
     ),
     Benchmark(
         "start_up",
