@@ -16,6 +16,7 @@ from click.testing import CliRunner, Result
 
 import atalante_dbc
 from atalante_dbc.foreign import catalogue
+from atalante_hal.bus import BusDown
 from atalante_hal.codec import Codec
 from atalante_hal.e2e import crc, data_id_bytes
 from atalante_hal.frame import FRAME, Frames, new_frames
@@ -24,9 +25,10 @@ from atalante_tools.validate.chunk import NOT_SAID, Chunk
 from atalante_tools.validate.judge import Judge
 from atalante_tools.validate.log import LogError, open_log
 from atalante_tools.validate.plan import Plan
-from atalante_tools.validate.project import ProjectError, load_project
+from atalante_tools.validate.project import Project, ProjectError, load_project
 from atalante_tools.validate.report import report, text
 from atalante_tools.validate.rules import RULES
+from atalante_tools.validate.run import listen
 from atalante_tools.validate.timing_rules import BINS, jitter_p99
 
 NETWORK = atalante_dbc.load()
@@ -492,7 +494,7 @@ def test_a_wrong_rules_file_is_refused_by_key(content: str, sentence: str, tmp_p
 
 
 def test_a_live_bus(plan: Plan) -> None:
-    """A node that sends while the command listens; one frame is damaged."""
+    """A node that sends while the command listens; every fifth frame is damaged."""
     sender = can.Bus(interface="virtual", channel="validate", protocol=can.CanProtocol.CAN_FD)
     done = threading.Event()
 
@@ -500,7 +502,7 @@ def test_a_live_bus(plan: Plan) -> None:
         number = 0
         while not done.is_set():
             message = MESSAGES[number % len(MESSAGES)].__copy__()
-            if number == 60:
+            if number % 5 == 0:
                 message.data = bytearray(message.data)
                 message.data[5] ^= 1
             sender.send(message)
@@ -518,6 +520,57 @@ def test_a_live_bus(plan: Plan) -> None:
     assert result.exit_code == 1
     assert "crc" in rules_of(result)
     assert "dropped:" not in result.stderr
+
+
+class Played:
+    """A bus that plays frames, a few a `receive`, and then fails or falls silent."""
+
+    name = "played"
+    dropped = 3
+
+    def __init__(self, chunk: Chunk, fails: bool) -> None:
+        self.stamps = np.zeros(0, np.int64)
+        self._chunk, self._fails, self._at = chunk, fails, 0
+
+    def receive(self, frames: Frames, timeout: float = 0.0) -> int:
+        part = self._chunk.select(np.arange(self._at, min(self._at + 37, len(self._chunk))))
+        self._at += len(part)
+        if not len(part) and self._fails:
+            raise BusDown("played is down: the adapter was unplugged")
+        frames[: len(part)], self.stamps = part.frames, part.stamps
+        return len(part)
+
+    @property
+    def ended(self) -> bool:
+        return self._at >= len(self._chunk)
+
+    def send(self, frames: Frames) -> None:
+        raise AssertionError("a validator sends nothing")
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize("fails", [False, True])
+@pytest.mark.parametrize("count", [1, 2])
+def test_listening_is_like_reading(fails: bool, count: int, good: Path, plan: Plan) -> None:
+    """The same frames from a bus, or from two, trip what a log of them trips, and what the bus lost is a finding."""
+    (chunk,) = open_log(good).chunks()
+    halves = [chunk.select(np.flatnonzero(np.arange(len(chunk)) % count == place)) for place in range(count)]
+    buses = {f"can{place}": Played(half, fails) for place, half in enumerate(halves)}
+    result = listen(
+        buses,
+        plan,
+        Project(),
+        name="played",
+        over=lambda: not fails and all(bus.ended for bus in buses.values()),
+        node="LEFT_FH",
+    )
+    assert result.judge.frames == len(chunk)
+    rules = {finding.rule for finding in result.findings}
+    assert "dropped" in rules
+    assert ("log-truncated" in rules) == fails
+    assert (rules - {"dropped", "log-truncated"} == set()) == (count == 1)
 
 
 def test_a_bus_that_is_not_there() -> None:

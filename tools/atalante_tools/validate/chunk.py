@@ -14,6 +14,10 @@ from atalante_hal.frame import Frames
 SENT, RECEIVED, NOT_SAID = 1, 0, -1
 
 
+class LogError(ValueError):
+    """The log cannot be opened at all; the message says why, and what would be right."""
+
+
 @dataclass
 class Chunk:
     """Frames in the order of the log. Shapes (n,)."""
