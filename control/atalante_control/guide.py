@@ -32,8 +32,10 @@ Vector = npt.NDArray[np.float64]
 _ROWS = 8
 #: Columns of its left factor: Phi11 and Phi12 of SH, of SK, and what the disturbance adds to each rollout.
 _TERMS = 8
-#: Phi terms of all rows.
-_STATE_TERMS = Struct(f"{4 * _ROWS}d").pack_into
+#: Phi11 and Phi12 of a joint in the left factor, term by term: e and -e, torque and -torque in its own rows, zero in
+#: the other joint's; and where the joint's begin [bytes].
+_STATE_TERMS = Struct("2d16x2d16x2d16x2d").pack_into
+_JOINT_TERMS = (2 * _ROWS + 2) * 8
 
 
 @dataclass(frozen=True)
@@ -149,7 +151,7 @@ class GuideFilter:
             (p.kp, p.kd, p.kp - p.kd * p.kd / p.inertia, -p.kd * p.kp / p.inertia) for p in config.policies
         ]
         self._backup = [(p.kp, p.kd, p.torque_limit) for p in config.policies]
-        # Left factor of the product, by terms: the first four are written every cycle, in one go.
+        # Left factor of the product, by terms: the first four are written every cycle.
         terms = np.zeros((_TERMS, _ROWS))
         self._z, self._state_terms = terms.T, memoryview(terms.data).cast("B")
         self._z[range(4), range(4, 8)] = 1.0
@@ -214,7 +216,8 @@ class GuideFilter:
             Shape (4, n) [rad]: of SH the largest e and the largest -e under the disturbance bounds, then of SK.
         """
         flow, p, _, _, _ = self._views[cycle]
-        self._load(cycle, e_hip, ed_hip, e_knee, ed_knee)
+        self._load(0, cycle, e_hip, ed_hip)
+        self._load(1, cycle, e_knee, ed_knee)
         return np.asarray((self._z @ flow + p)[:4])
 
     @property
@@ -241,25 +244,20 @@ class GuideFilter:
         u = -kp * e - kd * ed
         return weight * (limit if u > limit else -limit if u < -limit else u)
 
-    def _load(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> None:
-        """x - P(t) into the product's left factor: both joints, both signs, error rows and torque rows."""
-        p0, p1, p2, p3 = self._p[cycle].tolist()
-        (h0, h1, h2, h3), (k0, k1, k2, k3) = self._torque_of
-        (hip_up, hip_down), (knee_up, knee_down) = self._push
-        e, ed, f, fd = e_hip - p0, ed_hip - p1, e_knee - p2, ed_knee - p3
-        t, td, u, ud = h0 * e + h1 * ed, h2 * ed + h3 * e, k0 * f + k1 * fd, k2 * fd + k3 * f
-        _STATE_TERMS(
-            self._state_terms, 0,
-            e, -e, 0.0, 0.0, t, -t, 0.0, 0.0,
-            ed, -ed, 0.0, 0.0, td + hip_up, hip_down - td, 0.0, 0.0,
-            0.0, 0.0, f, -f, 0.0, 0.0, u, -u,
-            0.0, 0.0, fd, -fd, 0.0, 0.0, ud + knee_up, knee_down - ud,
-        )  # fmt: skip
+    def _load(self, joint: int, cycle: int, e: float, ed: float) -> None:
+        """x - P(t) of one joint into the product's left factor: both signs, error rows and torque rows."""
+        p, pd = self._p[cycle, 2 * joint : 2 * joint + 2].tolist()
+        a, b, c, d = self._torque_of[joint]
+        up, down = self._push[joint]
+        y, yd = e - p, ed - pd
+        t, td = a * y + b * yd, c * yd + d * y
+        _STATE_TERMS(self._state_terms, joint * _JOINT_TERMS, y, -y, t, -t, yd, -yd, td + up, down - td)
 
     def _predict(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> None:
         """Largest ratio to the bound ahead, of each joint, into `_ratio`."""
         flow, p, scale, out, bounds = self._views[cycle]
-        self._load(cycle, e_hip, ed_hip, e_knee, ed_knee)
+        self._load(0, cycle, e_hip, ed_hip)
+        self._load(1, cycle, e_knee, ed_knee)
         np.dot(self._z, flow, out)
         np.add(out, p, out)
         np.multiply(out, scale, out)
@@ -309,15 +307,12 @@ class GuideFilter:
     def _linear(self, joint: int, side: int, cycle: int, e: float, ed: float) -> tuple[float, float]:
         """Largest ratio and largest torque over the limit of one linear rollout from `cycle` on."""
         flow, p, scale, out, _ = self._views[cycle]
-        if joint:
-            self._load(cycle, 0.0, 0.0, e, ed)
-        else:
-            self._load(cycle, e, ed, 0.0, 0.0)
-        np.dot(self._z, flow, out=out)
-        np.add(out, p, out=out)
-        np.multiply(out, scale, out=out)
-        row, best = 2 * joint + side, out.argmax(1)
-        return float(out[row, best[row]]), float(out[row + 4, best[row + 4]])
+        self._load(joint, cycle, e, ed)  # the other joint's rows are not looked at
+        np.dot(self._z, flow, out)
+        np.add(out, p, out)
+        np.multiply(out, scale, out)
+        row, n, best = 2 * joint + side, out.shape[1], out.argmax(1).tolist()
+        return self._out_cells[row * n + best[row]], self._out_cells[(row + 4) * n + best[row + 4]]
 
     def _block(self, first: int) -> int:
         """Where the packed block of the grid points from `first` on begins."""
