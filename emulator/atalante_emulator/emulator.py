@@ -139,7 +139,7 @@ class Emulator:
         self._target = values[codec.slice("TargetTorque")]
         self._limit = values[codec.slice("MaxTorque")]
         self._level = values[codec.slice("Level")]
-        self._hal_state = values[codec.slice("HalState")]
+        self._pendant_hears = codec.index("SYNC_RIGHT_SENSE", "HalState")
         self._sync_cycles = values[codec.slice("Cycle")]
         self._command_rows = [codec.rows[f"COMMAND_{side.upper()}_LEG"] for side in SIDES]
         self._level_row = codec.rows["HAPTICS_COMMAND"]
@@ -306,7 +306,9 @@ class Emulator:
         self.cycle += 1
 
     def _ask_operator(self, operator: Operator) -> None:
-        operator.hear(int(self._hal_state[0]))
+        heard = self._rx.values[self._pendant_hears]
+        if heard == heard:  # NaN until there was a SYNC on the pendant's bus
+            operator.hear(int(heard))
         said = operator.signals
         if said is not self._operator_said:
             self._speak_for(said)
