@@ -121,6 +121,7 @@ class Emulator:
         syncs = [m for m in heard if m.name.startswith("SYNC_")]
         # As they come on an embedded bus: the commands of the last cycle, then SYNC.
         self._rx = ReceiveImage([m for m in heard if m not in syncs] + syncs)
+        self._rx.values.fill(0.0)  # until something is commanded: no torque, motors still, a HAL that is OFF
         self._scratch = new_frames(_RECEIVE_BUDGET)
         self._scratch_from = [self._scratch[place:] for place in range(_RECEIVE_BUDGET)]
         self._waiting = 0  # frames at the head of the scratch that no SYNC has followed yet
@@ -306,9 +307,7 @@ class Emulator:
         self.cycle += 1
 
     def _ask_operator(self, operator: Operator) -> None:
-        heard = self._rx.values[self._pendant_hears]
-        if heard == heard:  # NaN until there was a SYNC on the pendant's bus
-            operator.hear(int(heard))
+        operator.hear(int(self._rx.values[self._pendant_hears]))
         said = operator.signals
         if said is not self._operator_said:
             self._speak_for(said)
