@@ -1,0 +1,41 @@
+"""The patient-exoskeleton model, from one set of parameters: what gait generation, controller, emulator and viewers load.
+
+`ExoskeletonParameters, Patient -> links (left leg, right leg its mirror image) -> URDF text -> Pinocchio model`. Frames
+follow REP-103: x forward, y left, z up; a link's frame is its joint's frame, and all are parallel at the zero pose but
+the feet, which toe out.
+"""
+
+from atalante_control.model.articulated import ArticulatedModel, pinocchio_model
+from atalante_control.model.exoskeleton import (
+    BASE_LINK,
+    LEG_LINKS,
+    ExoskeletonParameters,
+    imu_link,
+    links,
+    pad_link,
+)
+from atalante_control.model.patient import HEIGHT_RANGE, LEG_RANGE, MASS_RANGE, SEGMENTS, Patient
+from atalante_control.model.rigid_body import Box, Inertia, Link, Vector3
+from atalante_control.model.urdf_writer import urdf, urdf_text
+
+__all__ = [
+    "BASE_LINK",
+    "HEIGHT_RANGE",
+    "LEG_LINKS",
+    "LEG_RANGE",
+    "MASS_RANGE",
+    "SEGMENTS",
+    "ArticulatedModel",
+    "Box",
+    "ExoskeletonParameters",
+    "Inertia",
+    "Link",
+    "Patient",
+    "Vector3",
+    "imu_link",
+    "links",
+    "pad_link",
+    "pinocchio_model",
+    "urdf",
+    "urdf_text",
+]

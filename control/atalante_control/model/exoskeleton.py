@@ -1,0 +1,158 @@
+"""The exoskeleton alone, and with a patient in it: `ExoskeletonParameters (, Patient) -> links`.
+
+Left leg, and the right leg its mirror image; with a patient each of his segments is fused into the link that carries it.
+The exoskeleton alone is what joint idealization cancels; with the patient it is what walks.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+from atalante_control.model.patient import ANKLE_HEIGHT, Patient
+from atalante_control.model.rigid_body import ZERO, Box, Inertia, Link, Vector3
+from atalante_hal.robot import CELLS, LEG_JOINTS
+
+BASE_LINK = "pelvis"
+#: Link moved by each joint of a leg; prefixed with the side.
+LEG_LINKS = dict(zip(LEG_JOINTS, ("frontal_hip", "transverse_hip", "thigh", "shank", "ankle", "foot"), strict=True))
+
+
+@dataclass(frozen=True)
+class ExoskeletonParameters:
+    """An Atalante-like exoskeleton. Left side; the right side is its mirror image in the sagittal plane.
+
+    Joint offsets, axes, masses, sole and sensor places are rounded public numbers; where in its link a mass sits is
+    chosen here. Thigh and shank adjust to the patient.
+    """
+
+    thigh_length: float = 0.38  # m, SH to SK
+    shank_length: float = 0.408  # m, SK to SA
+
+    pelvis_mass: float = 16.5  # kg, pelvis and back
+    frontal_hip_mass: float = 3.7  # kg, a side, like all below
+    transverse_hip_mass: float = 4.4
+    thigh_mass: float = 9.0
+    shank_mass: float = 11.0
+    ankle_mass: float = 1.7
+    foot_mass: float = 3.2  # kg, with its force cells
+
+    fh_offset: Vector3 = (0.0, 0.089, 0.0)  # m, in the pelvis
+    th_offset: Vector3 = (-0.135, 0.169, 0.0)  # m, in the frontal hip
+    sh_offset: Vector3 = (0.135, 0.0, 0.0)  # m, in the transverse hip
+    knee_lateral: float = 0.005  # m, SK outwards of SH
+    ankle_lateral: float = -0.169  # m, SA outwards of SK
+    toe_out: float = math.radians(8.0)  # rad, foot about the vertical
+    ha_axis: Vector3 = (0.788, 0.0, 0.616)  # henke axis in the foot frame, normalised in the URDF
+
+    sole_size: tuple[float, float] = (0.275, 0.119)  # m, length and width
+    sole_centre: tuple[float, float] = (0.06, -0.165)  # m, x and z from the ankle
+    cell_x: tuple[float, float] = (0.178, -0.064)  # m, front and rear force cells from the ankle
+    cell_y: float = 0.027  # m, either side of the foot's middle
+    pad_radius: float = 0.005  # m, contact sphere under a cell, touching the sole plane
+    pad_mass: float = 0.0015  # kg, taken from the foot
+
+    torso_imu: Vector3 = (-0.14, 0.0, 0.50)  # m, in the pelvis link
+    pelvis_imu: Vector3 = (-0.164, -0.015, 0.191)  # m, in the pelvis link
+    tibia_imu: Vector3 = (-0.13, -0.074, 0.018)  # m, in the left shank, but z from SA: it sits at the lower end
+
+    def __post_init__(self) -> None:
+        for name in ("thigh_length", "shank_length"):
+            if not 0.2 < getattr(self, name) < 0.7:
+                raise ValueError(f"{name} is a length in m between 0.2 and 0.7, not {getattr(self, name)!r}")
+        if not 0.0 < 4 * self.pad_mass < 0.1 * self.foot_mass:
+            raise ValueError(f"pad_mass is positive and four pads are under a tenth of the foot, not {self.pad_mass!r}")
+
+
+def links(parameters: ExoskeletonParameters, patient: Patient | None = None) -> tuple[Link, ...]:
+    """Every body of the exoskeleton, parents first: pelvis, its IMUs, left leg, right leg.
+
+    With a patient, thigh and shank of the exoskeleton take his lengths and his segments are fused link by link: head,
+    arms and trunk into the pelvis, thigh, shank and foot into those of each leg. The names of the links stay.
+    """
+    p = parameters
+    if patient is not None:
+        p = replace(p, thigh_length=patient.length("thigh"), shank_length=patient.length("shank"))
+    pelvis = Box(p.pelvis_mass, (-0.13, 0.0, 0.12), (0.18, 0.36, 0.40))
+    base = Link(BASE_LINK, "", None, ZERO, 0.0, ZERO, pelvis.inertia(), (pelvis,))
+    imus = (_imu("torso", BASE_LINK, p.torso_imu), _imu("pelvis", BASE_LINK, p.pelvis_imu))
+    left = _left_leg(p)
+    if patient is not None:
+        worn = _worn(p, patient)
+        base, *left = (link.fused(*worn[link.name]) if link.name in worn else link for link in (base, *left))
+    return (base, *imus, *left, *(link.mirrored() for link in left))
+
+
+def imu_link(imu: str) -> str:
+    """Link whose origin and axes are those of an IMU of `IMUS`."""
+    return f"imu_{imu}"
+
+
+def pad_link(foot: str, cell: str) -> str:
+    """Link of the contact pad under a force cell; its axes are the foot's."""
+    return f"{foot}_foot_{cell}"
+
+
+def _worn(p: ExoskeletonParameters, patient: Patient) -> dict[str, tuple[Box, Inertia]]:
+    """The patient's segments in the frames of the links that carry them, left side.
+
+    His hip is where the axes of FH and SH cross, his knee on that of SK, his ankle at SA: the machine's lateral offsets
+    put thigh and shank half a centimetre beside each other. His foot stands on the middle of the sole's length.
+    """
+    hip = (-p.th_offset[0] - p.sh_offset[0], -p.th_offset[1] - p.sh_offset[1], -p.th_offset[2] - p.sh_offset[2])
+    heel = (p.sole_centre[0] - 0.5 * patient.length("foot"), 0.0, -0.5 * ANKLE_HEIGHT * patient.height)
+    return {
+        BASE_LINK: patient.body("HAT", ZERO, axis=2, direction=1),
+        "left_thigh": patient.body("thigh", hip, axis=2, direction=-1),
+        "left_shank": patient.body("shank", (0.0, p.ankle_lateral, 0.0), axis=2, direction=-1),
+        "left_foot": patient.body("foot", heel, axis=0, direction=1),
+    }
+
+
+def _left_leg(p: ExoskeletonParameters) -> list[Link]:
+    norm = math.sqrt(math.fsum(a * a for a in p.ha_axis))
+    ha_axis = (p.ha_axis[0] / norm, p.ha_axis[1] / norm, p.ha_axis[2] / norm)
+    sk, sa = (0.0, p.knee_lateral, -p.thigh_length), (0.0, p.ankle_lateral, -p.shank_length)
+    length, width = p.sole_size
+    sole_x, sole_z = p.sole_centre
+    # Slender boxes between a joint and the next; hip and ankle bodies enclose the motors at their joint.
+    chain = (
+        ("FH", p.fh_offset, 0.0, (1.0, 0.0, 0.0), Box(p.frontal_hip_mass, _half(p.th_offset), (0.17, 0.19, 0.12))),
+        ("TH", p.th_offset, 0.0, (0.0, 0.0, 1.0), Box(p.transverse_hip_mass, _half(p.sh_offset), (0.20, 0.10, 0.12))),
+        ("SH", p.sh_offset, 0.0, (0.0, 1.0, 0.0), Box(p.thigh_mass, _half(sk), (0.12, 0.09, p.thigh_length))),
+        ("SK", sk, 0.0, (0.0, 1.0, 0.0), Box(p.shank_mass, _half(sa), (0.12, 0.12, p.shank_length))),
+        ("SA", sa, p.toe_out, (0.0, 1.0, 0.0), Box(p.ankle_mass, (0.0, 0.0, -0.02), (0.09, 0.09, 0.08))),
+        (
+            "HA",
+            ZERO,
+            0.0,
+            ha_axis,
+            Box(p.foot_mass - 4 * p.pad_mass, (sole_x, 0.0, sole_z + 0.035), (length, width, 0.07)),
+        ),
+    )
+    legs: list[Link] = []
+    names = [BASE_LINK, *(f"left_{LEG_LINKS[joint]}" for joint in LEG_JOINTS)]
+    for (parent, name), (joint, origin, yaw, axis, box) in zip(pairwise(names), chain, strict=True):
+        legs.append(Link(name, parent, f"left_{joint}", origin, yaw, axis, box.inertia(), (box,)))
+        if joint == "SK":
+            x, y, over_ankle = p.tibia_imu
+            legs.append(_imu("left_tibia", name, (x, y, over_ankle - p.shank_length)))
+    pad = 0.4 * p.pad_mass * p.pad_radius**2
+    pad_inertia = Inertia(p.pad_mass, ZERO, (pad, 0.0, 0.0, pad, 0.0, pad))
+    for cell in CELLS:
+        origin = (
+            p.cell_x[0] if cell[0] == "F" else p.cell_x[1],
+            p.cell_y if cell[1] == "L" else -p.cell_y,
+            sole_z + p.pad_radius,
+        )
+        legs.append(Link(pad_link("left", cell), "left_foot", None, origin, 0.0, ZERO, pad_inertia, pad=p.pad_radius))
+    return legs
+
+
+def _imu(imu: str, parent: str, place: Vector3) -> Link:
+    return Link(imu_link(imu), parent, None, place, 0.0, ZERO, Inertia(0.0, ZERO, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)))
+
+
+def _half(vector: Vector3) -> Vector3:
+    return (0.5 * vector[0], 0.5 * vector[1], 0.5 * vector[2])

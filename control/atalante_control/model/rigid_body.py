@@ -1,0 +1,106 @@
+"""Rigid bodies and the links of a tree, with the two laws the model is built by: fusion and reflection.
+
+`Box` (what one draws) -> `Inertia` (what moves) -> `Link` (a body with the joint that carries it).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.robot import SIDES
+
+Vector3 = tuple[float, float, float]
+ZERO: Vector3 = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Box:
+    """Homogeneous solid that stands for a link's mass: mass [kg], centre [m] and edge lengths [m] in the link frame."""
+
+    mass: float
+    centre: Vector3
+    size: Vector3
+
+    def inertia(self) -> Inertia:
+        """Mass properties of the box, edges along the link's axes."""
+        x, y, z = (edge * edge * self.mass / 12.0 for edge in self.size)
+        return Inertia(self.mass, self.centre, (y + z, 0.0, 0.0, x + z, 0.0, x + y))
+
+
+@dataclass(frozen=True)
+class Inertia:
+    """Mass properties of a rigid body in a link frame."""
+
+    mass: float  # kg
+    centre: Vector3  # m, centre of mass
+    tensor: tuple[float, float, float, float, float, float]  # kg m2 about it: xx, xy, xz, yy, yz, zz
+
+    def matrix(self) -> npt.NDArray[np.float64]:
+        """The tensor as a symmetric matrix, shape (3, 3) [kg m2]."""
+        xx, xy, xz, yy, yz, zz = self.tensor
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+    def mirrored(self) -> Inertia:
+        """The same body reflected in the sagittal plane, y to -y."""
+        xx, xy, xz, yy, yz, zz = self.tensor
+        return Inertia(self.mass, mirrored(self.centre), (xx, -xy, xz, yy, -yz, zz))
+
+    def fused(self, other: Inertia) -> Inertia:
+        """Both bodies moving as one, in the frame they share: parallel axes, with the reduced mass of the two."""
+        mass = self.mass + other.mass
+        (ax, ay, az), (bx, by, bz) = self.centre, other.centre
+        share, reduced = other.mass / mass, self.mass * other.mass / mass
+        x, y, z = bx - ax, by - ay, bz - az
+        apart = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
+        xx, xy, xz, yy, yz, zz = (
+            one + two + reduced * distance for one, two, distance in zip(self.tensor, other.tensor, apart, strict=True)
+        )
+        return Inertia(mass, (ax + share * x, ay + share * y, az + share * z), (xx, xy, xz, yy, yz, zz))
+
+
+@dataclass(frozen=True)
+class Link:
+    """One body of the tree with the joint that carries it. `joint` is one of `JOINTS`, or None for a fixed link."""
+
+    name: str
+    parent: str
+    joint: str | None
+    origin: Vector3  # m, in the parent's frame
+    yaw: float  # rad, about the parent's z
+    axis: Vector3  # in the link's own frame; unused when fixed
+    inertia: Inertia
+    boxes: tuple[Box, ...] = ()  # drawn
+    pad: float = 0.0  # m, radius of a contact sphere at the link's origin; 0: touches nothing
+
+    def fused(self, box: Box, inertia: Inertia) -> Link:
+        """The link with a second body fixed in it, and drawn."""
+        return replace(self, inertia=self.inertia.fused(inertia), boxes=(*self.boxes, box))
+
+    def mirrored(self) -> Link:
+        """The link of the right leg. The axis stays: the mirrored joint's angle changes sign instead (MIRROR_SIGN)."""
+        name = _right(self.name)
+        if self.pad:  # the cell that lies in the mirror is named for its own side of the foot
+            name = name[:-1] + {"L": "R", "R": "L"}[name[-1]]
+        return Link(
+            name,
+            _right(self.parent),
+            self.joint and _right(self.joint),
+            mirrored(self.origin),
+            -self.yaw,
+            self.axis,
+            self.inertia.mirrored(),
+            tuple(Box(box.mass, mirrored(box.centre), box.size) for box in self.boxes),
+            self.pad,
+        )
+
+
+def mirrored(vector: Vector3) -> Vector3:
+    """A polar vector reflected in the sagittal plane."""
+    return (vector[0], -vector[1], vector[2])
+
+
+def _right(name: str) -> str:
+    return name.replace(SIDES[0], SIDES[1])

@@ -1,0 +1,78 @@
+"""URDF of a tree of links: the one text that PyBullet, Pinocchio and viewers load. `links, robot limits -> URDF`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from atalante_control.model.exoskeleton import ExoskeletonParameters, links
+from atalante_control.model.patient import Patient
+from atalante_control.model.rigid_body import Link
+from atalante_hal.robot import JOINTS, Robot
+
+
+def urdf(parameters: ExoskeletonParameters, robot: Robot, patient: Patient | None = None) -> str:
+    """URDF of the exoskeleton, empty or worn.
+
+    Joints are those of `JOINTS` in that order; limits come from `robot`. Bodies touch the world with the eight pads
+    alone. IMU links are massless frames. The same parameters give the same text, every number with all its digits.
+
+    Source: geometry and masses of `ExoskeletonParameters`, a link being a homogeneous box; segments of `Patient`.
+    """
+    return urdf_text(links(parameters, patient), robot)
+
+
+def urdf_text(bodies: Sequence[Link], robot: Robot) -> str:
+    """URDF of a tree of links, parents first."""
+    lines = ['<?xml version="1.0"?>', '<robot name="atalante_like">']
+    for link in bodies:
+        lines += _link_xml(link)
+        if link.parent:
+            lines += _joint_xml(link, robot)
+    lines.append("</robot>")
+    return "\n".join(lines) + "\n"
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return " ".join(repr(value + 0.0) for value in values)  # + 0.0: no negative zero in the text
+
+
+def _link_xml(link: Link) -> list[str]:
+    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    tensor = " ".join(f'{name}="{value + 0.0!r}"' for name, value in zip(names, link.inertia.tensor, strict=True))
+    lines = [
+        f'  <link name="{link.name}">',
+        "    <inertial>",
+        f'      <origin xyz="{_numbers(link.inertia.centre)}"/>',
+        f'      <mass value="{link.inertia.mass!r}"/>',
+        f"      <inertia {tensor}/>",
+        "    </inertial>",
+    ]
+    for box in link.boxes:
+        lines += [
+            "    <visual>",
+            f'      <origin xyz="{_numbers(box.centre)}"/>',
+            f'      <geometry><box size="{_numbers(box.size)}"/></geometry>',
+            "    </visual>",
+        ]
+    if link.pad:
+        lines.append(f'    <collision><geometry><sphere radius="{link.pad!r}"/></geometry></collision>')
+    return [*lines, "  </link>"]
+
+
+def _joint_xml(link: Link, robot: Robot) -> list[str]:
+    kind = "revolute" if link.joint else "fixed"
+    lines = [
+        f'  <joint name="{link.joint or link.name + "_mount"}" type="{kind}">',
+        f'    <parent link="{link.parent}"/>',
+        f'    <child link="{link.name}"/>',
+        f'    <origin xyz="{_numbers(link.origin)}" rpy="0.0 0.0 {link.yaw + 0.0!r}"/>',
+    ]
+    if link.joint:
+        row = JOINTS.index(link.joint)
+        low, high = float(robot.position_min[row]), float(robot.position_max[row])
+        effort, speed = float(robot.torque_max[row]), float(robot.velocity_max[row])
+        lines += [
+            f'    <axis xyz="{_numbers(link.axis)}"/>',
+            f'    <limit lower="{low!r}" upper="{high!r}" effort="{effort!r}" velocity="{speed!r}"/>',
+        ]
+    return [*lines, "  </joint>"]
