@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 import pytest
 
 from atalante_hal.diagnostics import Dtc, Reaction, Severity, dtcs_of, emergency, event_code, worst
