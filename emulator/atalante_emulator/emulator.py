@@ -10,7 +10,7 @@ another process (`run`). One seed gives one sequence of bytes.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -20,9 +20,11 @@ import numpy.typing as npt
 from atalante_dbc import Network
 from atalante_emulator.body import PERIOD, Body
 from atalante_emulator.drive import WATCHDOG, DriveParameters, Drives, DriveSignals
+from atalante_emulator.faults import Fault
 from atalante_emulator.foot import Feet, FootParameters
 from atalante_emulator.haptics import Haptics, HapticsParameters
 from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
+from atalante_emulator.link import FaultyBus
 from atalante_emulator.pendant import Operator, PendantSignals
 from atalante_hal.bus import Bus, BusFull
 from atalante_hal.codec import Codec
@@ -80,6 +82,7 @@ class Emulator:
         seed: int = 0,
         operator: Operator | None = None,
         parameters: EmulatorParameters | None = None,
+        faults: Sequence[Fault] = (),
     ) -> None:
         """Put the nodes on the bus.
 
@@ -88,9 +91,16 @@ class Emulator:
             bus: that carries all of the network's buses; several channels come as a `JoinedBus`.
             seed: of every random number: sensor noise and biases.
             operator: holds the pendant; None: the pendant is somebody else's node.
+            faults: what goes wrong, and when; cycle 0 is the first.
+
+        Raises:
+            FaultError: the network has no such target or signal.
         """
         parameters = parameters or EmulatorParameters()
         self.network, self.body, self.bus, self.operator = network, body, bus, operator
+        self._link: FaultyBus | None = None
+        if faults:
+            self.bus = self._link = FaultyBus(bus, network, faults, lambda: self.cycle, seed=seed)
         self.cycle = 0
         self.frames_lost = 0  # nodes' frames that the bus had no room for
         self.before_send: list[Callable[[int, Vector], None]] = []
@@ -226,7 +236,7 @@ class Emulator:
         if count < len(self._rx.frames):
             count = self._receive_rest(count)
             if not count:
-                return False
+                return self._cycle_without_sync()
         self._waiting = 0
         self._rx.accept(self._scratch, count)
         if self._rx.all_fresh:
@@ -261,7 +271,7 @@ class Emulator:
             self._commanded[leg] |= checks[row] <= Check.SOME_LOST
         synced = [place for place, row in enumerate(self._sync_rows) if checks[row] <= Check.SOME_LOST]
         if not synced:
-            return False
+            return self._cycle_without_sync()
         shares = [self._shares[place] for place in synced]
         number = int(max(self._sync_cycles[synced]))
         if number == self._last_sync:  # the rest of a cycle that has already run
@@ -273,6 +283,13 @@ class Emulator:
         self._commanded = [False] * len(SIDES)
         self._cycle(fresh, shares)
         return True
+
+    def _cycle_without_sync(self) -> bool:
+        """Whether the wire lost or spoilt this cycle's SYNC: then the millisecond goes by all the same."""
+        lost = self._link is not None and self._link.synced
+        if lost:
+            self._alone(hold=())
+        return lost
 
     def _send(self, frames: Frames) -> None:
         try:
@@ -363,13 +380,18 @@ class Emulator:
 
     def idle(self) -> None:
         """One millisecond without a HAL: the nodes say nothing but their heartbeat, and enabled drives hold."""
+        self._alone(hold=range(len(SIDES)))
+
+    def _alone(self, hold: Iterable[int]) -> None:
+        """One millisecond without SYNC; the legs of `hold` hold at once, the other by their watchdog."""
         body, drives = self.body, self.drives
         drives.sample(body.position)
         self._imus.sample(body.imu)
         self._rx.new_cycle()
         self._send_slow()
-        for leg in range(len(SIDES)):
+        for leg in hold:
             drives.hold(leg)
+        drives.command((False, False), self._controlword, self._target, self._limit)
         if drives.emergencies:
             self._send_emergencies()
         body.step(drives.drive(body.velocity))

@@ -30,6 +30,7 @@ from atalante_tools.terminal import Progress, say
 if TYPE_CHECKING:
     from atalante_emulator.body import PyBulletBody
     from atalante_emulator.emulator import Emulator
+    from atalante_emulator.faults import Fault
     from atalante_emulator.pendant import Operator
 
 #: How long the nodes may take to answer a SYNC [s]: on the wall clock half a cycle, in lock-step as long as a slow machine needs.
@@ -70,6 +71,7 @@ def open_hal(
     controller_fields: Sequence[tuple[str, int]] = (),
     gait_hash: int = 0,
     tap: FrameTap | None = None,
+    faults: Sequence[Fault] = (),
 ) -> Iterator[Rig]:
     """Assemble a HAL for a command and take it apart in order.
 
@@ -79,8 +81,10 @@ def open_hal(
         pose: joint angles the embedded robot starts from, shape (12,) [rad].
         operator: who holds the embedded pendant; one who starts as soon as the HAL is ready unless given.
         assistance_factor, controller_fields, gait_hash, tap: see `Hal`.
+        faults: of the embedded robot.
 
     Raises:
+        FaultError: the network has no such target or signal.
         BusError, ChannelMapError: the buses cannot be opened.
         Failed: the embedded robot needs PyBullet and it is not installed.
     """
@@ -96,7 +100,7 @@ def open_hal(
             from atalante_emulator.pendant import Operator
 
             operator = operator or Operator()
-            emulator = Emulator(network, robot, body, theirs, seed=seed, operator=operator)
+            emulator = Emulator(network, robot, body, theirs, seed=seed, operator=operator, faults=faults)
             ours.step = emulator.poll
         else:
             bus = join(network, open_buses(network, target))

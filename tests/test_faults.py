@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import math
+import pickle
+from typing import Any
+
+import pytest
+
+from atalante_emulator.faults import KINDS, Fault, FaultError
+
+
+def test_as_given_with_defaults_filled_in() -> None:
+    fault = Fault("duplicate", "LEFT_SK_STATE", 100, 5, p=0.25)
+    assert (fault.kind, fault.target, fault.start, fault.cycles) == ("duplicate", "LEFT_SK_STATE", 100, 5)
+    assert (fault["p"], fault["copies"]) == (0.25, 1)
+    assert fault.end == 105
+    assert str(fault) == "duplicate LEFT_SK_STATE p=0.25 copies=1"
+
+
+def test_for_good_from_the_start() -> None:
+    fault = Fault("silence", "LEFT_SK")
+    assert (fault.start, fault.end) == (0, math.inf)
+
+
+def test_signals_are_parameters() -> None:
+    assert Fault("value", "LEFT_SK_STATE", Position=1, p=0.5).signals == {"Position": 1.0}
+
+
+def test_equal_faults_are_one_and_travel_between_processes() -> None:
+    fault = Fault("drop", "LEFT_SK", 1, 2)
+    assert {fault, Fault("drop", "LEFT_SK", 1, 2, p=1.0)} == {fault}
+    assert pickle.loads(pickle.dumps(fault)) == fault
+    with pytest.raises(AttributeError):
+        fault.start = 2  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "says"),
+    [
+        ("dropp", {}, "no fault 'dropp'; there are drop, duplicate, "),
+        ("drop", {"start": -1}, "a fault starts in cycle 0 or later, not -1"),
+        ("drop", {"start": 1.0}, "a fault starts in cycle 0 or later, not 1.0"),
+        ("drop", {"cycles": 0}, "a fault lasts 1 cycle or longer, or None for good, not 0"),
+        ("drop", {"cycles": True}, "a fault lasts 1 cycle or longer, or None for good, not True"),
+        ("drop", {"p": 1.5}, "drop: p is a number from 0 to 1, not 1.5"),
+        ("drop", {"p": math.nan}, "drop: p is a number from 0 to 1, not nan"),
+        ("drop", {"p": "1"}, "drop: p is a number from 0 to 1, not '1'"),
+        ("drop", {"q": 1.0}, "drop: no parameter 'q'; there are p"),
+        ("silence", {"p": 1.0}, "silence: no parameter 'p'; there are none"),
+        ("delay", {"by": 0}, "delay: by is a whole number from 1 to 1000, not 0"),
+        ("delay", {"by": 1.0}, "delay: by is a whole number from 1 to 1000, not 1.0"),
+        ("length", {}, "length: bytes has to be given, a length CAN FD can carry, 0, 1, .*, 48, 64"),
+        ("length", {"bytes": 13}, "length: bytes is a length CAN FD can carry, .*, not 13"),
+        ("masquerade", {"like": 3}, "masquerade: like is the name of a message, not 3"),
+        ("value", {}, "value: name a signal of the message and what it is, as Position=0.3"),
+        ("raw", {"p": 0.5}, "raw: name a signal of the message and what it is, as Position=0.3"),
+        ("value", {"Position": math.inf}, "value: signal Position is a finite number, not inf"),
+    ],
+)
+def test_what_is_valid_is_said(kind: str, options: dict[str, Any], says: str) -> None:
+    with pytest.raises(FaultError, match=says):
+        Fault(kind, "LEFT_SK_STATE", **options)
+
+
+def test_every_kind_says_what_it_does() -> None:
+    for kind in KINDS.values():
+        assert kind.does
+        assert kind.targets
+        assert all(parameter.valid for parameter in kind.parameters.values())

@@ -1,0 +1,296 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from atalante_dbc import Network
+from atalante_emulator.faults import Fault, FaultError
+from atalante_emulator.link import BUS_OFF, FaultyBus
+from atalante_hal.bus.pair import lockstep_pair
+from atalante_hal.e2e import Check
+from atalante_hal.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, Frames, new_frames
+from atalante_hal.image import ReceiveImage, TransmitImage
+
+KNEE, HIP, COMMAND, SYNC = "LEFT_SK_STATE", "LEFT_SH_STATE", "COMMAND_LEFT_LEG", "SYNC_LEFT_LEG"
+FOREVER = None
+
+
+class Line:
+    """A HAL that sends SYNC and command, two drives that answer, and faults at their end of the bus."""
+
+    def __init__(self, network: Network, *faults: Fault, seed: int = 0) -> None:
+        self.cycle = 0
+        self.hal, wire = lockstep_pair()
+        self.nodes = FaultyBus(wire, network, faults, lambda: self.cycle, seed=seed)
+        self.commands = TransmitImage([network.message(COMMAND), network.message(SYNC)])
+        self.states = TransmitImage([network.message(KNEE), network.message(HIP)])
+        self.of_knee, self.of_command = (ReceiveImage([network.message(name)]) for name in (KNEE, COMMAND))
+        self.to_hal: list[Frames] = []
+        self.to_nodes: list[Frames] = []
+        self.checks: list[tuple[Check, Check]] = []
+
+    def run(self, cycles: int, *, room: int = 64) -> Line:
+        for _ in range(cycles):
+            buffer = new_frames(room)
+            self.commands.values[self.commands.codec.index(COMMAND, "SK_TargetTorque")] = self.cycle
+            self.hal.send(self.commands.seal())
+            count = self.nodes.receive(buffer)
+            self.to_nodes.append(buffer[:count].copy())
+            self.states.values[self.states.codec.index(KNEE, "Position")] = 0.01 * self.cycle
+            self.nodes.send(self.states.seal())
+            buffer = new_frames(64)
+            count = self.hal.receive(buffer)
+            self.to_hal.append(buffer[:count].copy())
+            self.checks.append((self._judge(self.of_command, self.to_nodes), self._judge(self.of_knee, self.to_hal)))
+            self.cycle += 1
+        return self
+
+    @staticmethod
+    def _judge(image: ReceiveImage, frames: list[Frames]) -> Check:
+        image.new_cycle()
+        image.accept_each(frames[-1], len(frames[-1]))
+        return Check(int(image.check[0]))
+
+    @property
+    def knee(self) -> list[Check]:
+        return [check for _, check in self.checks]
+
+    @property
+    def command(self) -> list[Check]:
+        return [check for check, _ in self.checks]
+
+
+@pytest.fixture
+def line(network: Network) -> Callable[..., Line]:
+    return lambda *faults, **options: Line(network, *faults, **options)
+
+
+OK, LOST, NOTHING = Check.OK, Check.SOME_LOST, Check.NO_DATA
+Make = Callable[..., Line]
+
+
+def ids(frames: Frames) -> list[int]:
+    return frames["can_id"].tolist()
+
+
+class TestPerfect:
+    def test_without_an_active_fault_every_byte_passes(self, line: Make, network: Network) -> None:
+        never = line(Fault("drop", KNEE, 1000)).run(20)
+        plain = line().run(20)
+        assert [f.tobytes() for f in never.to_hal] == [f.tobytes() for f in plain.to_hal]
+        assert [f.tobytes() for f in never.to_nodes] == [f.tobytes() for f in plain.to_nodes]
+        assert set(never.checks) == {(OK, OK)}
+
+    def test_it_is_a_bus(self, line: Make) -> None:
+        nodes = line().nodes
+        assert (nodes.name, nodes.dropped, len(nodes.stamps)) == ("embedded peer", 0, 1024)
+        nodes.close()
+        with pytest.raises(Exception, match="closed"):
+            nodes.send(new_frames(1))
+
+
+class TestDrop:
+    def test_a_burst_begins_and_ends_to_the_cycle(self, line: Make) -> None:
+        assert line(Fault("drop", KNEE, 3, 4)).run(9).knee == [OK] * 3 + [NOTHING] * 4 + [LOST, OK]
+
+    def test_towards_the_nodes(self, line: Make) -> None:
+        run = line(Fault("drop", COMMAND, 3, 2)).run(7)
+        assert run.command == [OK] * 3 + [NOTHING] * 2 + [LOST, OK]
+        assert set(run.knee) == {OK}
+
+    def test_only_the_target(self, line: Make, network: Network) -> None:
+        run = line(Fault("drop", KNEE, 0)).run(2)
+        assert [ids(f) for f in run.to_hal] == [[network.message(HIP).frame_id]] * 2
+
+    @pytest.mark.parametrize("kind", ["drop", "silence"])
+    def test_a_node(self, line: Make, kind: str) -> None:
+        assert set(line(Fault(kind, "LEFT_SK", 0)).run(3).knee) == {NOTHING}
+
+    def test_a_bus(self, line: Make) -> None:
+        run = line(Fault("drop", "left_leg", 0)).run(3)
+        assert not any(len(f) for f in run.to_hal + run.to_nodes)
+
+    def test_by_chance(self, line: Make) -> None:
+        runs = [line(Fault("drop", KNEE, 0, p=0.3), seed=seed).run(1000) for seed in (1, 1, 2)]
+        lost = [[check is NOTHING for check in run.knee] for run in runs]
+        assert lost[0] == lost[1] != lost[2]
+        assert sum(lost[0]) == pytest.approx(300, abs=50)
+
+    def test_two_faults_of_one_kind_have_a_chance_of_their_own(self, line: Make) -> None:
+        run = line(Fault("drop", KNEE, 0, p=0.5), Fault("drop", HIP, 0, p=0.5)).run(100)
+        assert {len(f) for f in run.to_hal} == {0, 1, 2}
+
+
+class TestOrderAndTime:
+    def test_duplicate(self, line: Make, network: Network) -> None:
+        run = line(Fault("duplicate", KNEE, 1, 1, copies=2)).run(3)
+        assert [ids(f).count(network.message(KNEE).frame_id) for f in run.to_hal] == [1, 3, 1]
+        assert run.knee == [OK] * 3
+
+    @pytest.mark.parametrize("by", [1, 3])
+    def test_delay(self, line: Make, by: int) -> None:
+        run = line(Fault("delay", KNEE, 2, by=by)).run(10)
+        assert run.knee == [OK] * 2 + [NOTHING] * by + [OK] * (8 - by)
+        assert run.of_knee.values[run.of_knee.codec.index(KNEE, "Position")] == pytest.approx(0.01 * (9 - by), abs=1e-4)
+
+    def test_delay_towards_the_nodes_is_not_heard_by_the_hal(self, line: Make) -> None:
+        run = line(Fault("delay", COMMAND, 2, 1, by=2)).run(6)
+        assert [len(f) for f in run.to_nodes] == [2, 2, 1, 2, 3, 2]
+        assert [len(f) for f in run.to_hal] == [2] * 6
+        assert run.command[4] is not NOTHING
+        assert run.to_nodes[4]["data"][:, 2].tolist() == [2, 4, 4]
+
+    def test_what_is_late_arrives_after_the_fault(self, line: Make) -> None:
+        run = line(Fault("delay", KNEE, 2, 1, by=3)).run(7)
+        assert [len(f) for f in run.to_hal] == [2, 2, 1, 2, 2, 3, 2]
+
+    def test_reorder(self, line: Make) -> None:
+        run = line(Fault("reorder", KNEE, 2, 4)).run(7)
+        assert [len(f) for f in run.to_hal] == [2, 2, 1, 3, 1, 3, 2]
+        counters = [int(f["data"][0, 2]) for frames in run.to_hal for f in [frames[i : i + 1] for i in range(len(frames))]
+                    if int(f["can_id"][0]) == run.states.codec.messages[0].frame_id]  # fmt: skip
+        assert counters == [0, 1, 3, 2, 5, 4, 6]
+
+    def test_reorder_of_an_odd_number_loses_none(self, line: Make) -> None:
+        assert [len(f) for f in line(Fault("reorder", KNEE, 2, 3)).run(6).to_hal] == [2, 2, 1, 3, 2, 2]
+
+
+class TestContent:
+    def test_flip(self, line: Make) -> None:
+        run = line(Fault("flip", KNEE, 1, 50, bits=3)).run(52)
+        assert run.knee[0] is OK
+        assert set(run.knee[1:51]) == {Check.CRC}
+        plain = line().run(52)
+        wrong = [np.unpackbits(a["data"] ^ b["data"]).sum() for a, b in zip(run.to_hal, plain.to_hal, strict=True)]
+        assert wrong == [0] + [3] * 50 + [0]
+
+    def test_more_bits_than_there_are(self, line: Make) -> None:
+        run = line(Fault("flip", KNEE, 0, 1, bits=512)).run(1)
+        plain = line().run(1)
+        assert np.unpackbits(run.to_hal[0]["data"] ^ plain.to_hal[0]["data"]).sum() == 96
+
+    def test_frozen_counter(self, line: Make) -> None:
+        run = line(Fault("freeze_counter", KNEE, 2, 4)).run(8)
+        assert run.knee == [OK] * 3 + [Check.REPEATED] * 3 + [LOST, OK]
+        assert len({f["data"][0, 4:8].tobytes() for f in run.to_hal}) == 8
+
+    def test_masquerade(self, line: Make, network: Network) -> None:
+        run = line(Fault("masquerade", KNEE, 1, 1, like=HIP)).run(3)
+        assert run.knee == [OK, Check.CRC, LOST]
+        as_hip = ReceiveImage([network.message(HIP)])
+        frame = run.to_hal[1][:1].copy()
+        frame["can_id"] = network.message(HIP).frame_id
+        as_hip.accept_each(frame, 1)
+        assert Check(int(as_hip.check[0])) is OK
+
+    @pytest.mark.parametrize("length", [0, 2, 3, 8, 16, 64])
+    def test_length(self, line: Make, length: int) -> None:
+        run = line(Fault("length", KNEE, 1, 1, bytes=length)).run(3)
+        assert run.to_hal[1]["len"].tolist() == [length, 12]
+        assert run.knee == [OK, Check.LENGTH, LOST]
+
+    def test_classic_can(self, line: Make) -> None:
+        run = line(Fault("flags", KNEE, 1, 1, flags=FLAG_BRS)).run(2)
+        assert (run.to_hal[1]["len"][0], run.to_hal[1]["flags"][0]) == (8, 0)
+        assert run.knee == [OK, Check.LENGTH]
+
+    def test_without_bit_rate_switch(self, line: Make) -> None:
+        run = line(Fault("flags", KNEE, 1, 1, flags=FLAG_FDF)).run(2)
+        assert (run.to_hal[1]["len"][0], run.to_hal[1]["flags"][0]) == (12, FLAG_FDF)
+        assert run.knee == [OK, Check.LENGTH]
+
+    def test_value(self, line: Make) -> None:
+        run = line(Fault("value", KNEE, 1, 1, Position=-0.5, Velocity=2.0)).run(2)
+        assert run.knee == [OK, OK]
+        values, codec = run.of_knee.values, run.of_knee.codec
+        assert values[codec.index(KNEE, "Position")] == pytest.approx(-0.5, abs=1e-4)
+        assert values[codec.index(KNEE, "Velocity")] == pytest.approx(2.0)
+
+    def test_invalid_code(self, line: Make) -> None:
+        assert line(Fault("raw", KNEE, 1, 1, Position=0x800000)).run(2).knee == [OK, Check.RANGE]
+
+
+class TestAdded:
+    def test_second_source_of_a_command_is_heard_first_and_by_all(self, line: Make) -> None:
+        run = line(Fault("inject", COMMAND, 3, 2, SK_TargetTorque=100.0)).run(6)
+        assert [len(f) for f in run.to_nodes] == [2, 2, 2, 3, 3, 2]
+        assert [len(f) for f in run.to_hal] == [2, 2, 2, 3, 3, 2]
+        heard = ReceiveImage([run.commands.codec.messages[0]])
+        torque = heard.codec.index(COMMAND, "SK_TargetTorque")
+        for cycle, frames in enumerate(run.to_nodes):
+            heard.new_cycle()
+            heard.accept_each(frames, len(frames))
+            assert heard.values[torque] == pytest.approx(100.0 if cycle in (3, 4) else cycle)
+            assert heard.check[0] == OK
+
+    def test_second_source_that_does_not_know_the_counter(self, line: Make) -> None:
+        run = line(Fault("inject", COMMAND, 3, 1, ahead=100, count=2)).run(4)
+        counters = run.to_nodes[3]["data"][:, 2].tolist()
+        assert counters == [102, 103, 3, 3]
+
+    def test_second_source_from_the_first_cycle(self, line: Make) -> None:
+        run = line(Fault("inject", KNEE, 0, 1, Position=1.0)).run(1)
+        assert len(run.to_hal[0]) == 3
+        assert run.to_hal[0]["data"][0, 2] == 1
+
+    def test_foreign_frames(self, line: Make) -> None:
+        run = line(Fault("foreign", "left_leg", 1, 1, can_id=0, count=3)).run(3)
+        assert [ids(f)[:3] for f in (run.to_hal[1], run.to_nodes[1])] == [[0] * 3] * 2
+        assert set(run.checks) == {(OK, OK)}
+        long = line(Fault("foreign", "left_leg", 0, 1, can_id=0x800, bytes=64)).run(1).to_hal[0]
+        assert (long["can_id"][0], long["len"][0]) == (0x80000800, 64)
+
+    def test_once_a_cycle_though_sync_comes_in_parts(self, line: Make) -> None:
+        one = line(Fault("foreign", "left_leg", 0, 2, can_id=0))
+        for heard in (3, 2):
+            one.hal.send(one.commands.seal())
+            assert one.nodes.receive(new_frames(8)) == heard
+
+    def test_what_the_nodes_have_no_room_for_waits(self, line: Make) -> None:
+        run = line(Fault("foreign", "left_leg", 0, 1, can_id=0, count=5)).run(4, room=3)
+        assert [len(f) for f in run.to_nodes] == [3, 3, 3, 3]
+        assert ids(run.to_nodes[1])[:2] == [0, 0]
+
+    def test_error_frames_are_the_hals_own(self, line: Make) -> None:
+        run = line(Fault("error_frame", "left_leg", 1, 1, error=4)).run(2)
+        assert ids(run.to_hal[1])[0] == ID_ERROR | 4
+        assert len(run.to_nodes[1]) == 2
+
+    def test_bus_off(self, line: Make) -> None:
+        run = line(Fault("bus_off", "left_leg", 2, 2)).run(5)
+        assert [len(f) for f in run.to_nodes] == [2, 2, 0, 0, 2]
+        assert [ids(f) for f in run.to_hal[2:4]] == [[ID_ERROR | BUS_OFF], []]
+
+
+def test_faults_in_turn(line: Make) -> None:
+    run = line(Fault("value", KNEE, 0, Position=0.5), Fault("flip", KNEE, 1, 1, bits=1), Fault("drop", KNEE, 2, 1)).run(
+        4
+    )
+    assert run.knee == [OK, Check.CRC, NOTHING, LOST]
+
+
+def test_says_whether_the_hal_sent_sync(line: Make) -> None:
+    one = line(Fault("drop", SYNC, 0))
+    one.run(1)
+    assert one.nodes.synced
+    assert one.nodes.receive(new_frames(4)) == 0
+    assert not one.nodes.synced
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        (Fault("drop", "LEFT_KNEE"), "drop: 'LEFT_KNEE' is no message, node or bus; there are SYNC_LEFT_LEG, "),
+        (Fault("value", "LEFT_SK", Position=0.0), "value: 'LEFT_SK' is no message; there are SYNC_LEFT_LEG, "),
+        (Fault("silence", KNEE), "silence: 'LEFT_SK_STATE' is no node; there are HAL, LEFT_FH, "),
+        (Fault("bus_off", "HAL"), "bus_off: 'HAL' is no bus; there are left_leg, right_leg, left_sense, right_sense$"),
+        (Fault("value", KNEE, Angle=0.0), "value: no signal 'Angle' in LEFT_SK_STATE; there are Crc, Counter, "),
+        (Fault("masquerade", KNEE, like="KNEE"), "masquerade: like is a message, not 'KNEE'; there are SYNC_LEFT_LEG"),
+    ],
+    ids=str,
+)
+def test_a_fault_that_fits_no_network(network: Network, fault: Fault, says: str) -> None:
+    with pytest.raises(FaultError, match=says):
+        FaultyBus(lockstep_pair()[1], network, [fault], lambda: 0)
