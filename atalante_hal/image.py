@@ -229,18 +229,22 @@ class TransmitImage:
         self._in_step = True  # all rows have the counter of the first: none was ever sealed alone
         self._singles = [self.frames[row : row + 1] for row in range(rows)]
 
-    def seal(self) -> Frames:
+    def seal(self, *, again: bool = False) -> Frames:
         """Encode the values and protect every row: one counter step and the CRC. Returns the frames to send, shape (rows,).
+
+        Args:
+            again: the frames of the last `seal` were not sent and are replaced: their counters stay.
 
         Raises:
             ValueError: NaN for a signal without an invalid code.
         """
         self.codec.pack(self.values, self._words)
         if self._in_step:
-            counter = self._counters[0] = (self._counters[0] + 1) & 0xFF
+            counter = self._counters[0] = (self._counters[0] + (not again)) & 0xFF
             self._e2e.counters.fill(counter)
         else:
-            self._counters = [(counter + 1) & 0xFF for counter in self._counters]
+            if not again:
+                self._counters = [(counter + 1) & 0xFF for counter in self._counters]
             self._e2e.counters[:] = self._counters
         self._e2e.crcs[:] = self._e2e.checksums()
         return self.frames

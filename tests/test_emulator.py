@@ -231,6 +231,36 @@ class TestCycle:
         assert emulator.drives.missed == [0, 0]
         assert master.states == {DriveState.OPERATION_ENABLED}
 
+    def test_the_answer_is_one_batch_and_goes_out_before_the_body_moves(
+        self, make: Callable[..., Setup], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Whoever waits for it in another process gets all of it or none, and works while the body moves."""
+        master, emulator = make(operator=Operator())
+        master.sync()
+        done: list[str] = []
+        sizes: set[int] = set()
+
+        class Recorder:
+            def __init__(self, bus: Bus) -> None:
+                self.receive = bus.receive
+                self._send = bus.send
+
+            def send(self, frames: Frames) -> None:
+                done.append("send")
+                sizes.add(len(frames))
+                self._send(frames)
+
+        def noted(what: str, call: Callable[..., object]) -> Callable[..., object]:
+            return lambda *arguments: (done.append(what), call(*arguments))[1]
+
+        emulator.bus = Recorder(emulator.bus)  # type: ignore[assignment]
+        monkeypatch.setattr(emulator.body, "step", noted("step", emulator.body.step))
+        monkeypatch.setattr(emulator.drives, "sample", noted("sample", emulator.drives.sample))
+        for _ in range(200):
+            master.sync()
+        assert done == ["send", "step", "sample"] * 200
+        assert sizes == {19, 20, 21}
+
     def test_what_is_rewritten_before_sending_is_what_is_sent(self, make: Callable[..., Setup]) -> None:
         master, emulator = make()
         place = emulator.signals.index("IMU_PELVIS_STATE", "AccelX")

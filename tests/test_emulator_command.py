@@ -141,9 +141,9 @@ def received(bus: PairBus) -> list[int]:
 def test_the_line_counts_and_keeps_the_pendant_back_once_another_speaks() -> None:
     near, far = lockstep_pair()
     line = Line(near, pendant_id=0x194)
-    batch, alone, none = frames_with([0x181, 0x194]), frames_with([0x194]), new_frames(0)
+    batch, alone, none = frames_with([0x181, 0x194, 0x701]), frames_with([0x194]), new_frames(0)
     line.send(batch)
-    assert received(far) == [0x181, 0x194]
+    assert received(far) == [0x181, 0x194, 0x701]
     far.send(frames_with([0x10, 0x100]))
     assert line.receive(new_frames(8)) == 2
     assert not line.pendant_given_away
@@ -154,8 +154,8 @@ def test_the_line_counts_and_keeps_the_pendant_back_once_another_speaks() -> Non
         line.send(batch)
         line.send(alone)
         line.send(none)
-        assert received(far) == [0x181]
-    assert (line.sent, line.received) == (5, 4)
+        assert received(far) == [0x181, 0x701]
+    assert (line.sent, line.received) == (9, 4)
 
 
 def test_what_lies_behind_the_received_frames_is_not_heard() -> None:

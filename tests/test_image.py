@@ -90,6 +90,19 @@ def test_an_invalid_code_leaves_the_last_good_values():
     assert (np.delete(rx.check, row) == Check.OK).all()
 
 
+def test_frames_that_were_not_sent_are_sealed_again_under_their_counters():
+    tx, rx, buffer = pair()
+    deliver(tx, rx, buffer)
+    for _ in range(300):
+        tx.values[:] = 1.0
+        tx.seal()
+        tx.values[:] = 0.0
+        buffer[:ROWS] = tx.seal(again=True)
+        rx.accept(buffer, ROWS)
+        assert (rx.check == Check.OK).all()
+    assert abs(rx.values[rx.codec.index("LEFT_FH_STATE", "Torque")]) < 0.1
+
+
 def test_foreign_frames_are_named_wherever_they_stand():
     tx, rx, buffer = pair()
     deliver(tx, rx, buffer)

@@ -2,15 +2,16 @@
 
     bus -> process image -> E2E + validity -> nodes -> body (PyBullet) -> nodes -> process image -> bus
 
-A cycle begins with SYNC: every node samples and sends, then latches the command of the cycle before, and the body moves on by
-one millisecond. The same object answers an embedded HAL in lock-step (`poll` as the `step` of a `PairBus`) and a HAL in
-another process (`run`). One seed gives one sequence of bytes.
+A cycle begins with SYNC: every node latches the command of the cycle before and sends what it sampled, then the body moves on
+by one millisecond. Then the next answer is sampled and sealed ahead: a HAL that waits for it in another process waits for a
+copy, and works while the body moves. The same object answers an embedded HAL in lock-step (`poll` as the `step` of a `PairBus`)
+and a HAL in another process (`run`). One seed gives one sequence of bytes.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -20,16 +21,14 @@ import numpy.typing as npt
 from atalante_dbc import Network
 from atalante_emulator.body import PERIOD, Body
 from atalante_emulator.drive import WATCHDOG, DriveParameters, Drives, DriveSignals
-from atalante_emulator.faults import Fault
 from atalante_emulator.foot import Feet, FootParameters
 from atalante_emulator.haptics import Haptics, HapticsParameters
 from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
-from atalante_emulator.link import FaultyBus
 from atalante_emulator.pendant import Operator, PendantSignals
 from atalante_hal.bus import Bus, BusFull
 from atalante_hal.codec import Codec
 from atalante_hal.e2e import Check
-from atalante_hal.frame import Frames, new_frames
+from atalante_hal.frame import Frames, as_words, new_frames
 from atalante_hal.image import ReceiveImage, TransmitImage
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, SIDES, Robot
 
@@ -68,8 +67,8 @@ class _Status(NamedTuple):
 class Emulator:
     """All nodes of the network but the HAL, on one body.
 
-    `before_send` holds callables `(cycle, values)` that may rewrite what the nodes are about to say: `values` is in the order
-    of `signals`.
+    `before_send` holds callables `(cycle, values)` that may rewrite what the nodes are about to say, called when the SYNC of that
+    cycle has come: `values` is in the order of `signals`.
     """
 
     def __init__(
@@ -82,7 +81,6 @@ class Emulator:
         seed: int = 0,
         operator: Operator | None = None,
         parameters: EmulatorParameters | None = None,
-        faults: Sequence[Fault] = (),
     ) -> None:
         """Put the nodes on the bus.
 
@@ -91,16 +89,9 @@ class Emulator:
             bus: that carries all of the network's buses; several channels come as a `JoinedBus`.
             seed: of every random number: sensor noise and biases.
             operator: holds the pendant; None: the pendant is somebody else's node.
-            faults: what goes wrong, and when; cycle 0 is the first.
-
-        Raises:
-            FaultError: the network has no such target or signal.
         """
         parameters = parameters or EmulatorParameters()
         self.network, self.body, self.bus, self.operator = network, body, bus, operator
-        self._link: FaultyBus | None = None
-        if faults:
-            self.bus = self._link = FaultyBus(bus, network, faults, lambda: self.cycle, seed=seed)
         self.cycle = 0
         self.frames_lost = 0  # nodes' frames that the bus had no room for
         self.before_send: list[Callable[[int, Vector], None]] = []
@@ -108,6 +99,7 @@ class Emulator:
         self._bind_commands()
         self._build_nodes(robot, parameters)
         self._build_noise(seed)
+        self._look_ahead()
 
     @property
     def signals(self) -> Codec:
@@ -123,6 +115,7 @@ class Emulator:
         sent = [m for m in network.messages if m.sender in ours]
         cyclic = [m for bus in network.buses for m in sent if m.bus == bus and m.cycle_ms == 1]
         self._tx = TransmitImage(cyclic)
+        self._unsent = False  # the frames have been sealed and not sent since
         self._haptics_tx = TransmitImage([network.message("HAPTICS_STATE")])
         self._status_messages = [m for m in sent if m.name.endswith("_STATUS")]
         self._emergency_tx = TransmitImage([m for m in sent if m.name.endswith("_EMCY")])
@@ -143,6 +136,10 @@ class Emulator:
             rows = [row for row, m in enumerate(cyclic) if m.bus == sync.bus]
             self._shares.append(self._tx.frames[rows[0] : rows[-1] + 1])
         self._whole = [self._tx.frames]
+        self._answered = self._shares  # shares of the last imperfect cycle
+        batch = new_frames(len(sent))
+        self._batch = as_words(batch)
+        self._batch_up_to = [batch[:count] for count in range(len(sent) + 1)]
 
     def _bind_commands(self) -> None:
         values, codec = self._rx.values, self._rx.codec
@@ -236,11 +233,12 @@ class Emulator:
         if count < len(self._rx.frames):
             count = self._receive_rest(count)
             if not count:
-                return self._cycle_without_sync()
+                return False
         self._waiting = 0
         self._rx.accept(self._scratch, count)
         if self._rx.all_fresh:
             self._commanded = [False] * len(SIDES)
+            self._complete_answer()
             self._cycle((True, True), self._whole)
             return True
         return self._imperfect_cycle()
@@ -271,63 +269,78 @@ class Emulator:
             self._commanded[leg] |= checks[row] <= Check.SOME_LOST
         synced = [place for place, row in enumerate(self._sync_rows) if checks[row] <= Check.SOME_LOST]
         if not synced:
-            return self._cycle_without_sync()
-        shares = [self._shares[place] for place in synced]
+            return False
         number = int(max(self._sync_cycles[synced]))
         if number == self._last_sync:  # the rest of a cycle that has already run
-            for frames in shares:
-                self._send(frames)
+            self._send([self._answered[place] for place in synced])
             return False
         self._last_sync = number
         fresh = self._commanded[0], self._commanded[1]
         self._commanded = [False] * len(SIDES)
-        self._cycle(fresh, shares)
+        self._complete_answer()
+        self._answered = [share.copy() for share in self._shares]
+        self._cycle(fresh, [self._answered[place] for place in synced])
         return True
 
-    def _cycle_without_sync(self) -> bool:
-        """Whether the wire lost or spoilt this cycle's SYNC: then the millisecond goes by all the same."""
-        lost = self._link is not None and self._link.synced
-        if lost:
-            self._alone(hold=())
-        return lost
-
-    def _send(self, frames: Frames) -> None:
+    def _send(self, parts: Sequence[Frames]) -> None:
+        """All that a cycle has to say in one batch: who waits for it takes it up at once or not at all."""
+        frames = parts[0] if len(parts) == 1 else self._gather(parts)
         try:
             self.bus.send(frames)
         except BusFull as error:
             self.frames_lost += len(frames) - error.sent
 
+    def _gather(self, parts: Sequence[Frames]) -> Frames:
+        end = 0
+        for part in parts:
+            begin, end = end, end + len(part)
+            self._batch[begin:end] = as_words(part)
+        return self._batch_up_to[end]
+
     # -- one cycle ---------------------------------------------------------------------------------------------------
 
-    def _cycle(self, fresh: tuple[bool, bool], shares: list[Frames]) -> None:
-        """Sample, send, latch, move: [k, k+1] is driven by the command of cycle k-1."""
-        body, drives, tx = self.body, self.drives, self._tx
-        drives.sample(body.position)
+    def _look_ahead(self) -> None:
+        """What the sensors say in the coming cycle: known as soon as the body has moved."""
+        body = self.body
+        self.drives.sample(body.position)
         self._imus.sample(body.imu)
         self._feet.sample(body.contact, body.foot_rotation)
-        if self.operator is not None:
-            self._ask_operator(self.operator)
-        phase = self.cycle % _NOISE_CYCLES
-        if not phase:
+        if not self.cycle % _NOISE_CYCLES:
             self._draw_noise()
-        np.add(self._truth, self._noise_rows[phase], out=tx.values)
-        for rewrite in self.before_send:
-            rewrite(self.cycle, tx.values)
-        tx.seal()
-        for frames in shares:
-            self._send(frames)
-        self._send_slow()
-        drives.command(fresh, self._controlword, self._target, self._limit)
-        if drives.emergencies:
-            self._send_emergencies()
-        body.step(drives.drive(body.velocity))
-        self.cycle += 1
+        if not self.before_send:
+            self._seal()
 
-    def _ask_operator(self, operator: Operator) -> None:
+    def _seal(self) -> None:
+        np.add(self._truth, self._noise_rows[self.cycle % _NOISE_CYCLES], out=self._tx.values)
+        for rewrite in self.before_send:
+            rewrite(self.cycle, self._tx.values)
+        self._tx.seal(again=self._unsent)
+        self._unsent = True
+
+    def _complete_answer(self) -> None:
+        """SYNC is there: what could not be said ahead of it."""
+        changed = self.operator is not None and self._ask_operator(self.operator)
+        if changed or self.before_send or not self._unsent:
+            self._seal()
+        self._unsent = False
+
+    def _cycle(self, fresh: tuple[bool, bool], answer: list[Frames]) -> None:
+        """Latch, send, move, look ahead: [k, k+1] is driven by the command of cycle k-1."""
+        drives = self.drives
+        drives.command(fresh, self._controlword, self._target, self._limit)
+        self._send(self._with_slow(answer))
+        self.body.step(drives.drive(self.body.velocity))
+        self.cycle += 1
+        self._look_ahead()
+
+    def _ask_operator(self, operator: Operator) -> bool:
+        """Whether the pendant says something else than before."""
         operator.hear(int(self._rx.values[self._pendant_hears]))
         said = operator.signals
-        if said is not self._operator_said:
-            self._speak_for(said)
+        if said is self._operator_said:
+            return False
+        self._speak_for(said)
+        return True
 
     def _speak_for(self, said: PendantSignals) -> None:
         self._operator_said = said
@@ -339,26 +352,30 @@ class Emulator:
         truth[at("PENDANT_STATE", "AssistanceSet")] = factor is not None
         truth[at("PENDANT_STATE", "AssistanceFactor")] = factor or 0.0
 
-    def _send_slow(self) -> None:
-        """Messages slower than the cycle, when they are due."""
+    def _with_slow(self, parts: list[Frames]) -> list[Frames]:
+        """`parts`, and the messages slower than the cycle that are due."""
         if self.cycle % self._haptics_cycles == 0:
             self._haptics.advance(self._level, int(self._rx.age[self._level_row]), self._haptics_cycles)
-            self._send(self._haptics_tx.seal())
+            parts = [*parts, self._haptics_tx.seal()]
         status = self._status_due.get(self.cycle % self._status_period)
         if status is not None:
             tx, node_state, uptime = status
             tx.values[uptime] = self.cycle * PERIOD
-            self._send(tx.seal())
+            parts = [*parts, tx.seal()]
             tx.values[node_state] = _OPERATIONAL
+        if self.drives.emergencies:
+            parts = [*parts, *self._seal_emergencies()]
+        return parts
 
-    def _send_emergencies(self) -> None:
-        tx = self._emergency_tx
+    def _seal_emergencies(self) -> list[Frames]:
+        tx, parts = self._emergency_tx, []
         for drive, register, code in self.drives.emergencies:
             name = f"{JOINTS[drive].upper()}_EMCY"
             tx.values[tx.codec.index(name, "ErrorRegister")] = register
             tx.values[tx.codec.index(name, "ErrorCode")] = code
-            self._send(tx.seal_row(tx.codec.rows[name]))
+            parts.append(tx.seal_row(tx.codec.rows[name]).copy())
         self.drives.emergencies.clear()
+        return parts
 
     # -- wall clock --------------------------------------------------------------------------------------------------
 
@@ -380,19 +397,12 @@ class Emulator:
 
     def idle(self) -> None:
         """One millisecond without a HAL: the nodes say nothing but their heartbeat, and enabled drives hold."""
-        self._alone(hold=range(len(SIDES)))
-
-    def _alone(self, hold: Iterable[int]) -> None:
-        """One millisecond without SYNC; the legs of `hold` hold at once, the other by their watchdog."""
-        body, drives = self.body, self.drives
-        drives.sample(body.position)
-        self._imus.sample(body.imu)
+        drives = self.drives
         self._rx.new_cycle()
-        self._send_slow()
-        for leg in hold:
+        for leg in range(len(SIDES)):
             drives.hold(leg)
-        drives.command((False, False), self._controlword, self._target, self._limit)
-        if drives.emergencies:
-            self._send_emergencies()
-        body.step(drives.drive(body.velocity))
+        if parts := self._with_slow([]):
+            self._send(parts)
+        self.body.step(drives.drive(self.body.velocity))
         self.cycle += 1
+        self._look_ahead()

@@ -111,7 +111,6 @@ class Line:
 
     def __init__(self, bus: Bus, pendant_id: int) -> None:
         self._bus, self._pendant_id = bus, pendant_id
-        self._without: dict[int, tuple[Frames, Frames]] = {}
         self.name = bus.name
         self.sent = 0
         self.received = 0
@@ -147,10 +146,6 @@ class Line:
         self._bus.close()
 
     def _without_pendant(self, frames: Frames) -> Frames:
-        """The batch less the pendant's frame, which is the last of a batch; a view, the same one every cycle."""
-        if not len(frames) or frames["can_id"][-1] != self._pendant_id:
-            return frames
-        known = self._without.get(id(frames))
-        if known is None:
-            known = self._without[id(frames)] = (frames, frames[:-1])
-        return known[1]
+        """The batch less the pendant's frame; a batch without it is itself."""
+        kept = frames["can_id"] != self._pendant_id
+        return frames if kept.all() else frames[kept]
