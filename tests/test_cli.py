@@ -137,7 +137,8 @@ def test_a_known_error_is_one_sentence_and_its_code(failing: Any, error: BaseExc
     assert result.exit_code == code
     assert result.stdout == ""
     if str(error) and not isinstance(error, SystemExit):
-        assert result.stderr.startswith(f"atalante: {error}")
+        diagnostic = getattr(error, "code", "")
+        assert result.stderr.startswith(f"atalante: {diagnostic}: {error}" if diagnostic else f"atalante: {error}")
         assert result.stderr.count("\n") == 1
     assert "Traceback" not in result.stderr
 

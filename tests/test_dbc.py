@@ -82,6 +82,7 @@ def _signal(name: str, rest: str) -> tuple[str, str]:
 MUTATIONS = {
     "overlap": (*_signal("Temperature", '52|8@1+ (1,-40) [-40|214] "degC" HAL'), "overlaps"),
     "does not fit": (*_signal("Torque", '90|16@1- (0.0125,0) [-400|400] "Nm" HAL'), "ends at bit 106"),
+    "endless factor": (*_signal("Torque", '80|16@1- (1e999,0) [-400|400] "Nm" HAL'), "factor inf"),
     "factor 0": (*_signal("Torque", '80|16@1- (0,0) [-400|400] "Nm" HAL'), "factor 0"),
     "range too wide": (*_signal("Torque", '80|16@1- (0.0125,0) [-500|400] "Nm" HAL'), "cannot hold"),
     "empty range": (*_signal("Torque", '80|16@1- (0.0125,0) [0|0] "Nm" HAL'), "min < max"),
@@ -104,6 +105,15 @@ MUTATIONS = {
     "no data id": ('BA_ "E2EDataId" BO_ 385 41345;', "", "needs an E2EDataId"),
     "shared data id": ('BA_ "E2EDataId" BO_ 386 41346;', 'BA_ "E2EDataId" BO_ 386 41345;', "give each message its own"),
     "unbounded event": ('BA_ "GenMsgDelayTime" BO_ 129 100;', "", "GenMsgDelayTime"),
+    "node kind unknown": ('BA_ "NodeKind" BU_ LEFT_FH 1;', 'BA_ "NodeKind" BU_ LEFT_FH 9;', "one of master, drive"),
+    "cycle out of range": (
+        'BA_ "GenMsgCycleTime" BO_ 385 1;', 'BA_ "GenMsgCycleTime" BO_ 385 -1;', "a whole number from 0 to 10000"),
+    "cycle not whole": ('BA_ "TimeoutTime" BO_ 385 5;', 'BA_ "TimeoutTime" BO_ 385 5.5;', "a whole number from 0 to 10000"),
+    "invalid code no number": (
+        'BA_ "InvalidRaw" SG_ 385 Torque "0x8000";', 'BA_ "InvalidRaw" SG_ 385 Torque "x8";', "a raw code such as"),
+    "no default": ('BA_DEF_DEF_ "E2EDataId" 0;', "", "E2EDataId has no default"),
+    "no definition": ('BA_DEF_ SG_ "InvalidRaw" STRING;', "", "InvalidRaw has no definition"),
+    "undefined": ('BA_ "E2EDataId" BO_ 385 41345;', 'BA_ "DataId" BO_ 385 41345;', "DataId has no definition"),
     "invalid code in range": (
         'BA_ "InvalidRaw" SG_ 385 Torque "0x8000";', 'BA_ "InvalidRaw" SG_ 385 Torque "0x10";', "inside its valid range"),
     "invalid code too long": (
@@ -123,8 +133,12 @@ def test_a_bad_dbc_is_refused_and_the_line_named(name: str, tmp_path: Path):
     with pytest.raises(DbcError, match=message) as refused:
         load(path)
     numbers = {int(line.split(":")[1]) for line in str(refused.value).splitlines()}
-    message_lines = [i for i, line in enumerate(text.splitlines(), start=1) if line.startswith(MESSAGES)]
-    assert numbers <= {line + offset for line in message_lines for offset in range(9)}
+    lines = text.splitlines()
+    message_lines = [i for i, line in enumerate(lines, start=1) if line.startswith(MESSAGES)]
+    named = {line + offset for line in message_lines for offset in range(9)}
+    # An attribute is named where it is set, one without default on the first line.
+    attributes = (i for i, line in enumerate(lines, start=1) if line == new or (not new and '"InvalidRaw"' in line))
+    assert numbers <= named | {1, *attributes}
 
 
 @pytest.mark.parametrize("content", ["", "BO_ nonsense", "\x00\x01"])

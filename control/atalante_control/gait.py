@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -35,6 +36,7 @@ SIGN = np.array(MIRROR_SIGN * len(SIDES), dtype=np.float64)
 POSITION_JUMP = math.radians(0.1)  # rad, largest discontinuity accepted at the step change
 VELOCITY_JUMP = 0.05  # rad/s
 DURATION_RANGE = (0.3, 3.0)  # s
+ROUNDING = 1e-9  # of the sums behind a table: a gait may touch a limit
 
 _REQUIRED = ("format", "name", "duration", "joints")
 _OPTIONAL = ("feedforward", "parameters", "solver")
@@ -42,6 +44,8 @@ _OPTIONAL = ("feedforward", "parameters", "solver")
 
 class GaitError(ValueError):
     """The gait file is not a gait of this robot; the message names the key and what is valid."""
+
+    code = "GAIT_INVALID"
 
 
 @dataclass(frozen=True)
@@ -86,14 +90,9 @@ class Gait:
     def tables(self) -> StepTables:
         """The step on the cycle grid."""
         phase = np.arange(self.cycles + 1) / self.cycles
-        first, second = derivative(self.coefficients), derivative(derivative(self.coefficients))
         uf = np.zeros_like(self.coefficients) if self.feedforward is None else self.feedforward
-        return StepTables(
-            _read_only(bezier(self.coefficients, phase)),
-            _read_only(bezier(first, phase) / self.duration),
-            _read_only(bezier(second, phase) / self.duration**2),
-            _read_only(bezier(uf, phase)),
-        )
+        tables = (*motion(self.coefficients, self.duration, phase), bezier(uf, phase))
+        return StepTables(*map(_read_only, tables))
 
 
 def bezier(coefficients: Vector, phase: Vector) -> Vector:
@@ -109,6 +108,16 @@ def bezier(coefficients: Vector, phase: Vector) -> Vector:
 def derivative(coefficients: Vector) -> Vector:
     """Control points of the derivative with respect to the phase: (m, d + 1) to (m, d)."""
     return np.asarray((coefficients.shape[1] - 1) * np.diff(coefficients, axis=1))
+
+
+def motion(coefficients: Vector, duration: float, phase: Vector) -> tuple[Vector, Vector, Vector]:
+    """Angles, speeds and accelerations [rad, rad/s, rad/s2] of a step of `duration` [s] at phases (n,), each (n, m)."""
+    first = derivative(coefficients)
+    return (
+        bezier(coefficients, phase),
+        bezier(first, phase) / duration,
+        bezier(derivative(first), phase) / duration**2,
+    )
 
 
 def power_basis(coefficients: Vector) -> Vector:
@@ -130,11 +139,13 @@ def load_gait(path: Path, robot: Robot) -> Gait:
 
     Raises:
         GaitError: unknown, missing or malformed key; a value that is not finite; a discontinuity through the step
-            change over 0.1 degrees or 0.05 rad/s; a position or speed beyond the robot's limits.
+            change over 0.1 degrees or 0.05 rad/s; a position, speed or feedforward beyond the robot's limits.
     """
     try:
-        document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
-    except (OSError, UnicodeDecodeError, ValueError) as error:
+        document = json.loads(
+            path.read_text(encoding="utf-8"), parse_constant=_refuse_constant, object_pairs_hook=_without_twins
+        )
+    except (OSError, ValueError, RecursionError) as error:
         raise GaitError(f"{path}: {error}") from error
     if not isinstance(document, dict):
         raise GaitError(f"{path}: a gait file is a JSON object with the keys {', '.join(_REQUIRED)}")
@@ -186,10 +197,11 @@ def check_gait(gait: Gait, robot: Robot, where: str = "gait") -> None:
         for values, low, high, unit in (
             (tables.q, robot.position_min, robot.position_max, "rad"),
             (tables.qd, -robot.velocity_max, robot.velocity_max, "rad/s"),
+            (tables.uf, -robot.torque_max, robot.torque_max, "Nm"),
         ):
             beyond = np.maximum(values - high, low - values).max(axis=0)
             worst = int(beyond.argmax())
-            if beyond[worst] > 0.0:
+            if beyond[worst] > ROUNDING:
                 raise GaitError(
                     f"{where}: joints.{JOINTS[worst]} leaves its range by {beyond[worst]:.4g} {unit}; "
                     f"it is [{low[worst]:.4g}, {high[worst]:.4g}] {unit}"
@@ -219,11 +231,22 @@ def _control_points(path: Path, key: str, table: Any) -> Vector:
 
 
 def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)
+    return (
+        type(value) in (int, float) and abs(value) <= sys.float_info.max
+    )  # false for NaN, and no overflow of an integer
 
 
 def _refuse_constant(text: str) -> float:
     raise ValueError(f"{text} is not allowed; every number in a gait file is finite")
+
+
+def _without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twin = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{twin} is there twice; every key is given once")
+    return found
 
 
 def _mirror(rows: Vector) -> Vector:

@@ -5,9 +5,11 @@ cantools accepts duplicate identifiers and names, factor 0 and signals without a
 
 from __future__ import annotations
 
+import math
 import re
 import zlib
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from cantools.database.can import Message as RawMessage
 from cantools.database.can import Signal as RawSignal
 from cantools.database.errors import Error as CantoolsError
 
+from atalante_dbc.attributes import missing, wrong_values
 from atalante_dbc.network import Message, Network, Node, Signal
 
 DBC_FILE = Path(__file__).with_name("atalante.dbc")
@@ -33,6 +36,8 @@ _SG = re.compile(r"SG_\s+(\w+)\s*(\w*)\s*:")
 class DbcError(ValueError):
     """The DBC cannot be trusted; one line of the message a problem, each with its line in the file."""
 
+    code = "DBC_INVALID"
+
 
 def load(path: Path | None = None) -> Network:
     """The network of a DBC file, checked.
@@ -45,13 +50,15 @@ def load(path: Path | None = None) -> Network:
         raw = path.read_bytes()
         text = raw.decode("cp1252")
         lines = _Lines(text)
-        _refuse(path, _duplicates(lines))  # before cantools, which drops them or stumbles over what follows
+        # Before cantools, which drops duplicates or stumbles over what follows.
+        _refuse(path, chain(_duplicates(lines), wrong_values(text)))
         database = cantools.database.load_string(text, database_format="dbc", strict=False)
     except DbcError:
         raise
     except (OSError, ValueError, CantoolsError) as error:
         raise DbcError(f"{path}: {error}") from error
     assert isinstance(database, Database)
+    _refuse(path, missing(text))
     _refuse(path, _problems(database, lines))
     return Network(
         nodes=tuple(
@@ -93,10 +100,6 @@ class _Lines:
 
 def _problems(database: Database, lines: _Lines) -> Iterator[tuple[int, str]]:
     """Every broken rule as (line, sentence)."""
-    for attribute in ("Bus", "GenMsgSendType", "GenMsgCycleTime", "GenMsgDelayTime", "TimeoutTime", "E2EDataId"):
-        if attribute not in _definitions(database):
-            yield 1, f"the message attribute {attribute} is not defined (BA_DEF_ BO_)"
-            return
     data_ids: dict[int, str] = {}
     nodes = {node.name for node in database.nodes}
     for message in database.messages:
@@ -169,8 +172,8 @@ def _signal_problems(message: RawMessage, signal: RawSignal, nodes: set[str]) ->
         yield 'has no unit; write "1" for a number without one'
     if not signal.receivers or not set(signal.receivers) <= nodes:
         yield f"needs receivers out of BU_, not {', '.join(signal.receivers) or 'none'}"
-    if signal.scale == 0:
-        yield "has factor 0"
+    if signal.scale == 0 or not math.isfinite(signal.scale) or not math.isfinite(signal.offset):
+        yield f"has factor {signal.scale} and offset {signal.offset}; both are finite, and the factor is not 0"
         return
     yield from _range_problems(signal)
 

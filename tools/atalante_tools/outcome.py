@@ -65,9 +65,14 @@ KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
 
 
 def failure_of(error: BaseException) -> Failed | None:
-    """What a library's error means for the command; None: it is a defect and deserves its traceback."""
+    """What a library's error means for the command; None: it is a defect and deserves its traceback.
+
+    An error with a diagnostic code (FAULTS.md: CONFIG_INVALID, DBC_INVALID, GAIT_INVALID, ...) is told with it.
+    """
     for module, name, failure in KNOWN:
         kind = getattr(sys.modules.get(module), name, None)
         if kind is not None and isinstance(error, kind):
-            return failure(" ".join(str(error).split()))
+            sentence = " ".join(str(error).split())
+            code = getattr(error, "code", "")
+            return failure(f"{code}: {sentence}" if code else sentence)
     return None

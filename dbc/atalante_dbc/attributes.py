@@ -1,0 +1,56 @@
+"""Attribute values of a DBC text, checked before cantools reads it: `text -> attributes -> loader`.
+
+cantools takes a value of any kind for an attribute of any kind, and stumbles over it (or not) when somebody asks.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+#: Attributes the network is made of, which need a definition (`BA_DEF_`): a loader must not guess.
+_NEEDED = (
+    "NominalBitrate", "DataBitrate", "NodeKind", "NodeNumber", "VFrameFormat", "Bus", "GenMsgSendType", "GenMsgCycleTime",
+    "GenMsgDelayTime", "TimeoutTime", "E2EDataId", "InvalidRaw",
+)  # fmt: skip
+_DEFINITION = re.compile(r'BA_DEF_\s+(?:(?:BU_|BO_|SG_|EV_)\s+)?"(\w+)"\s+(\w+)\s*(.*?)\s*;')
+_VALUE = re.compile(r'(BA_|BA_DEF_DEF_)\s+"(\w+)"\s+(.*?)("[^"]*"|\S+)\s*;')
+_INTEGER = re.compile(r"[+-]?\d{1,18}")
+_RAW = re.compile(r"(0[xX][0-9a-fA-F]{1,16}|\d{1,20})?")
+
+
+def wrong_values(text: str) -> Iterator[tuple[int, str]]:
+    """Every attribute that is set without a definition or to what its definition does not allow, as (line, sentence)."""
+    definitions: dict[str, tuple[str, str]] = {}
+    for number, line in enumerate(text.splitlines(), start=1):
+        if match := _DEFINITION.match(line):
+            definitions[match[1]] = match[2], match[3]
+        elif match := _VALUE.match(line):
+            name, owner, value = match[2], match[3].strip() or "the network", match[4]
+            if name not in definitions:
+                yield number, f"the attribute {name} has no definition (BA_DEF_) above this line"
+            elif wanted := _refused(name, *definitions[name], value, by_name=match[1] == "BA_DEF_DEF_"):
+                yield number, f"{name} of {owner} is {value}; valid is {wanted}"
+
+
+def missing(text: str) -> Iterator[tuple[int, str]]:
+    """Every attribute of the network without definition or default, as (1, sentence)."""
+    for name in _NEEDED:
+        for keyword, what in (("BA_DEF_", "definition"), ("BA_DEF_DEF_", "default")):
+            if not re.search(rf'^{keyword}\s+[^"]*"{name}"', text, re.MULTILINE):
+                yield 1, f"the attribute {name} has no {what} ({keyword})"
+
+
+def _refused(name: str, kind: str, domain: str, value: str, *, by_name: bool) -> str:
+    """What would be valid, empty if the value is; enumerations are given by name in defaults, elsewhere by number too."""
+    if kind == "INT":
+        low, high = [*domain.split(), "0", "0"][:2]
+        valid = _INTEGER.fullmatch(value) and int(low) <= int(value) <= int(high)
+        return "" if valid else f"a whole number from {low} to {high}"
+    if kind == "ENUM":
+        names = re.findall(r'"([^"]*)"', domain)
+        valid = value.strip('"') in names if value.startswith('"') else value.isdecimal() and int(value) < len(names)
+        return "" if valid and (value.startswith('"') or not by_name) else f"one of {', '.join(names)}"
+    if name == "InvalidRaw":
+        return "" if _RAW.fullmatch(value.strip('"')) else 'a raw code such as "0x8000", or ""'
+    return ""

@@ -1,0 +1,275 @@
+"""What is read at start and is not right is refused: F52 (DBC), F54 (robot file), F55 (gait), each in one sentence with its code.
+
+Every field of robot and gait file is mutated, the DBC line by line.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+import re
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import atalante_control.gait
+import atalante_dbc.loader
+import atalante_hal.robot
+from atalante_control.gait import HANG_GAIT, GaitError, check_gait, load_gait
+from atalante_dbc import DBC_FILE, DbcError
+from atalante_hal.image import ReceiveImage, TransmitImage
+from atalante_hal.robot import JOINTS, LEG_JOINTS, ROBOT_FILE, RobotError, load_robot
+from atalante_tools.cli import cli
+
+ROBOT = tomllib.loads(ROBOT_FILE.read_text())
+KEYS = tuple(ROBOT["joints"]["FH"])
+GAIT = json.loads(HANG_GAIT.read_text())
+#: No number of any robot or gait.
+NONSENSE = st.sampled_from(
+    [math.nan, math.inf, -math.inf, 1e300, -1e300, 10**400, True, False, "4 rad/s", "", [], [[1.0, 2.0]], {}, {"a": 1}]
+)
+anywhere = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return json.dumps(value)
+    if isinstance(value, list):
+        return f"[{', '.join(map(toml, value))}]"
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key} = {toml(item)}' for key, item in value.items())}}}"
+    return repr(value)
+
+
+def robot_with(path: Path, joint: str, change: Callable[[dict[str, Any]], object]) -> Path:
+    tables = {name: dict(ROBOT["joints"][name]) for name in LEG_JOINTS}
+    change(tables[joint])
+    lines = [f"joints.{name}.{key} = {toml(value)}" for name in LEG_JOINTS for key, value in tables[name].items()]
+    path.write_text("\n".join(lines))
+    return path
+
+
+def refusal_of(path: Path) -> str:
+    with pytest.raises(RobotError) as refused:
+        load_robot(path)
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
+
+
+class TestF54ConfigInvalid:
+    @anywhere
+    @given(st.sampled_from(LEG_JOINTS), st.sampled_from(KEYS), NONSENSE, st.integers(0, 1))
+    def test_f54_nonsense_in_any_field_is_refused_by_its_name(
+        self, tmp_path: Path, joint: str, key: str, value: Any, place: int
+    ) -> None:
+        def change(table: dict[str, Any]) -> None:
+            if isinstance(table[key], list):
+                table[key] = [*table[key][:place], value, *table[key][place + 1 :]]
+            else:
+                table[key] = value
+
+        said = refusal_of(robot_with(tmp_path / "robot.toml", joint, change))
+        assert f"joints.{joint}.{key} is " in said
+
+    @anywhere
+    @given(
+        st.sampled_from(LEG_JOINTS),
+        st.sampled_from([key for key in KEYS if key not in ("position", "polarity")]),
+        st.floats(max_value=0.0) | st.integers(max_value=0),
+    )
+    def test_f54_no_limit_is_negative_or_zero(self, tmp_path: Path, joint: str, key: str, value: float) -> None:
+        old = ROBOT["joints"][joint][key]
+        said = refusal_of(
+            robot_with(
+                tmp_path / "robot.toml",
+                joint,
+                lambda table: table.update({key: [value, old[1]] if isinstance(old, list) else value}),
+            )
+        )
+        assert f"joints.{joint}.{key} is " in said
+
+    @pytest.mark.parametrize("joint", LEG_JOINTS)
+    @pytest.mark.parametrize("key", KEYS)
+    def test_f54_a_missing_a_misspelt_and_a_doubled_key(self, tmp_path: Path, joint: str, key: str) -> None:
+        path = tmp_path / "robot.toml"
+        assert f"joints.{joint}.{key} is missing" in refusal_of(robot_with(path, joint, lambda t: t.pop(key)))
+        said = refusal_of(robot_with(path, joint, lambda t: t.update({f"{key}_": 1.0})))
+        assert f"joints.{joint}.{key}_ is unknown; valid keys are position" in said
+        line = f"\njoints.{joint}.{key} = {toml(ROBOT['joints'][joint][key])}"
+        path.write_text(robot_with(path, joint, lambda t: None).read_text() + line)
+        assert "overwrite" in refusal_of(path)
+
+    @pytest.mark.parametrize("joint", LEG_JOINTS)
+    @pytest.mark.parametrize("key", ["position", "velocity_max"])
+    def test_f54_degrees_are_not_radians(self, tmp_path: Path, joint: str, key: str) -> None:
+        value = np.degrees(ROBOT["joints"][joint][key]).tolist()
+        said = refusal_of(robot_with(tmp_path / "robot.toml", joint, lambda t: t.update({key: value})))
+        assert re.search(rf"joints\.{joint}\.{key} is .* \(rad", said)
+
+    @anywhere
+    @given(st.sampled_from(LEG_JOINTS), st.floats(0.1, 400.0))
+    def test_a_valid_limit_arrives_to_the_bit(self, tmp_path: Path, joint: str, value: float) -> None:
+        robot = load_robot(robot_with(tmp_path / "robot.toml", joint, lambda t: t.update(torque_max=value)))
+        assert (robot.torque_max[[LEG_JOINTS.index(joint), LEG_JOINTS.index(joint) + 6]] == value).all()
+        assert robot.hash32 != load_robot().hash32
+
+    @anywhere
+    @given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode) | st.just(b"a=" + b"[" * 100_000))
+    def test_f54_a_file_of_anything_is_refused_in_a_sentence(self, tmp_path: Path, content: bytes) -> None:
+        path = tmp_path / "robot.toml"
+        path.write_bytes(content)
+        assert str(path) in refusal_of(path)
+
+
+#: (where, how to reach it) of every field of a gait.
+FIELDS: list[tuple[str | int, ...]] = [
+    *((key,) for key in GAIT),
+    *(("joints", joint) for joint in JOINTS),
+    *(("joints", joint, point) for joint in JOINTS for point in range(8)),
+]
+
+
+def gait_with(path: Path, field: tuple[str | int, ...], value: Any) -> Path:
+    document = json.loads(HANG_GAIT.read_text())
+    *parents, last = field
+    place = document
+    for parent in parents:
+        place = place[parent]
+    place[last] = value
+    path.write_text(json.dumps(document))
+    return path
+
+
+def gait_refusal_of(path: Path) -> str:
+    with pytest.raises(GaitError) as refused:
+        load_gait(path, load_robot())
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
+
+
+class TestF55GaitInvalid:
+    @anywhere
+    @given(st.sampled_from(FIELDS), NONSENSE)
+    def test_f55_nonsense_in_any_field_is_refused_by_its_name(self, tmp_path: Path, field: Any, value: Any) -> None:
+        if field in (("parameters",), ("solver",)) and isinstance(value, dict):
+            return  # those may say anything
+        if field == ("name",) and value:
+            value = 3
+        said = gait_refusal_of(gait_with(tmp_path / "gait.json", field, value))
+        # A jump is told of the joint at the end of the step, whose mirrored start it is.
+        wanted = ".".join(str(part) for part in field[:2]).replace("left_", "right_").replace("right_", "(left|right)_")
+        assert re.search(f"{wanted} |NaN is not allowed|Infinity is not allowed", said)
+
+    @anywhere
+    @given(st.sampled_from(JOINTS), st.floats(0.05, 1e6), st.sampled_from([0, 1, 6, 7]), st.sampled_from([-1, 1]))
+    def test_f55_a_jump_at_the_step_change(self, tmp_path: Path, joint: str, by: float, point: int, sign: int) -> None:
+        moved = GAIT["joints"][joint][point] + sign * by
+        said = gait_refusal_of(gait_with(tmp_path / "gait.json", ("joints", joint, point), moved))
+        assert re.search(r"joints\.(left|right)_(FH|TH|SH|SK|SA|HA) (jumps by|leaves its range by)", said)
+
+    def test_f55_degrees_are_not_radians(self, tmp_path: Path) -> None:
+        degrees = {joint: np.degrees(points).tolist() for joint, points in GAIT["joints"].items()}
+        assert "rad" in gait_refusal_of(gait_with(tmp_path / "gait.json", ("joints",), degrees))
+
+    @pytest.mark.parametrize("joint", JOINTS)
+    def test_f55_a_feedforward_beyond_the_torque_limit(self, tmp_path: Path, joint: str) -> None:
+        robot = load_robot()
+        most = robot.torque_max[JOINTS.index(joint)]
+        for factor in (1.0, -1.0, 1.01, -1.01):
+            feedforward = {name: [most * factor * (name == joint)] * 8 for name in JOINTS}
+            path = gait_with(tmp_path / "gait.json", ("feedforward",), feedforward)
+            if abs(factor) == 1.0:
+                load_gait(path, robot)
+            else:
+                assert f"{joint} leaves its range by {0.01 * most:.4g} Nm" in gait_refusal_of(path)
+
+    def test_f55_a_key_given_twice(self, tmp_path: Path) -> None:
+        path = tmp_path / "gait.json"
+        path.write_text(HANG_GAIT.read_text().replace("{", '{"duration": 0.8, ', 1))
+        assert "duration is there twice" in gait_refusal_of(path)
+
+    @anywhere
+    @given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode) | st.just(b"[" * 100_000))
+    def test_f55_a_file_of_anything_is_refused_in_a_sentence(self, tmp_path: Path, content: bytes) -> None:
+        path = tmp_path / "gait.json"
+        path.write_bytes(content)
+        assert str(path) in gait_refusal_of(path)
+
+
+LINES = DBC_FILE.read_text().splitlines(keepends=True)
+NUMBERS = ("0", "-1", "65", "1e999", "1.5", "99999999999999999999", "nan")
+
+
+def mutant(rng: random.Random) -> str:
+    """The DBC with one line gone, doubled, swapped, cut short, or one character or number of it changed."""
+    lines = list(LINES)
+    place, other = rng.randrange(len(lines)), rng.randrange(len(lines))
+    kind, line = rng.choice(("gone", "doubled", "swapped", "cut", "character", "number", "number")), lines[place]
+    if kind == "gone":
+        del lines[place]
+    elif kind == "doubled":
+        lines.insert(other, line)
+    elif kind == "swapped":
+        lines[place], lines[other] = lines[other], line
+    elif kind == "cut":
+        lines = [*lines[:place], line[: len(line) // 2]]
+    elif kind == "character":
+        at = rng.randrange(len(line))
+        lines[place] = line[:at] + chr(rng.randrange(32, 127)) + line[at + 1 :]
+    elif numbers := list(re.finditer(r"-?\d+(\.\d+)?", line)):
+        number = rng.choice(numbers)
+        lines[place] = line[: number.start()] + rng.choice(NUMBERS) + line[number.end() :]
+    return "".join(lines)
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_f52_a_mutated_dbc_is_refused_in_sentences_or_is_a_network_like_any_other(seed: int, tmp_path: Path) -> None:
+    path = tmp_path / "mutant.dbc"
+    path.write_text(mutant(random.Random(seed)))
+    said = ""
+    try:
+        network = atalante_dbc.load(path)
+    except DbcError as error:
+        said = str(error)
+    else:
+        images = [ReceiveImage(network.messages), TransmitImage(network.messages)]
+        assert [len(image.frames) for image in images] == [len(network.messages)] * 2
+    assert not said or said.startswith(f"{path}:")
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "file", "old", "new", "said"),
+    [
+        (atalante_dbc.loader, "DBC_FILE", DBC_FILE, "(0.0125,0)", "(0,0)", "DBC_INVALID: "),
+        (atalante_hal.robot, "ROBOT_FILE", ROBOT_FILE, "torque_max = 350.0", "torque_max = -350.0", "CONFIG_INVALID: "),
+        (atalante_control.gait, "HANG_GAIT", HANG_GAIT, '"duration": 0.8', '"duration": 8', "GAIT_INVALID: "),
+    ],
+    ids=["f52", "f54", "f55"],
+)
+def test_the_command_line_refuses_to_start_in_one_sentence(
+    module: Any, name: str, file: Path, old: str, new: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert old in file.read_text()
+    path = tmp_path / file.name
+    path.write_text(file.read_text().replace(old, new, 1))
+    monkeypatch.setattr(module, name, path)
+    result = CliRunner().invoke(cli, ["demo", "--steps", "1", "--out", str(tmp_path / "run")])
+    assert result.exit_code == 1
+    assert result.stderr.startswith(f"atalante: {said}{path}")
+    assert result.stderr.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_gait_that_is_shipped_is_checked_without_its_file() -> None:
+    gait = load_gait(HANG_GAIT, load_robot())
+    check_gait(gait, load_robot())
