@@ -11,7 +11,7 @@ and a HAL in another process (`run`). One seed gives one sequence of bytes.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -21,9 +21,11 @@ import numpy.typing as npt
 from atalante_dbc import Network
 from atalante_emulator.body import PERIOD, Body
 from atalante_emulator.drive import WATCHDOG, DriveParameters, Drives, DriveSignals
+from atalante_emulator.faults import Fault
 from atalante_emulator.foot import Feet, FootParameters
 from atalante_emulator.haptics import Haptics, HapticsParameters
 from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
+from atalante_emulator.link import FaultyBus
 from atalante_emulator.pendant import Operator, PendantSignals
 from atalante_hal.bus import Bus, BusFull
 from atalante_hal.codec import Codec
@@ -36,6 +38,8 @@ Vector = npt.NDArray[np.float64]
 
 #: Frames one `receive` can take; a cycle is seven and now and then one more.
 _RECEIVE_BUDGET = 128
+#: Frames of one cycle at most: nineteen, now and then a slow one, and what goes wrong.
+_BATCH = 128
 #: Cycles of noise drawn at once.
 _NOISE_CYCLES = 128
 #: Longest wait [s] for the other SYNCs of a cycle once the first is there.
@@ -81,6 +85,7 @@ class Emulator:
         seed: int = 0,
         operator: Operator | None = None,
         parameters: EmulatorParameters | None = None,
+        faults: Sequence[Fault] = (),
     ) -> None:
         """Put the nodes on the bus.
 
@@ -89,9 +94,16 @@ class Emulator:
             bus: that carries all of the network's buses; several channels come as a `JoinedBus`.
             seed: of every random number: sensor noise and biases.
             operator: holds the pendant; None: the pendant is somebody else's node.
+            faults: what goes wrong, and when; cycle 0 is the first.
+
+        Raises:
+            FaultError: the network has no such target or signal.
         """
         parameters = parameters or EmulatorParameters()
         self.network, self.body, self.bus, self.operator = network, body, bus, operator
+        self._link: FaultyBus | None = None
+        if faults:
+            self.bus = self._link = FaultyBus(bus, network, faults, lambda: self.cycle, seed=seed)
         self.cycle = 0
         self.frames_lost = 0  # nodes' frames that the bus had no room for
         self.before_send: list[Callable[[int, Vector], None]] = []
@@ -137,9 +149,9 @@ class Emulator:
             self._shares.append(self._tx.frames[rows[0] : rows[-1] + 1])
         self._whole = [self._tx.frames]
         self._answered = self._shares  # shares of the last imperfect cycle
-        batch = new_frames(len(sent))
+        batch = new_frames(_BATCH)
         self._batch = as_words(batch)
-        self._batch_up_to = [batch[:count] for count in range(len(sent) + 1)]
+        self._batch_up_to = [batch[:count] for count in range(_BATCH + 1)]
 
     def _bind_commands(self) -> None:
         values, codec = self._rx.values, self._rx.codec
@@ -233,7 +245,7 @@ class Emulator:
         if count < len(self._rx.frames):
             count = self._receive_rest(count)
             if not count:
-                return False
+                return self._cycle_without_sync()
         self._waiting = 0
         self._rx.accept(self._scratch, count)
         if self._rx.all_fresh:
@@ -269,7 +281,7 @@ class Emulator:
             self._commanded[leg] |= checks[row] <= Check.SOME_LOST
         synced = [place for place, row in enumerate(self._sync_rows) if checks[row] <= Check.SOME_LOST]
         if not synced:
-            return False
+            return self._cycle_without_sync()
         number = int(max(self._sync_cycles[synced]))
         if number == self._last_sync:  # the rest of a cycle that has already run
             self._send([self._answered[place] for place in synced])
@@ -281,6 +293,13 @@ class Emulator:
         self._answered = [share.copy() for share in self._shares]
         self._cycle(fresh, [self._answered[place] for place in synced])
         return True
+
+    def _cycle_without_sync(self) -> bool:
+        """Whether the wire lost or spoilt this cycle's SYNC: then the millisecond goes by all the same."""
+        lost = self._link is not None and self._link.synced
+        if lost:
+            self._alone(hold=())
+        return lost
 
     def _send(self, parts: Sequence[Frames]) -> None:
         """All that a cycle has to say in one batch: who waits for it takes it up at once or not at all."""
@@ -397,10 +416,15 @@ class Emulator:
 
     def idle(self) -> None:
         """One millisecond without a HAL: the nodes say nothing but their heartbeat, and enabled drives hold."""
+        self._alone(hold=range(len(SIDES)))
+
+    def _alone(self, hold: Iterable[int]) -> None:
+        """One millisecond without SYNC; the legs of `hold` hold at once, the other by their watchdog."""
         drives = self.drives
         self._rx.new_cycle()
-        for leg in range(len(SIDES)):
+        for leg in hold:
             drives.hold(leg)
+        drives.command((False, False), self._controlword, self._target, self._limit)
         if parts := self._with_slow([]):
             self._send(parts)
         self.body.step(drives.drive(self.body.velocity))
