@@ -55,10 +55,6 @@ def only(worn: Inertia, empty: Inertia) -> Inertia:
     return Inertia(mass, tuple(centre), (m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2]))
 
 
-def fitted(patient: Patient) -> ExoskeletonParameters:
-    return ExoskeletonParameters(thigh_length=patient.length("thigh"), shank_length=patient.length("shank"))
-
-
 def test_fractions_are_winter_s_and_make_a_whole() -> None:
     assert {name: (s.mass, s.centre, s.gyration, s.length) for name, s in SEGMENTS.items()} == WINTER
     both_legs = 2 * sum(WINTER[name][0] for name in ("thigh", "shank", "foot"))
@@ -68,7 +64,7 @@ def test_fractions_are_winter_s_and_make_a_whole() -> None:
 @pytest.mark.parametrize("patient", [Patient(75.0, 1.75), Patient(58.0, 1.93, 0.41, 0.45)])
 def test_what_fusion_adds_to_a_link_is_the_segment_of_the_table(patient: Patient) -> None:
     worn = {link.name: link.inertia for link in links(EMPTY, patient)}
-    empty = {link.name: link.inertia for link in links(fitted(patient))}
+    empty = {link.name: link.inertia for link in links(EMPTY.fitted(patient))}
     for name, segment in WORN.items():
         mass, centre, gyration, _ = WINTER[segment]
         added, length = only(worn[name], empty[name]), patient.length(segment)

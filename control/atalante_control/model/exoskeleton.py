@@ -64,6 +64,10 @@ class ExoskeletonParameters:
         if not 0.0 < 4 * self.pad_mass < 0.1 * self.foot_mass:
             raise ValueError(f"pad_mass is positive and four pads are under a tenth of the foot, not {self.pad_mass!r}")
 
+    def fitted(self, patient: Patient) -> ExoskeletonParameters:
+        """The exoskeleton with its thigh and shank adjusted to a patient, nobody in it."""
+        return replace(self, thigh_length=patient.length("thigh"), shank_length=patient.length("shank"))
+
 
 def links(parameters: ExoskeletonParameters, patient: Patient | None = None) -> tuple[Link, ...]:
     """Every body of the exoskeleton, parents first: pelvis, its IMUs, left leg, right leg.
@@ -71,9 +75,7 @@ def links(parameters: ExoskeletonParameters, patient: Patient | None = None) -> 
     With a patient, thigh and shank of the exoskeleton take his lengths and his segments are fused link by link: head,
     arms and trunk into the pelvis, thigh, shank and foot into those of each leg. The names of the links stay.
     """
-    p = parameters
-    if patient is not None:
-        p = replace(p, thigh_length=patient.length("thigh"), shank_length=patient.length("shank"))
+    p = parameters if patient is None else parameters.fitted(patient)
     pelvis = Box(p.pelvis_mass, (-0.13, 0.0, 0.12), (0.18, 0.36, 0.40))
     base = Link(BASE_LINK, "", None, ZERO, 0.0, ZERO, pelvis.inertia(), (pelvis,))
     imus = (_imu("torso", BASE_LINK, p.torso_imu), _imu("pelvis", BASE_LINK, p.pelvis_imu))
