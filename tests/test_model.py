@@ -1,12 +1,9 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pinocchio
-import pybullet
 import pytest
 
 from atalante_control.model import (
@@ -156,100 +153,3 @@ def test_urdf_without_a_joint_is_refused() -> None:
     text = urdf(ExoskeletonParameters(), ROBOT).replace('"right_HA"', '"spare"')
     with pytest.raises(ValueError, match="lacks joint right_HA"):
         pinocchio_model(text)
-
-
-def agree(theirs: np.ndarray, ours: np.ndarray) -> None:
-    np.testing.assert_allclose(theirs, ours, rtol=1e-6, atol=1e-6 * np.abs(ours).max())
-
-
-def load(client: int, text: str, folder: Path, *, fixed: bool) -> int:
-    path = folder / "exoskeleton.urdf"
-    path.write_text(text)
-    flags = pybullet.URDF_USE_INERTIA_FROM_FILE
-    return int(pybullet.loadURDF(str(path), useFixedBase=fixed, flags=flags, physicsClientId=client))
-
-
-class TestAgainstPyBullet:
-    """The two engines read the same text and must agree on the dynamics."""
-
-    @pytest.fixture(params=PATIENTS, ids=str)
-    def engines(self, request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[int, int, list[int], str]]:
-        text = urdf(PARAMETERS[0] if request.param else PARAMETERS[1], ROBOT, request.param)
-        client = pybullet.connect(pybullet.DIRECT)
-        pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
-        body = load(client, text, tmp_path, fixed=True)
-        infos = [
-            pybullet.getJointInfo(body, i, physicsClientId=client)
-            for i in range(pybullet.getNumJoints(body, physicsClientId=client))
-        ]
-        moving = [info[1].decode() for info in infos if info[2] == pybullet.JOINT_REVOLUTE]
-        yield client, body, [moving.index(name) for name in JOINTS], text
-        pybullet.disconnect(client)
-
-    def test_dynamics_agree(self, engines: tuple[int, int, list[int], str]) -> None:
-        client, body, order, text = engines
-        model, q_index, v_index = pinocchio_model(text)
-        data = model.createData()
-        rng = np.random.default_rng(11)
-        for _ in range(100):
-            q, v, a = random_state(rng)
-            theirs = np.zeros((3, 12))
-            theirs[:, order] = q, v, a
-            ours = np.zeros((3, 12))
-            ours[0, q_index], ours[1, v_index], ours[2, v_index] = q, v, a
-
-            def inverse_dynamics(states: np.ndarray) -> np.ndarray:
-                torque = pybullet.calculateInverseDynamics(
-                    body, *(row.tolist() for row in states), physicsClientId=client
-                )
-                return np.array(torque)[order]
-
-            agree(inverse_dynamics(theirs), np.asarray(pinocchio.rnea(model, data, *ours))[v_index])
-            gravity = np.asarray(pinocchio.computeGeneralizedGravity(model, data, ours[0]))[v_index]
-            agree(inverse_dynamics(theirs * [[1], [0], [0]]), gravity)
-
-            upper = np.triu(pinocchio.crba(model, data, ours[0]))
-            mass = (upper + np.triu(upper, 1).T)[np.ix_(v_index, v_index)]
-            bullet = np.array(pybullet.calculateMassMatrix(body, theirs[0].tolist(), physicsClientId=client))
-            agree(bullet[np.ix_(order, order)], mass)
-
-    def test_centres_of_mass_agree(self, engines: tuple[int, int, list[int], str], tmp_path: Path) -> None:
-        client, _, _, text = engines
-        body = load(client, text, tmp_path, fixed=False)  # Bullet knows no mass of a base it holds fixed
-        inertial_in_base = pybullet.getDynamicsInfo(body, -1, physicsClientId=client)[3:5]
-        model, q_index, _ = pinocchio_model(text, fixed_base=False)
-        data = model.createData()
-        count = pybullet.getNumJoints(body, physicsClientId=client)
-        infos = [pybullet.getJointInfo(body, i, physicsClientId=client) for i in range(count)]
-        row_of = {info[1].decode(): i for i, info in enumerate(infos)}
-        masses = np.array([pybullet.getDynamicsInfo(body, i, physicsClientId=client)[0] for i in range(-1, count)])
-        rng = np.random.default_rng(12)
-        for _ in range(100):
-            q, _, _ = random_state(rng)
-            for name, angle in zip(JOINTS, q, strict=True):
-                pybullet.resetJointState(body, row_of[name], angle, physicsClientId=client)
-            root = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
-            states = pybullet.getLinkStates(body, range(count), 0, 1, physicsClientId=client)
-            centre = masses @ np.array([root[0], *(state[0] for state in states)]) / masses.sum()
-            # Bullet's base frame is that of its principal axes.
-            in_root = pybullet.multiplyTransforms(*pybullet.invertTransform(*root), centre.tolist(), [0, 0, 0, 1])[0]
-            in_base = pybullet.multiplyTransforms(*inertial_in_base, in_root, [0, 0, 0, 1])[0]
-            full = pinocchio.neutral(model)
-            full[q_index] = q
-            # 1e-7 of a machine of 1 m: the centre of mass may lie on the origin.
-            np.testing.assert_allclose(in_base, pinocchio.centerOfMass(model, data, full), rtol=0, atol=1e-7)
-
-    def test_the_base_and_every_link_have_the_inertia_of_the_text(
-        self, engines: tuple[int, int, list[int], str]
-    ) -> None:
-        client, body, _, text = engines
-        masses = {
-            link.attrib["name"]: float(mass.attrib["value"])
-            for link in ET.fromstring(text).iter("link")
-            if (mass := link.find("inertial/mass")) is not None
-        }
-        count = pybullet.getNumJoints(body, physicsClientId=client)
-        names = [pybullet.getJointInfo(body, i, physicsClientId=client)[12].decode() for i in range(count)]
-        assert set(names) | {BASE_LINK} == set(masses)
-        for row, name in enumerate(names):  # Bullet reports 0 for a base it holds fixed
-            assert pybullet.getDynamicsInfo(body, row, physicsClientId=client)[0] == masses[name]

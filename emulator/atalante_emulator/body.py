@@ -95,7 +95,7 @@ class PyBulletBody:
         )
         pybullet.setGravity(0.0, 0.0, -GRAVITY, **client)
         try:
-            self._body = _load(urdf, self._client)
+            self._body = load_urdf(urdf, self._client)
             self._find_links()
         except ValueError:
             self.close()
@@ -200,7 +200,12 @@ class PyBulletBody:
             pybullet.disconnect(self._client)
 
 
-def _load(urdf: str, client: int) -> int:
+def load_urdf(urdf: str, client: int, *, fixed: bool = True) -> int:
+    """Number of the body that PyBullet makes of a URDF text, its base fixed or free.
+
+    Raises:
+        ValueError: the text is no URDF.
+    """
     with tempfile.TemporaryDirectory(prefix="atalante-") as folder:
         path = Path(folder, "exoskeleton.urdf")
         path.write_text(urdf)
@@ -208,7 +213,7 @@ def _load(urdf: str, client: int) -> int:
             # Fixed links stay apart (no merging): IMUs and pads are found by their names.
             return int(
                 pybullet.loadURDF(
-                    str(path), useFixedBase=True, flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client
+                    str(path), useFixedBase=fixed, flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client
                 )
             )
         except pybullet.error as error:
