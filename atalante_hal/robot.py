@@ -1,6 +1,6 @@
 """The robot as data: names, order and limits of its joints, sensors and motors, read once from `robot.toml`.
 
-Limiter, drives, model generator and controller all take their numbers from here.
+Limiter, plausibility checks, drives, model generator and controller all take their numbers from here.
 """
 
 from __future__ import annotations
@@ -42,8 +42,37 @@ class RobotError(ValueError):
 
 
 @dataclass(frozen=True)
+class Envelope:
+    """How torque fades towards the limits of position and velocity, see `limiter`."""
+
+    look_ahead: float  # s, at its velocity, in which a joint has to stay inside its position limits
+    position_margin: float  # rad past a position limit where no torque drives it any further
+    velocity_margin: float  # rad/s past a velocity limit where no torque drives it any faster
+
+
+@dataclass(frozen=True)
+class Derating:
+    """Torque a hot drive may give."""
+
+    start: float  # degC, up to here all of it
+    end: float  # degC, from here `floor`
+    floor: float  # share of torque_max
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """What healthy sensors agree within, see `plausibility`."""
+
+    velocity_error: float  # rad/s at the joint, reported velocity against the encoder, on average
+    attitude_error: float  # rad, tibia against pelvis IMU, each axis, against the encoders between them
+    quaternion_error: float  # of its squared norm against 1
+    cell_free: float  # N, vertical: a force cell under this carries nothing
+    cell_loaded: float  # N, vertical, three cells together: over this the fourth carries something
+
+
+@dataclass(frozen=True)
 class Robot:
-    """Joint limits and transmission, arrays of shape (12,) in the order of `JOINTS`, read-only, joint side."""
+    """Limits, transmission and sensors; arrays of shape (12,) in the order of `JOINTS`, read-only, joint side."""
 
     position_min: Vector  # rad
     position_max: Vector  # rad
@@ -54,7 +83,24 @@ class Robot:
     polarity: Vector  # +1 or -1: encoder sign against the joint
     hold_kp: Vector  # Nm/rad, the drive's own position hold
     hold_kd: Vector  # Nm s/rad
+    encoder_noise: Vector  # rad rms
+    breakaway: Vector  # Nm, change of torque that moves a joint out of dry friction
+    envelope: Envelope
+    derating: Derating
+    sensors: Sensors
     hash32: int  # CRC-32 of the file, as reported in HAL_STATUS
+
+    def torque_limit(self, temperature: Vector) -> Vector:
+        """What a drive may give when it is this hot: `torque_max` up to `derating.start`, linear to `floor` at `end`.
+
+        Args:
+            temperature: as the drives report it, shape (12,) [degC].
+
+        Returns:
+            Shape (12,) [Nm].
+        """
+        start, end, floor = self.derating.start, self.derating.end, self.derating.floor
+        return self.torque_max * np.clip(1.0 - (temperature - start) / (end - start) * (1.0 - floor), floor, 1.0)
 
 
 class _Key(NamedTuple):
@@ -74,6 +120,28 @@ _KEYS = {
     "gear": _Key(1, 1.0, 1000.0, "motor turns a joint turn"),
     "polarity": _Key(1, -1.0, 1.0, "1 or -1"),
     "hold": _Key(2, 0.01, 1e5, "Nm/rad and Nm s/rad"),
+    "encoder_noise": _Key(1, 1e-9, 1e-2, "rad"),
+    "breakaway": _Key(1, 0.01, 400.0, "Nm"),
+}
+#: Keys of the tables beside [joints].
+_TABLES = {
+    "envelope": {
+        "look_ahead": _Key(1, 1e-3, 1.0, "s"),
+        "position_margin": _Key(1, 1e-4, 0.2, "rad"),
+        "velocity_margin": _Key(1, 0.01, 10.0, "rad/s"),
+    },
+    "derating": {
+        "start": _Key(1, 40.0, 200.0, "degC"),
+        "end": _Key(1, 40.0, 200.0, "degC"),
+        "floor": _Key(1, 0.01, 1.0, "share of torque_max"),
+    },
+    "sensors": {
+        "velocity_error": _Key(1, 0.01, 10.0, "rad/s"),
+        "attitude_error": _Key(1, 1e-3, 0.5, "rad"),
+        "quaternion_error": _Key(1, 1e-4, 0.5, "of 1"),
+        "cell_free": _Key(1, 1.0, 1000.0, "N"),
+        "cell_loaded": _Key(1, 1.0, 3000.0, "N"),
+    },
 }
 
 
@@ -89,12 +157,19 @@ def load_robot(path: Path | None = None) -> Robot:
         document = tomllib.loads(raw.decode())
     except (OSError, ValueError, RecursionError) as error:
         raise RobotError(f"{path}: {error}") from error
-    if set(document) != {"joints"}:
-        raise RobotError(f"{path}: the only top-level table is 'joints', found {sorted(document)}")
+    if set(document) != {"joints", *_TABLES}:
+        raise RobotError(f"{path}: the top-level tables are joints, {', '.join(_TABLES)}, found {sorted(document)}")
     tables = document["joints"]
     if not isinstance(tables, dict) or set(tables) != set(LEG_JOINTS):
         raise RobotError(f"{path}: [joints] needs exactly the tables {', '.join(LEG_JOINTS)}")
-    left = {key: np.array([_numbers(path, joint, tables[joint], key) for joint in LEG_JOINTS]) for key in _KEYS}
+    joints = {joint: _table(f"{path}: joints.{joint}", tables[joint], _KEYS) for joint in LEG_JOINTS}
+    left = {key: np.array([joints[joint][key] for joint in LEG_JOINTS]) for key in _KEYS}
+    others = {
+        name: {key: numbers[0] for key, numbers in _table(f"{path}: {name}", document[name], keys).items()}
+        for name, keys in _TABLES.items()
+    }
+    if not others["derating"]["start"] < others["derating"]["end"]:
+        raise RobotError(f"{path}: derating.start is below derating.end, not {others['derating']['start']!r}")
 
     def both(column: Vector) -> Vector:
         return _frozen(np.concatenate([column, column]))
@@ -111,30 +186,36 @@ def load_robot(path: Path | None = None) -> Robot:
         polarity=both(left["polarity"][:, 0]),
         hold_kp=both(left["hold"][:, 0]),
         hold_kd=both(left["hold"][:, 1]),
+        encoder_noise=both(left["encoder_noise"][:, 0]),
+        breakaway=both(left["breakaway"][:, 0]),
+        envelope=Envelope(**others["envelope"]),
+        derating=Derating(**others["derating"]),
+        sensors=Sensors(**others["sensors"]),
         hash32=zlib.crc32(raw),
     )
 
 
-def _numbers(path: Path, joint: str, table: Any, key: str) -> list[float]:
-    where = f"{path}: joints.{joint}"
+def _table(where: str, table: Any, keys: dict[str, _Key]) -> dict[str, list[float]]:
+    """The numbers of each key of a table, which has exactly these."""
     if not isinstance(table, dict):
-        raise RobotError(f"{where} is a table with the keys {', '.join(_KEYS)}")
-    if unknown := set(table) - set(_KEYS):
-        raise RobotError(f"{where}.{sorted(unknown)[0]} is unknown; valid keys are {', '.join(_KEYS)}")
-    if key not in table:
-        raise RobotError(f"{where}.{key} is missing")
-    value, valid = table[key], _KEYS[key]
+        raise RobotError(f"{where} is a table with the keys {', '.join(keys)}")
+    if unknown := sorted(set(table) - set(keys)):
+        raise RobotError(f"{where}.{unknown[0]} is unknown; valid keys are {', '.join(keys)}")
+    if missing := [key for key in keys if key not in table]:
+        raise RobotError(f"{where}.{missing[0]} is missing")
+    return {key: _numbers(f"{where}.{key}", table[key], valid) for key, valid in keys.items()}
+
+
+def _numbers(where: str, value: Any, valid: _Key) -> list[float]:
     numbers = value if isinstance(value, list) else [value]
     # The comparison is false for NaN too.
     if len(numbers) != valid.size or not all(type(n) in (int, float) and valid.low <= n <= valid.high for n in numbers):
         what = "1 number" if valid.size == 1 else f"{valid.size} numbers"
-        raise RobotError(
-            f"{where}.{key} is {what} from {valid.low:.6g} to {valid.high:.6g} ({valid.unit}), not {value!r}"
-        )
-    if key == "position" and not numbers[0] < numbers[1]:
-        raise RobotError(f"{where}.position is [min, max] with min < max, not {value!r}")
-    if key == "polarity" and numbers[0] not in (-1, 1):
-        raise RobotError(f"{where}.polarity is 1 or -1, not {value!r}")
+        raise RobotError(f"{where} is {what} from {valid.low:.6g} to {valid.high:.6g} ({valid.unit}), not {value!r}")
+    if where.endswith(".position") and not numbers[0] < numbers[1]:
+        raise RobotError(f"{where} is [min, max] with min < max, not {value!r}")
+    if where.endswith(".polarity") and numbers[0] not in (-1, 1):
+        raise RobotError(f"{where} is 1 or -1, not {value!r}")
     return [float(n) for n in numbers]
 
 

@@ -55,6 +55,7 @@ def robot_with(path: Path, joint: str, change: Callable[[dict[str, Any]], object
     tables = {name: dict(ROBOT["joints"][name]) for name in LEG_JOINTS}
     change(tables[joint])
     lines = [f"joints.{name}.{key} = {toml(value)}" for name in LEG_JOINTS for key, value in tables[name].items()]
+    lines += [f"{name} = {toml(table)}" for name, table in ROBOT.items() if name != "joints"]
     path.write_text("\n".join(lines))
     return path
 

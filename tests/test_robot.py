@@ -51,6 +51,11 @@ def test_the_right_leg_mirrors_the_left():
         ("[joints.FH]", "[joints.XX]", "FH"),
         ("[joints.FH]", "[patient]\nmass = 70\n[joints.FH]", "patient"),
         ("[joints.FH]", "[joints.FH", "robot.toml"),
+        ("[derating]", "[patient]", "patient"),
+        ("look_ahead = 0.02", "", r"envelope\.look_ahead is missing"),
+        ("look_ahead = 0.02", "look_ahead = 20.0", r"envelope\.look_ahead is 1 number from 0\.001 to 1 \(s\), not 20\.0"),
+        ("floor = 0.3", "flor = 0.3", r"derating\.flor is unknown; valid keys are start, end, floor"),
+        ("end = 115.0", "end = 90.0", r"derating\.start is below derating\.end, not 90\.0"),
     ],
 )
 def test_a_wrong_file_is_refused_with_the_key(old: str, new: str, key: str, tmp_path: Path):
@@ -77,3 +82,16 @@ def test_no_limit_can_be_negative_zero_or_not_finite(value: float):
 def test_a_missing_file_is_named(tmp_path: Path):
     with pytest.raises(RobotError, match="nowhere"):
         load_robot(tmp_path / "nowhere.toml")
+
+
+def test_a_hot_drive_may_give_less_torque():
+    robot = load_robot()
+    cold, hot = np.full(12, robot.derating.start), np.full(12, robot.derating.end)
+    assert robot.torque_limit(cold).tobytes() == robot.torque_max.tobytes()
+    assert np.allclose(robot.torque_limit(hot), robot.derating.floor * robot.torque_max)
+    assert np.allclose(robot.torque_limit(hot + 50.0), robot.derating.floor * robot.torque_max)
+    half = (1.0 + robot.derating.floor) / 2.0
+    assert np.allclose(robot.torque_limit((cold + hot) / 2.0), half * robot.torque_max)
+    one = cold.copy()
+    one[3] += 5.0
+    assert np.flatnonzero(robot.torque_limit(one) < robot.torque_max).tolist() == [3]
