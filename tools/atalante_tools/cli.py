@@ -26,6 +26,7 @@ COMMANDS = {
     "decode": "The signals of CAN logs as Parquet or MCAP.",
     "conform": "An acceptance test of one node, with this computer in the place of the HAL.",
     "dbc": "Check, print and compare network descriptions, and make C code of one.",
+    "model": "The patient-exoskeleton model: its links, checks, URDF and picture.",
     "bench": "How fast the stack is, with the baseline beside each figure.",
 }
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
+
+if TYPE_CHECKING:
+    from atalante_control.model import Patient
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -15,6 +18,73 @@ EMBEDDED: Final = "embedded"
 
 #: --json: one object a line on stdout, everything else on stderr.
 json_option = click.option("--json", "as_json", is_flag=True, help="JSON objects on stdout, one a line.")
+
+
+class Length(click.ParamType):
+    """A length of a body or a step, as people write it: 1.75 or 175 for the same height, in metres inside."""
+
+    name = "length"
+    #: From here on a number means centimetres: nobody is 3 m tall, and no thigh or step is under 3 cm.
+    CENTIMETRES: Final = 3.0
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Metres."""
+        metres = float(click.FLOAT.convert(value, param, ctx))
+        return metres / 100.0 if metres >= self.CENTIMETRES else metres
+
+
+LENGTH: Final = Length()
+
+
+def patient_options(*, legs: bool) -> Callable[[_Command], _Command]:
+    """Give a command `--mass` and `--height`, and hand it the patient as the argument `patient`; None without them.
+
+    Args:
+        legs: `--thigh` and `--shank` too.
+    """
+    options = [
+        click.option("--mass", type=float, metavar="KG", help="Of the patient, kg."),
+        click.option("--height", type=LENGTH, metavar="M", help="Of the patient, m (1.75) or cm (175)."),
+    ]
+    if legs:
+        options += [
+            click.option("--thigh", type=LENGTH, metavar="M", help="Hip to knee.  [default: Winter's for the height]"),
+            click.option(
+                "--shank", type=LENGTH, metavar="M", help="Knee to ankle.  [default: Winter's for the height]"
+            ),
+        ]
+
+    def decorate(command: _Command) -> _Command:
+        @functools.wraps(command)
+        def with_patient(
+            mass: float | None,
+            height: float | None,
+            thigh: float | None = None,
+            shank: float | None = None,
+            **arguments: Any,
+        ) -> Any:
+            return command(patient=_patient(mass, height, thigh, shank), **arguments)
+
+        wrapped: Any = with_patient
+        for option in reversed(options):
+            wrapped = option(wrapped)
+        decorated: _Command = wrapped
+        return decorated
+
+    return decorate
+
+
+def _patient(mass: float | None, height: float | None, thigh: float | None, shank: float | None) -> Patient | None:
+    if mass is None and height is None and thigh is None and shank is None:
+        return None
+    if mass is None or height is None:
+        raise click.UsageError("a patient needs --mass and --height")
+    from atalante_control.model import Patient
+
+    try:
+        return Patient(mass, height, thigh, shank)
+    except ValueError as error:
+        raise click.UsageError(str(error)) from error
 
 
 @dataclass(frozen=True)

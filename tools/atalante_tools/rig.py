@@ -128,7 +128,7 @@ def open_body(robot: Robot, pose: Sequence[float] | None = None) -> Iterator[PyB
     from atalante_control.model import ExoskeletonParameters, urdf
 
     try:
-        with _no_banner():
+        with no_banner():
             from atalante_emulator.body import PyBulletBody
     except ModuleNotFoundError as error:
         if error.name != "pybullet":
@@ -219,7 +219,7 @@ def waiting_for(rig: Rig) -> str:
 
 
 @contextmanager
-def _no_banner() -> Iterator[None]:
+def no_banner() -> Iterator[None]:
     """Keep what a library's C code prints on import off the terminal."""
     sys.stderr.flush()
     terminal, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)

@@ -1,0 +1,101 @@
+"""`atalante model`: the patient-exoskeleton model as a table, a URDF, a picture, and the checks that it is sound."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from atalante_tools.options import json_option, patient_options
+from atalante_tools.outcome import Failed
+from atalante_tools.terminal import say, show_json, table
+
+if TYPE_CHECKING:
+    from atalante_control.model import Link, Patient
+
+_FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+@click.command()
+@patient_options(legs=True)
+@click.option(
+    "--urdf", "urdf_file", type=_FILE, metavar="FILE", help="Write the URDF, for PyBullet, Pinocchio and viewers."
+)
+@click.option(
+    "--show",
+    "picture",
+    type=_FILE,
+    is_flag=False,
+    flag_value=Path("model.png"),
+    metavar="[FILE]",
+    help="Draw the model from behind and from the side; .png, .svg or .pdf.  [FILE: model.png]",
+)
+@json_option
+def command(patient: Patient | None, urdf_file: Path | None, picture: Path | None, as_json: bool) -> None:  # fmt: skip
+    """The links of the exoskeleton with a patient in it, and whether the model is sound; exit code 1 if it is not.
+
+    Without --mass and --height it is the exoskeleton alone, the model of joint idealization. Masses are kg, centres of
+    mass m in the frame of the link, moments of inertia kg m2 about them.
+
+    \b
+    Example: atalante model --mass 75 --height 175
+             atalante model --mass 58 --height 1.62 --thigh 0.41 --urdf worn.urdf --show
+    """
+    from atalante_control.model import ExoskeletonParameters, links, urdf
+    from atalante_hal.robot import load_robot
+    from atalante_tools.model.checks import checks
+
+    robot, parameters = load_robot(), ExoskeletonParameters()
+    bodies = links(parameters, patient)
+    found = list(checks(parameters, robot, patient))
+    if as_json:
+        for body in bodies:
+            show_json({"link": body.name, "parent": body.parent or None, "joint": body.joint, **_numbers(body)})
+        for check in found:
+            show_json({"check": check.name, "ok": check.ok, "text": check.text})
+    else:
+        click.echo(_table(bodies))
+        click.echo()
+        for check in found:
+            click.echo(f"{'ok  ' if check.ok else '--  ' if check.ok is None else 'FAIL'}  {check.name}: {check.text}")
+    if urdf_file is not None:
+        urdf_file.write_text(urdf(parameters, robot, patient), encoding="utf-8")
+        say(f"URDF in {urdf_file}")
+    if picture is not None:
+        _draw(picture, bodies)
+    if failed := [check.name for check in found if check.ok is False]:
+        raise Failed(f"the model is not sound: {', '.join(failed)}")
+
+
+def _numbers(body: Link) -> dict[str, object]:
+    return {
+        "mass": body.inertia.mass,
+        "centre": [value + 0.0 for value in body.inertia.centre],  # + 0.0: no negative zero
+        "origin": [value + 0.0 for value in body.origin],
+        "inertia": {
+            name: value + 0.0
+            for name, value in zip(("xx", "xy", "xz", "yy", "yz", "zz"), body.inertia.tensor, strict=True)
+        },
+    }
+
+
+def _table(bodies: tuple[Link, ...]) -> str:
+    head = ["link", "on", "by", "mass", "x", "y", "z", "Ixx", "Iyy", "Izz"]
+    rows = []
+    for body in bodies:
+        inertia = body.inertia
+        mass = f"{inertia.mass:.4f}" if inertia.mass else "-"
+        centre = [f"{value + 0.0:.4f}" if inertia.mass else "-" for value in inertia.centre]
+        moments = [f"{inertia.tensor[i]:.5f}" if inertia.mass else "-" for i in (0, 3, 5)]
+        rows.append([body.name, body.parent or "world", body.joint or "fixed", mass, *centre, *moments])
+    return table([head, *rows])
+
+
+def _draw(picture: Path, bodies: tuple[Link, ...]) -> None:
+    try:
+        from atalante_tools.model.picture import draw
+    except ModuleNotFoundError as error:
+        raise Failed(f"a picture needs {error.name}: type `pip install 'atalante-hal[plot]'`") from error
+    draw(bodies, picture)
+    say(f"picture in {picture}")

@@ -1,0 +1,76 @@
+"""Is a model sound? `parameters, patient -> checks`, each an independent reason to trust the dynamics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio
+
+from atalante_control.model import ExoskeletonParameters, Patient, links, pinocchio_model, urdf
+from atalante_hal.robot import Robot
+from atalante_tools.rig import no_banner
+
+#: Random states the two engines are compared in, and the largest difference relative to the largest entry.
+STATES, AGREEMENT = 100, 1e-6
+
+
+@dataclass(frozen=True)
+class Check:
+    """One answer."""
+
+    name: str
+    ok: bool | None  # None: could not be asked
+    text: str
+
+
+def checks(parameters: ExoskeletonParameters, robot: Robot, patient: Patient | None) -> Iterator[Check]:
+    """Total mass, mirror symmetry, physical inertias, and the agreement of two engines on the URDF."""
+    bodies = links(parameters, patient)
+    total, empty = (math.fsum(body.inertia.mass for body in tree) for tree in (bodies, links(parameters)))
+    worn = patient.mass if patient else 0.0
+    yield Check("mass", abs(total - empty - worn) < 1e-10, f"{total:g} kg: exoskeleton {empty:g}, patient {worn:g}")
+
+    by_name = {body.name: body for body in bodies}
+    left = [body for body in bodies if body.name.startswith("left_")]
+    unlike = [body.name for body in left if by_name[body.mirrored().name] != body.mirrored()]
+    text = f"{unlike[0]} and the right one differ" if unlike else f"{len(left)} links are exact images of each other"
+    yield Check("mirror", not unlike, text)
+
+    moments = {body.name: np.linalg.eigvalsh(body.inertia.matrix()) for body in bodies if body.inertia.mass}
+    slack = {name: float((a + b - c) / c) if a > 0.0 else -math.inf for name, (a, b, c) in moments.items()}
+    worst = min(slack, key=lambda name: slack[name])
+    text = f"all {len(moments)} positive definite, triangle inequality tightest in {worst} ({slack[worst]:.2f} left)"
+    yield Check("inertias", slack[worst] > -1e-12, text if slack[worst] > -1e-12 else f"{worst} is no real body")
+    yield _engines(urdf(parameters, robot, patient), robot)
+
+
+def _engines(text: str, robot: Robot) -> Check:
+    try:
+        with no_banner():
+            from atalante_emulator.engine_dynamics import EngineDynamics
+    except ModuleNotFoundError as error:
+        if error.name != "pybullet":
+            raise
+        return Check("engines", None, "not compared, PyBullet is missing: type `pip install 'atalante-hal[emulator]'`")
+    model, into, out_of = pinocchio_model(text)
+    data = model.createData()
+    rng = np.random.default_rng(0)
+    largest = 0.0
+    with EngineDynamics(text) as engine:
+        for _ in range(STATES):
+            q = rng.uniform(robot.position_min, robot.position_max)
+            v, a = rng.normal(size=q.size) * 2.0, rng.normal(size=q.size) * 20.0
+            state = np.zeros((3, q.size))
+            state[0, into], state[1, out_of], state[2, out_of] = q, v, a
+            upper = np.triu(pinocchio.crba(model, data, state[0]))
+            for theirs, ours in (
+                (engine.inverse_dynamics(q, v, a), pinocchio.rnea(model, data, *state)[out_of]),
+                (engine.gravity(q), pinocchio.computeGeneralizedGravity(model, data, state[0])[out_of]),
+                (engine.mass_matrix(q), (upper + np.triu(upper, 1).T)[np.ix_(out_of, out_of)]),
+            ):
+                largest = max(largest, float(np.abs(theirs - ours).max() / np.abs(ours).max()))
+    text = f"Pinocchio and PyBullet differ by at most {largest:.1e} (relative, {STATES} random states)"
+    return Check("engines", largest < AGREEMENT, text)
