@@ -21,6 +21,7 @@ from atalante_control.gait import (
     derivative,
     load_gait,
     power_basis,
+    write_gait,
 )
 from atalante_hal.robot import JOINTS, load_robot
 
@@ -178,3 +179,19 @@ def test_loader_refuses_what_the_robot_cannot_do(tmp_path: Path):
     fast = document()
     fast["duration"] = 0.3  # the same way in less than half the time
     assert "joints.left_SK leaves its range" in refused(tmp_path, fast)
+
+
+def test_a_written_gait_is_read_back_to_the_bit(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    feedforward = rng.normal(size=(12, 8)) * 10.0
+    gait = Gait(
+        "walk", 0.8, HANG.coefficients, feedforward, {"patient_mass": 0.1 + 0.2}, {"status": "solved", "log": [1]}
+    )
+    path = tmp_path / "walk.json"
+    write_gait(gait, path)
+    back = load_gait(path, ROBOT)
+    assert back.hash32 == gait.hash32
+    assert (back.name, back.parameters, back.solver) == (gait.name, gait.parameters, gait.solver)
+    write_gait(HANG, path)
+    assert load_gait(path, ROBOT).feedforward is None
+    assert [entry.name for entry in tmp_path.iterdir()] == ["walk.json"]

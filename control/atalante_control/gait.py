@@ -174,6 +174,18 @@ def load_gait(path: Path, robot: Robot) -> Gait:
     return gait
 
 
+def write_gait(gait: Gait, path: Path) -> None:
+    """Write a gait file that `load_gait` reads back to the bit; it appears whole or not at all."""
+    document: dict[str, Any] = {"format": FORMAT, "name": gait.name, "duration": gait.duration}
+    document["joints"] = dict(zip(JOINTS, gait.coefficients.tolist(), strict=True))
+    if gait.feedforward is not None:
+        document["feedforward"] = dict(zip(JOINTS, gait.feedforward.tolist(), strict=True))
+    document |= {"parameters": dict(gait.parameters), "solver": dict(gait.solver)}
+    unfinished = path.with_name(f"{path.name}.new")
+    unfinished.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    unfinished.replace(path)
+
+
 def check_gait(gait: Gait, robot: Robot, where: str = "gait") -> None:
     """Refuse a gait that jumps at the step change or leaves the robot's limits.
 

@@ -1,0 +1,229 @@
+"""A library of gaits over a grid of subjects: resumable, fanned out over processes or a cluster, nothing silently missing.
+
+`Grid, solve -> rings around the centre -> one file a gait -> fit`. Every gait but the centre's is warm-started from its
+neighbour one step nearer to the centre, so the whole library follows one local minimum, and what a gait is started from
+depends on the grid alone: not on how many processes there are, nor on how often the work was interrupted.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, fields
+from itertools import pairwise, product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import joblib
+
+from atalante_control.gait import Gait, load_gait, write_gait
+from atalante_control.generation.solved import SolvedGait
+from atalante_control.model import Patient
+from atalante_control.subject import Subject
+from atalante_hal.robot import Robot
+
+FORMAT = "atalante-library/1"
+LEVELS_MIN = 3  # an axis: with two, a fit is off by 10 degrees between them
+
+Index = tuple[int, ...]
+#: A solver, warm-started from a gait or cold; it has to be a function of a module, for other processes to find it.
+Solve = Callable[[Subject, Gait | None], SolvedGait]
+
+
+class LibraryError(ValueError):
+    """The folder does not hold the library that was asked for; the message says what does."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Levels of each parameter; the default encloses the paper's subjects, who are 58 to 91 kg and 1.62 to 1.93 m.
+
+    Raises:
+        ValueError: fewer than three levels, levels that do not rise, or a subject out of range.
+    """
+
+    mass: tuple[float, ...] = (58.0, 69.0, 80.0, 91.0)  # kg
+    height: tuple[float, ...] = (1.62, 1.72, 1.83, 1.93)  # m
+    step_length: tuple[float, ...] = (0.10, 0.13, 0.16, 0.20)  # m
+    step_duration: tuple[float, ...] = (0.7, 0.8, 0.95, 1.1)  # s
+
+    def __post_init__(self) -> None:
+        for name, levels in zip(self.names(), self.axes(), strict=True):
+            if len(levels) < LEVELS_MIN or any(b <= a for a, b in pairwise(levels)):
+                raise ValueError(f"{name} has at least {LEVELS_MIN} levels that rise, not {list(levels)}")
+        for index in (tuple(0 for _ in self.shape), tuple(n - 1 for n in self.shape)):
+            self.subject(index)
+
+    @staticmethod
+    def names() -> tuple[str, ...]:
+        """The parameters, in the order of an index."""
+        return tuple(field.name for field in fields(Grid))
+
+    def axes(self) -> tuple[tuple[float, ...], ...]:
+        """The levels of each parameter."""
+        return (self.mass, self.height, self.step_length, self.step_duration)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Levels of each parameter."""
+        return tuple(map(len, self.axes()))
+
+    def subject(self, index: Index) -> Subject:
+        """Who stands at a point of the grid; leg lengths are Winter's."""
+        mass, height, length, duration = (levels[i] for levels, i in zip(self.axes(), index, strict=True))
+        return Subject(Patient(mass, height), length, duration)
+
+    def rings(self) -> Iterator[list[Index]]:
+        """All points by their distance from the centre; what a point is started from lies in the ring before."""
+        points = sorted(product(*map(range, self.shape)), key=self._distance)
+        while points:
+            ring = [point for point in points if self._distance(point) == self._distance(points[0])]
+            yield ring
+            points = points[len(ring) :]
+
+    def nearer(self, index: Index) -> Index | None:
+        """The neighbour one step nearer to the centre, along the axis it is farthest on; None for the centre."""
+        offsets = [i - n // 2 for i, n in zip(index, self.shape, strict=True)]
+        farthest = max(range(len(offsets)), key=lambda axis: abs(offsets[axis]))
+        if not offsets[farthest]:
+            return None
+        step = 1 if offsets[farthest] < 0 else -1
+        return tuple(i + step * (axis == farthest) for axis, i in enumerate(index))
+
+    def _distance(self, index: Index) -> int:
+        return sum(abs(i - n // 2) for i, n in zip(index, self.shape, strict=True))
+
+
+class Failure(NamedTuple):
+    """A point of the grid that has no gait."""
+
+    subject: Subject
+    status: str
+
+
+class Library:
+    """The folder of a library: `grid.json`, `gaits/` with one gait file each, `failed/` with the record of each failure."""
+
+    def __init__(self, folder: Path, grid: Grid | None = None) -> None:
+        """Open a library, or begin one.
+
+        Args:
+            grid: what is wanted; None takes the folder's own.
+
+        Raises:
+            LibraryError: there is none and no grid to begin one, or the folder's is another.
+        """
+        self.folder = folder
+        path = folder / "grid.json"
+        try:
+            found = _read_grid(path) if path.exists() else None
+        except (OSError, TypeError, ValueError) as error:
+            raise LibraryError(f"{path}: {error}") from error
+        if found is None:
+            if grid is None:
+                raise LibraryError(f"{folder} holds no library; `atalante gait library --out {folder}` makes one")
+            for name in ("gaits", "failed"):
+                (folder / name).mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps({"format": FORMAT, **asdict(grid)}, indent=1) + "\n", encoding="utf-8")
+        elif grid is not None and grid != found:
+            raise LibraryError(f"{folder} holds a library over another grid, {found}; choose another folder")
+        self.grid = grid or found or Grid()
+
+    def gait(self, index: Index, robot: Robot) -> Gait | None:
+        """The gait of a point; None while there is none. Raises `GaitError`."""
+        path = self._path("gaits", index)
+        return load_gait(path, robot) if path.exists() else None
+
+    def gaits(self, robot: Robot) -> dict[Index, Gait]:
+        """Every gait there is. Raises `GaitError`."""
+        found = ((index, self.gait(index, robot)) for index in self._points())
+        return {index: gait for index, gait in found if gait is not None}
+
+    def failures(self) -> list[Failure]:
+        """Every point whose last attempt failed."""
+        failed = ((index, self._path("failed", index)) for index in self._points())
+        return [
+            Failure(self.grid.subject(index), json.loads(path.read_text(encoding="utf-8"))["status"])
+            for index, path in failed
+            if path.exists()
+        ]
+
+    def missing(self) -> list[Index]:
+        """Points without a gait, failed or not yet tried, from the centre outwards."""
+        return [index for index in self._points() if not self._path("gaits", index).exists()]
+
+    def generate(
+        self, solve: Solve, robot: Robot, *, jobs: int = 1, cluster: str | None = None
+    ) -> Iterator[tuple[Subject, SolvedGait]]:
+        """Solve what is missing, and hand out each result once it is on the disk.
+
+        Args:
+            jobs: processes on this machine.
+            cluster: address of a dask scheduler whose workers solve instead.
+
+        Raises:
+            GaitError: a gait on the disk that a neighbour is to be started from is not a gait.
+        """
+        with ExitStack() as stack:
+            if cluster is not None:
+                from distributed import Client
+
+                stack.enter_context(Client(cluster))  # type: ignore[no-untyped-call]
+                stack.enter_context(joblib.parallel_config(backend="dask"))
+            parallel = stack.enter_context(joblib.Parallel(n_jobs=jobs, return_as="generator_unordered"))
+            missing = set(self.missing())
+            for ring in self.grid.rings():
+                tasks = [(index, self._start(index, robot)) for index in ring if index in missing]
+                results = parallel(joblib.delayed(_solve)(solve, self.grid.subject(i), i, warm) for i, warm in tasks)
+                for index, solved in results:
+                    self._keep(index, solved)
+                    yield self.grid.subject(index), solved
+
+    def _points(self) -> list[Index]:
+        return [index for ring in self.grid.rings() for index in ring]
+
+    def _path(self, kind: str, index: Index) -> Path:
+        levels = (axis[i] for axis, i in zip(self.grid.axes(), index, strict=True))
+        return (
+            self.folder
+            / kind
+            / ("_".join(f"{letter}{v:g}" for letter, v in zip("mhld", levels, strict=True)) + ".json")
+        )
+
+    def _start(self, index: Index, robot: Robot) -> Gait | None:
+        """Gait of the nearest solved point on the way to the centre."""
+        toward = self.grid.nearer(index)
+        while toward is not None:
+            gait = self.gait(toward, robot)
+            if gait is not None:
+                return gait
+            toward = self.grid.nearer(toward)
+        return None
+
+    def _keep(self, index: Index, solved: SolvedGait) -> None:
+        failed = self._path("failed", index)
+        if solved.solved:
+            write_gait(solved.gait, self._path("gaits", index))
+            failed.unlink(missing_ok=True)
+        else:
+            record: dict[str, Any] = {"status": solved.status, "parameters": dict(solved.gait.parameters)}
+            record["solver"] = dict(solved.gait.solver)
+            failed.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+def _solve(solve: Solve, subject: Subject, index: Index, warm: Gait | None) -> tuple[Index, SolvedGait]:
+    return index, solve(subject, warm)
+
+
+def _read_grid(path: Path) -> Grid:
+    document = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(document, dict) or document.pop("format", None) != FORMAT:
+        raise ValueError(f"format is {FORMAT!r} in the grid of a library")
+    return Grid(**{name: _levels(name, values) for name, values in document.items()})
+
+
+def _levels(name: str, values: Any) -> tuple[float, ...]:
+    if not isinstance(values, Sequence) or not all(type(value) in (int, float) for value in values):
+        raise ValueError(f"{name} is a list of numbers, not {values!r}")
+    return tuple(map(float, values))

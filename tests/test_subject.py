@@ -1,0 +1,33 @@
+from __future__ import annotations
+
+import pytest
+
+from atalante_control.model import Patient
+from atalante_control.subject import Subject
+
+PATIENT = Patient(75.0, 1.75, thigh_length=0.44)
+
+
+def test_parameters_are_those_of_a_gait_file() -> None:
+    assert Subject(PATIENT, 0.16, 0.8).parameters() == {
+        "patient_mass": 75.0,
+        "patient_height": 1.75,
+        "thigh_length": 0.44,
+        "shank_length": 0.246 * 1.75,
+        "step_length": 0.16,
+        "step_duration": 0.8,
+    }
+    assert str(Subject(PATIENT, 0.16, 0.8)) == "75 kg, 1.75 m, step 0.16 m in 0.8 s"
+
+
+@pytest.mark.parametrize(
+    ("length", "duration", "sentence"),
+    [
+        (16.0, 0.8, "a step length is from 0.05 to 0.4 m, not 16 m"),
+        (0.16, 0.2, "a step duration is from 0.4 to 2 s, not 0.2 s"),
+        (0.16, 0.8004, "a step duration is a whole number of milliseconds, not 0.8004 s"),
+    ],
+)
+def test_an_impossible_step_is_refused(length: float, duration: float, sentence: str) -> None:
+    with pytest.raises(ValueError, match=f"^{sentence}$"):
+        Subject(PATIENT, length, duration)
