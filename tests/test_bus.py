@@ -24,6 +24,7 @@ from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.bus.python_can import PythonCanBus, message_of
 from atalante_hal.bus.replay import LogUnreadable, ReplayBus
+from atalante_hal.bus.shared import shared_pair
 from atalante_hal.frame import (
     FD_LENGTHS,
     FLAG_BRS,
@@ -263,6 +264,15 @@ class TestPairBus(FrameSender, FrameReceiver):
     @pytest.fixture
     def ends(self) -> Iterator[tuple[Bus, Bus]]:
         one, other = lockstep_pair()
+        yield one, other
+        one.close()
+        other.close()
+
+
+class TestSharedBus(FrameSender, FrameReceiver, FrameWaiter):
+    @pytest.fixture
+    def ends(self) -> Iterator[tuple[Bus, Bus]]:
+        one, other = shared_pair()
         yield one, other
         one.close()
         other.close()

@@ -3,7 +3,8 @@
 One small protocol and the transports behind it; the HAL and the emulator run on any of them unchanged:
 
 - `socketcan.SocketCanBus`: a Linux CAN interface, `can0` of an adapter or a `vcan0`;
-- `pair.PairBus`: two ends in one process, in lock-step (the embedded default);
+- `pair.PairBus`: two ends in one process, in lock-step;
+- `shared.SharedBus`: the same between two processes, which then work at once;
 - `python_can.PythonCanBus`: any interface python-can knows (virtual, pcan, kvaser, ...);
 - `replay.ReplayBus`: a log, read only.
 """

@@ -20,7 +20,6 @@ import json
 import mmap
 import os
 import sys
-import tempfile
 import time
 from collections.abc import Mapping
 from types import TracebackType
@@ -28,6 +27,8 @@ from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
+
+from atalante_hal.memory import anonymous_file
 
 MAGIC = int.from_bytes(b"ATLRING\0", "little")
 VERSION = 1
@@ -156,9 +157,7 @@ class RingWriter(_Ring):
         packed = json.dumps(dict(meta or {})).encode()
         stride = -(-record_size // 8) * 8
         data = -(-(_HEADER_BYTES + len(packed) + NOTES_BYTES) // mmap.PAGESIZE) * mmap.PAGESIZE
-        fd = _anonymous_file()
-        os.ftruncate(fd, data + stride * slots)
-        super().__init__(fd)
+        super().__init__(anonymous_file("atalante-telemetry", data + stride * slots))
         header = self._header
         header[_MAGIC], header[_VERSION] = MAGIC, VERSION
         header[_RECORD_SIZE], header[_STRIDE], header[_SLOTS], header[_DATA] = record_size, stride, slots, data
@@ -327,11 +326,3 @@ class RingReader(_Ring):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _anonymous_file() -> int:
-    """Descriptor of a file without a name, in memory where the system can."""
-    if hasattr(os, "memfd_create"):
-        return os.memfd_create("atalante-telemetry", os.MFD_CLOEXEC)
-    with tempfile.TemporaryFile() as file:
-        return os.dup(file.fileno())

@@ -1,0 +1,198 @@
+"""What only the shared-memory bus has: lock-step between two processes, sleep, and noticing who is gone.
+
+The behaviour it shares with every bus is in test_bus.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from atalante_hal.bus import BusDown, BusFull
+from atalante_hal.bus.shared import SharedBus, descriptors, shared_pair
+from atalante_hal.frame import FLAG_BRS, FLAG_FDF, Frames, new_frames
+
+#: s; a test that waits this long has failed.
+LONG = 60.0
+
+
+def frames_of(payload: int, count: int = 1) -> Frames:
+    frames = new_frames(count)
+    frames["can_id"], frames["len"], frames["flags"] = 0x181, 12, FLAG_FDF | FLAG_BRS
+    frames["data"][:, 0] = payload
+    return frames
+
+
+@pytest.fixture
+def ends() -> Iterator[tuple[SharedBus, SharedBus]]:
+    one, other = shared_pair(capacity=10)
+    yield one, other
+    one.close()
+    other.close()
+
+
+class Answering:
+    """The other end in a thread: answers frames below 100 with as many, takes the others without a word."""
+
+    def __init__(self, bus: SharedBus) -> None:
+        self.heard: list[list[int]] = []
+        self._bus = bus
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        block = new_frames(8)
+        try:
+            while True:
+                count = self._bus.receive(block, LONG)
+                self.heard.append(block["data"][:count, 0].tolist())
+                if count and block["data"][0, 0] < 100:
+                    self._bus.send(block[:count].copy())
+        except BusDown:
+            pass
+
+    def join(self) -> None:
+        self._thread.join(LONG)
+        assert not self._thread.is_alive()
+
+
+@pytest.fixture
+def asker(ends: tuple[SharedBus, SharedBus]) -> Iterator[tuple[SharedBus, Answering]]:
+    ours, theirs = ends
+    ours.patience = LONG
+    answering = Answering(theirs)
+    ours.meet(LONG)
+    yield ours, answering
+    ours.close()
+    answering.join()
+
+
+def test_the_asker_hands_over_everything_at_once_and_gets_the_answer(asker: tuple[SharedBus, Answering]) -> None:
+    ours, answering = asker
+    block = new_frames(8)
+    for cycle in range(50):
+        ours.send(frames_of(cycle, 3))
+        ours.send(frames_of(cycle + 1))
+        assert ours.receive(block) == 4
+        assert block["data"][:4, 0].tolist() == [cycle] * 3 + [cycle + 1]
+    assert answering.heard == [[cycle] * 3 + [cycle + 1] for cycle in range(50)]
+
+
+def test_who_is_not_answered_gets_nothing_as_soon_as_all_is_taken(asker: tuple[SharedBus, Answering]) -> None:
+    ours, answering = asker
+    block = new_frames(8)
+    assert ours.receive(block) == 0  # nothing was asked
+    ours.send(frames_of(100))
+    assert ours.receive(block) == 0
+    assert answering.heard == [[100]]
+    ours.send(frames_of(7))
+    assert ours.receive(block) == 1
+
+
+def test_what_does_not_fit_comes_with_the_next_receive_without_asking(asker: tuple[SharedBus, Answering]) -> None:
+    ours, answering = asker
+    ours.send(frames_of(1, 5))
+    assert [ours.receive(new_frames(2)) for _ in range(3)] == [2, 2, 1]
+    assert len(answering.heard) == 1
+
+
+def test_a_late_answer_wakes_the_asker_and_a_late_question_the_other(ends: tuple[SharedBus, SharedBus]) -> None:
+    """Both ends fall asleep, as on a machine with one core."""
+    ours, theirs = ends
+    ours.patience = LONG
+    block, asked = new_frames(4), new_frames(4)
+
+    def answer() -> None:
+        for _ in range(3):
+            theirs.receive(asked, LONG)
+            time.sleep(0.01)
+            theirs.send(asked[:1])
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    for cycle in range(3):
+        time.sleep(0.01)
+        ours.send(frames_of(cycle))
+        assert ours.receive(block) == 1
+        assert block["data"][0, 0] == cycle
+    thread.join(LONG)
+
+
+def test_patience_with_an_end_that_never_listens_is_limited(ends: tuple[SharedBus, SharedBus]) -> None:
+    ours, _ = ends
+    ours.patience = 0.03
+    ours.send(frames_of(1))
+    begun = time.monotonic()
+    assert ours.receive(new_frames(1)) == 0
+    assert time.monotonic() - begun >= 0.03
+    with pytest.raises(BusDown, match="nobody listens at the other end after 0 s"):
+        ours.meet(0.03)
+
+
+def test_a_queue_goes_round_and_refuses_whole_batches_when_nobody_reads(ends: tuple[SharedBus, SharedBus]) -> None:
+    one, other = ends
+    received = []
+    for batch in range(20):
+        one.send(frames_of(batch, 4))
+        one.send(frames_of(100 + batch, 3))
+        with pytest.raises(BusFull, match="7 frames wait at the other end and are not read") as refusal:
+            one.send(frames_of(0, 4))
+        assert refusal.value.sent == 0
+        block = new_frames(7)
+        assert other.receive(block) == 7
+        received += block["data"][:, 0].tolist()
+    assert received == [value for batch in range(20) for value in [batch] * 4 + [100 + batch] * 3]
+
+
+def test_stamps_are_the_time_of_the_receive(ends: tuple[SharedBus, SharedBus]) -> None:
+    one, other = ends
+    one.send(frames_of(0, 2))
+    before = time.time_ns()
+    other.receive(new_frames(2))
+    assert before <= other.stamps[0] == other.stamps[1] <= time.time_ns()
+    assert other.stamps.dtype == np.int64
+
+
+def test_what_was_sent_before_closing_arrives_and_then_the_last_words(ends: tuple[SharedBus, SharedBus]) -> None:
+    one, other = ends
+    other.send(frames_of(1))  # makes the kernel report a broken connection first
+    one.send(frames_of(5))
+    one.close("the body exploded")
+    block = new_frames(1)
+    assert other.receive(block, LONG) == 1
+    for _ in range(2):
+        with pytest.raises(BusDown, match=r"^embedded peer: the body exploded$"):
+            other.receive(block, LONG)
+    other.send(frames_of(2))  # a wire nobody listens to
+
+
+@pytest.mark.parametrize("patience", [0.0, LONG])
+def test_a_killed_process_at_the_other_end_is_noticed(patience: float) -> None:
+    memory, bell, theirs = descriptors()
+    program = (
+        "import sys\n"
+        "from atalante_hal.bus.shared import SharedBus\n"
+        "from atalante_hal.frame import new_frames\n"
+        "bus = SharedBus('other', int(sys.argv[1]), int(sys.argv[2]), 1)\n"
+        "while True: bus.receive(new_frames(1), 3600.0)\n"
+    )
+    child = subprocess.Popen([sys.executable, "-c", program, str(memory), str(theirs)], pass_fds=(memory, theirs))
+    os.close(theirs)
+    bus = SharedBus("embedded", memory, bell, 0)
+    bus.patience = patience
+    bus.meet(LONG)
+    assert bus.receive(new_frames(1)) == 0
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    bus.send(frames_of(1))
+    with pytest.raises(BusDown, match=r"^embedded: the other end is gone$"):
+        bus.receive(new_frames(1), LONG)
+    bus.close()
