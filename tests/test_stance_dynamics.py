@@ -5,6 +5,7 @@ import pinocchio
 import pytest
 
 from atalante_control.gait import HANG_GAIT, bezier, load_gait, motion
+from atalante_control.idealization import Gravity
 from atalante_control.model import ExoskeletonParameters, Patient, pinocchio_model, urdf
 from atalante_control.stance_dynamics import STANCE_FOOT, StanceDynamics, stance_dynamics
 from atalante_hal.robot import load_robot
@@ -63,7 +64,7 @@ def test_joints_supply_the_power_that_the_energy_gains() -> None:
 def test_at_rest_the_ground_carries_the_weight_under_the_centre_of_mass() -> None:
     body = OnItsFoot()
     for q, _, _ in random_states(20):
-        torque, force, moment = DYNAMICS.forces(q, np.zeros(12), np.zeros(12))
+        torque, force, moment, _ = DYNAMICS.forces(q, np.zeros(12), np.zeros(12))
         full = body.configuration(q)
         mass = pinocchio.computeTotalMass(body.floating.model)
         np.testing.assert_allclose(force, [0.0, 0.0, mass * GRAVITY], atol=1e-9)
@@ -76,16 +77,27 @@ def test_at_rest_the_ground_carries_the_weight_under_the_centre_of_mass() -> Non
         np.testing.assert_allclose(torque, gradient, atol=1e-3)
 
 
-def test_feedforward_is_the_torque_without_the_static_one() -> None:
+def test_feedforward_and_gravity_of_the_hanging_exoskeleton_are_the_torque_that_walks() -> None:
     gait = load_gait(HANG_GAIT, ROBOT)
     slow = 3.0  # s: drawn by hand for the air, it would ask too much of the ground in its own time
     phase = np.linspace(0.0, 1.0, 41)
     q, qd, qdd = motion(gait.coefficients, slow, phase)
-    static = DYNAMICS.torques(q, np.zeros_like(q), np.zeros_like(q))
-    walked = static + bezier(DYNAMICS.feedforward(gait.coefficients, slow), phase)
+    fitted = pinocchio_model(urdf(ExoskeletonParameters().fitted(PATIENT), ROBOT))
+    gravity = Gravity(fitted)
+    u_g = np.array(
+        [gravity.torque(q, DYNAMICS.forces(q, qd, qdd).pelvis).copy() for q, qd, qdd in zip(q, qd, qdd, strict=True)]
+    )
     demanded = DYNAMICS.torques(q, qd, qdd)
+    walked = u_g + bezier(DYNAMICS.feedforward(gait.coefficients, slow), phase)
     assert np.abs(walked - demanded).max() < 0.02 * np.abs(demanded).max()
-    assert np.abs(DYNAMICS.feedforward(np.repeat(q[:1].T, 8, axis=1), slow)).max() < 1e-9
+
+
+def test_the_swing_leg_of_an_empty_exoskeleton_needs_no_feedforward_at_rest() -> None:
+    """Its weight is the same, standing on the other foot or hanging from the pelvis: u_g is all of it."""
+    q = load_gait(HANG_GAIT, ROBOT).tables().q[300]
+    feedforward = stance_dynamics(ROBOT).feedforward(np.repeat(q[:, None], 8, axis=1), 1.0)
+    assert np.abs(feedforward[:6]).max() < 1e-9
+    assert np.abs(feedforward[6:]).max() > 10.0
 
 
 def test_a_heavier_patient_asks_for_more() -> None:
@@ -100,4 +112,4 @@ def test_a_heavier_patient_asks_for_more() -> None:
 def test_the_text_needs_every_joint() -> None:
     text = urdf(ExoskeletonParameters(), ROBOT).replace('"right_HA"', '"spare"')
     with pytest.raises(ValueError, match="lacks joint right_HA"):
-        StanceDynamics(text)
+        StanceDynamics(text, urdf(ExoskeletonParameters(), ROBOT))

@@ -7,9 +7,10 @@ seen from the pelvis, the pelvis moves with -V. One recursive Newton-Euler pass 
 nothing but the ground can supply it, so the ground wrench is f, and the joints' torques are those of the pass minus
 J^T f, J being the foot's Jacobian in the pelvis (the base rows of the equation of motion, solved exactly).
 
-What walks is the sum of two torques, and the gait file holds the second: the *static* torque that holds the pose still on
-the stance leg, which the controller computes from the model, and u_f, the rest. So u_f excludes gravity, and adding u_g
-counts it once.
+What walks is the sum of two torques: u_g, the gravity of the *empty* exoskeleton hanging from its pelvis, which the
+controller adds in every cycle (joint idealization), and u_f, all the rest, which the gait file holds: the patient's
+weight, what standing on one leg asks for, and the inertia. So u_f excludes gravity where u_g is added, and u_g + u_f is
+the torque that walks.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy.typing as npt
 import pinocchio
 
 from atalante_control.gait import DEGREE, bezier, motion
+from atalante_control.idealization import Gravity
 from atalante_control.model import LEG_LINKS, ExoskeletonParameters, Patient, pinocchio_model, urdf
 from atalante_hal.robot import SIDES, Robot
 
@@ -33,22 +35,28 @@ _SAMPLES = 33
 
 
 class GroundForces(NamedTuple):
-    """What one pose in motion asks for."""
+    """What one pose in motion asks for, and how the pelvis is turned."""
 
     torque: Vector  # (12,) Nm, order of JOINTS
     force: Vector  # (3,) N, of the ground, in the stance foot's axes
     moment: Vector  # (3,) Nm, about the stance foot's origin (the ankle)
+    pelvis: tuple[float, float, float, float]  # unit quaternion wxyz, pelvis to world
 
 
 class StanceDynamics:
     """A robot, worn or empty, on its right foot."""
 
-    def __init__(self, urdf_text: str) -> None:
-        """Build the two Pinocchio models, pelvis floating and pelvis fixed.
+    def __init__(self, urdf_text: str, empty: str) -> None:
+        """Build the Pinocchio models, pelvis floating and pelvis fixed, and that of u_g.
+
+        Args:
+            urdf_text: what walks.
+            empty: the same exoskeleton with nobody in it.
 
         Raises:
-            ValueError: a joint of `JOINTS` is not in the text.
+            ValueError: a joint of `JOINTS` is not in a text.
         """
+        self._gravity = Gravity(pinocchio_model(empty))
         self._floating, self._fixed = pinocchio_model(urdf_text, fixed_base=False), pinocchio_model(urdf_text)
         self._data: tuple[Any, Any] = (self._floating.model.createData(), self._fixed.model.createData())
         self._foot = self._fixed.model.getFrameId(STANCE_FOOT)
@@ -81,26 +89,32 @@ class StanceDynamics:
         wrench = pinocchio.Force(demanded[:6])
         on_foot = foot.actInv(wrench)
         torque = demanded[floating.v] - (jacobian.T @ demanded[:6])[fixed.v]
-        return GroundForces(torque, on_foot.linear.copy(), on_foot.angular.copy())
+        x, y, z, w = full_q[3:7].tolist()
+        return GroundForces(torque, on_foot.linear.copy(), on_foot.angular.copy(), (w, x, y, z))
 
     def torques(self, q: Vector, qd: Vector, qdd: Vector) -> Vector:
         """Joint torques along a motion. Shapes (n, 12) [rad, rad/s, rad/s2] to (n, 12) [Nm]."""
         return np.array([self.forces(*state).torque for state in zip(q, qd, qdd, strict=True)])
 
     def feedforward(self, coefficients: Vector, duration: float) -> Vector:
-        """u_f of a right-stance step: the torques that walk it less the static ones, as (12, 8) control points [Nm].
+        """u_f of a right-stance step: the torques that walk it less u_g, as (12, 8) control points [Nm].
 
         Args:
             coefficients: Bezier control points of the joints, (12, 8) [rad].
             duration: T [s].
         """
         phase = np.linspace(0.0, 1.0, _SAMPLES)
-        q, qd, qdd = motion(coefficients, duration, phase)
-        still = np.zeros_like(q)
-        moving = self.torques(q, qd, qdd) - self.torques(q, still, still)
-        return np.asarray(np.linalg.lstsq(bezier(np.eye(DEGREE + 1), phase), moving, rcond=None)[0].T)
+        states = [self.forces(*state) for state in zip(*motion(coefficients, duration, phase), strict=True)]
+        gravity = [
+            self._gravity.torque(pose, state.pelvis).copy()
+            for pose, state in zip(bezier(coefficients, phase), states, strict=True)
+        ]
+        feedforward = np.array([state.torque for state in states]) - np.array(gravity)
+        return np.asarray(np.linalg.lstsq(bezier(np.eye(DEGREE + 1), phase), feedforward, rcond=None)[0].T)
 
 
 def stance_dynamics(robot: Robot, patient: Patient | None = None) -> StanceDynamics:
     """The exoskeleton with a patient in it, or empty, on its right foot."""
-    return StanceDynamics(urdf(ExoskeletonParameters(), robot, patient))
+    exoskeleton = ExoskeletonParameters()
+    fitted = exoskeleton if patient is None else exoskeleton.fitted(patient)
+    return StanceDynamics(urdf(exoskeleton, robot, patient), urdf(fitted, robot))
