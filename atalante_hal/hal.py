@@ -95,6 +95,7 @@ class Hal:
         self._build_state(assistance_factor)
         self._build_status(gait_hash)
         self._limiter = Limiter(robot, PERIOD)
+        self._enabling = False  # drives are being enabled, and torque is sent to those that are
         self._all_valid = False  # `state.valid` says so
         self._settled = False  # the supervisor stays where it is while the conditions stay as they are
         self._pending = 0  # conditions raised since the last read, judged in the next
@@ -143,6 +144,7 @@ class Hal:
         record, layout, robot = self.record, self.layout, self.robot
         joint = record[layout["position"].start : layout["torque"].stop]
         self._joint_side = joint
+        self._motion = joint[: 2 * _JOINT_COUNT].reshape(2, _JOINT_COUNT)  # position, velocity
         self._motor_side = record[layout["motor_position"].start : layout["motor_torque"].stop]
         per_turn = robot.polarity / robot.gear
         # Torque is at the joint on the wire, in both directions.
@@ -253,7 +255,7 @@ class Hal:
         """
         if self.state.supervisor is not SupervisorState.ACTIVE:
             return self.hold()
-        limited = self._limiter.apply(command.torque)
+        limited = self._limiter.apply(command.torque, self._motion)
         if not limited.finite:
             self._raise_condition(Condition.COMMAND_NOT_FINITE, "the controller asked for a torque that is not finite")
             return self.hold()
@@ -277,11 +279,21 @@ class Hal:
         elif self._start_wanted and self.state.supervisor in (SupervisorState.READY, SupervisorState.HOLD):
             self._tx_control[:] = [controlword_towards_operation(int(s)) for s in self.state.drive_state.tolist()]
             # What the drive holds with now, so that nothing sags between its hold and the controller's first torque.
-            self._limiter.restart(self.state.torque)
+            self._follow_drives()
             self._tx_torque[:] = self._limiter.last
+        else:
+            self._enabling = False
         self._torque_command[:] = self._tx_torque
         self._level_command.fill(0.0)
         return self._send_command()
+
+    def _follow_drives(self) -> None:
+        """Command what the drives exert by themselves, within all limits from the second cycle on."""
+        if self._enabling:
+            self._limiter.apply(self.state.torque, self._motion)
+        else:
+            self._limiter.restart(self.state.torque)
+            self._enabling = True
 
     def fail(self, error: Exception) -> Vector:
         """The controller raised: HOLD in this same cycle."""
@@ -444,7 +456,8 @@ class Hal:
         self._tx_state.fill(after)
         if after is SupervisorState.ACTIVE:
             self._start_wanted = 0
-            self._limiter.restart(state.torque)
+            if not self._enabling:
+                self._limiter.restart(state.torque)
         if (
             before is SupervisorState.ACTIVE
             and not self.conditions & HOLD_ON

@@ -1,63 +1,270 @@
-"""The limiter: nothing leaves outside the limits, and nothing inside them is touched."""
+"""The limiter: nothing leaves outside the limits, nothing inside them is touched, and no brake is weakened."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from atalante_hal.limiter import Limiter
-from atalante_hal.robot import load_robot
+from atalante_hal.limiter import Limited, Limiter
+from atalante_hal.robot import JOINTS, load_robot
 
 ROBOT = load_robot()
-STEP = ROBOT.torque_rate_max * 1e-3
+PERIOD = 1e-3
+STEP = ROBOT.torque_rate_max * PERIOD
+MIDDLE = (ROBOT.position_min + ROBOT.position_max) / 2.0
+AT_REST = np.array([MIDDLE, np.zeros(12)])
+LOOK, PAST, FASTER = ROBOT.envelope.look_ahead, ROBOT.envelope.position_margin, ROBOT.envelope.velocity_margin
+FREE, CUT, REFUSED = Limited(True, False), Limited(True, True), Limited(False, False)
+
+commands = arrays(np.float64, 12, elements=st.floats(width=64))
+finite_commands = arrays(np.float64, 12, elements=st.floats(-500.0, 500.0))
+motions = st.tuples(
+    arrays(np.float64, 12, elements=st.floats(-2.5, 2.5)), arrays(np.float64, 12, elements=st.floats(-8.0, 8.0))
+).map(np.array)
+joints = pytest.mark.parametrize("joint", range(12), ids=JOINTS)
 
 
-@given(st.lists(arrays(np.float64, 12, elements=st.floats(width=64)), min_size=1, max_size=20))
-def test_nothing_leaves_above_torque_or_rate_limit(commands: list[np.ndarray]):
-    limiter = Limiter(ROBOT, 1e-3)
+def limiter_at(torque: np.ndarray) -> Limiter:
+    limiter = Limiter(ROBOT, PERIOD)
+    limiter.restart(torque)
+    return limiter
+
+
+def moving(joint: int, position: float, velocity: float = 0.0) -> np.ndarray:
+    motion = AT_REST.copy()
+    motion[:, joint] = position, velocity
+    return motion
+
+
+def only(joint: int, value: float) -> np.ndarray:
+    vector = np.zeros(12)
+    vector[joint] = value
+    return vector
+
+
+def share(beyond: np.ndarray) -> np.ndarray:
+    return 1.0 - np.clip(beyond, 0.0, 1.0)
+
+
+def reach(motion: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Largest torque up and down of the docstring, written once more."""
+    q, v = motion
+    ahead = q + LOOK * v
+    up = np.minimum(share((ahead - ROBOT.position_max) / PAST), share((v - ROBOT.velocity_max) / FASTER))
+    down = np.minimum(share((ROBOT.position_min - ahead) / PAST), share((-v - ROBOT.velocity_max) / FASTER))
+    return up * limit, down * limit
+
+
+@given(st.lists(st.tuples(commands, motions), min_size=1, max_size=20))
+@example([(np.full(12, 1.7e308), AT_REST), (np.full(12, -1.7e308), AT_REST)])
+def test_what_the_docstring_promises_of_every_command(cycles: list[tuple[np.ndarray, np.ndarray]]):
+    limiter = Limiter(ROBOT, PERIOD)
+    saturated = 0
+    for command, motion in cycles:
+        before, copy = limiter.last.copy(), command.copy()
+        result = limiter.apply(command, motion)
+        assert command.tobytes() == copy.tobytes()
+        u = limiter.last
+        if not np.isfinite(command).all():
+            assert result == REFUSED
+            assert u.tobytes() == before.tobytes()
+            continue
+        tiny = 1e-9
+        up, down = reach(motion, ROBOT.torque_max)
+        assert (np.abs(u) <= ROBOT.torque_max).all()
+        assert (np.abs(u - before) <= STEP + tiny).all()
+        assert (u <= np.maximum(up, before - STEP) + tiny).all()
+        assert (-u <= np.maximum(down, -before - STEP) + tiny).all()
+        # And no more is cut than that.
+        low = np.clip(-down, before - STEP, before + STEP)
+        high = np.clip(up, before - STEP, before + STEP)
+        assert np.allclose(u, np.minimum(np.maximum(command, low), high), rtol=0.0, atol=tiny)
+        assert result == (CUT if (u != command).any() else FREE)
+        assert np.array_equal(limiter.cut, u != command)
+        saturated = saturated + 1 if result.clamped else 0
+        assert limiter.saturated == saturated
+
+
+@given(finite_commands, motions, arrays(np.float64, 12, elements=st.floats(0.0, 400.0)))
+def test_a_torque_inside_all_limits_keeps_its_bits(command: np.ndarray, motion: np.ndarray, limit: np.ndarray):
+    limiter = limiter_at(np.clip(command, -limit, limit))
+    limiter.derate(limit)
+    up, down = reach(motion, np.minimum(limit, ROBOT.torque_max))
+    inside = np.clip(command, np.maximum(-down, limiter.last - STEP), np.minimum(up, limiter.last + STEP))
+    inside = np.where((inside <= up) & (inside >= -down), inside, limiter.last)
     before = limiter.last.copy()
-    for command in commands:
-        result = limiter.apply(command)
-        assert result.finite == np.isfinite(command).all()
-        assert (np.abs(limiter.last) <= ROBOT.torque_max).all()
-        assert (np.abs(limiter.last - before) <= STEP * (1 + 1e-12)).all()
-        if not result.finite:
-            assert np.array_equal(limiter.last, before)
-        before = limiter.last.copy()
+    limiter.apply(inside, motion)
+    touched = limiter.last.view(np.int64) != inside.view(np.int64)
+    allowed = (np.abs(inside) <= limiter.limit) & (inside <= up) & (-inside <= down) & (np.abs(inside - before) <= STEP)
+    assert not (touched & allowed).any()
 
 
-def test_a_command_inside_the_limits_keeps_its_bits():
-    limiter = Limiter(ROBOT, 1e-3)
+def test_a_command_inside_the_limits_keeps_its_bits_for_a_thousand_cycles():
+    limiter = Limiter(ROBOT, PERIOD)
     rng = np.random.default_rng(0)
     torque = np.zeros(12)
     for _ in range(1000):
         torque = np.clip(torque + rng.uniform(-0.9, 0.9, 12) * STEP, -ROBOT.torque_max, ROBOT.torque_max)
-        result = limiter.apply(torque)
+        assert limiter.apply(torque, AT_REST) == FREE
         assert limiter.last.tobytes() == torque.tobytes()
-        assert not result.clamped
 
 
-def test_cutting_is_reported():
-    limiter = Limiter(ROBOT, 1e-3)
-    assert limiter.apply(np.full(12, 1e4)).clamped
-    assert np.allclose(limiter.last, np.minimum(STEP, ROBOT.torque_max))
+@joints
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+class TestTightThresholds:
+    """Just inside nothing happens, just outside that joint alone is cut."""
+
+    def expect(self, limiter: Limiter, torque: np.ndarray, motion: np.ndarray, cut: int | None) -> None:
+        assert limiter.apply(torque, motion) == (FREE if cut is None else CUT)
+        assert np.flatnonzero(limiter.cut).tolist() == ([] if cut is None else [cut])
+
+    def test_torque(self, joint: int, sign: float):
+        largest = ROBOT.torque_max[joint]
+        at = only(joint, sign * largest)
+        self.expect(limiter_at(at), at, AT_REST, None)
+        over = limiter_at(at)
+        self.expect(over, at * (1.0 + 1e-12), AT_REST, joint)
+        assert over.last[joint] == sign * largest
+
+    def test_derated_torque(self, joint: int, sign: float):
+        limiter = limiter_at(np.zeros(12))
+        limit = ROBOT.torque_max.copy()
+        limit[joint] = 7.0
+        limiter.derate(limit)
+        assert limiter.limit.tobytes() == limit.tobytes()
+        self.expect(limiter, only(joint, sign * 7.0), AT_REST, None)
+        self.expect(limiter, only(joint, sign * 7.0001), AT_REST, joint)
+        assert limiter.last[joint] == sign * 7.0
+
+    def test_rate(self, joint: int, sign: float):
+        step = STEP[joint]
+        self.expect(limiter_at(np.zeros(12)), only(joint, sign * step), AT_REST, None)
+        self.expect(limiter_at(only(joint, sign)), only(joint, sign * (1.0 - step)), AT_REST, None)
+        over = limiter_at(only(joint, sign))
+        self.expect(over, only(joint, sign * (1.001 + step)), AT_REST, joint)
+        assert over.last[joint] == sign * (1.0 + step)
+
+    def test_position(self, joint: int, sign: float):
+        limit = (ROBOT.position_max if sign > 0 else ROBOT.position_min)[joint]
+        full = only(joint, sign * ROBOT.torque_max[joint])
+        self.expect(limiter_at(full), full, moving(joint, limit), None)
+        beyond = limiter_at(full)
+        self.expect(beyond, full, moving(joint, limit + sign * 1e-6), joint)
+        assert sign * beyond.last[joint] == pytest.approx(ROBOT.torque_max[joint] * (1.0 - 1e-6 / PAST))
+
+    def test_where_the_joint_will_be(self, joint: int, sign: float):
+        limit = (ROBOT.position_max if sign > 0 else ROBOT.position_min)[joint]
+        full = only(joint, sign * ROBOT.torque_max[joint])
+        self.expect(limiter_at(full), full, moving(joint, limit - sign * (LOOK + 1e-9), sign), None)
+        self.expect(limiter_at(full), full, moving(joint, limit - sign * (LOOK - 1e-6), sign), joint)
+        self.expect(limiter_at(full), full, moving(joint, limit + sign * 0.9 * LOOK, -sign), None)
+
+    def test_velocity(self, joint: int, sign: float):
+        fastest = sign * ROBOT.velocity_max[joint]
+        full = only(joint, sign * ROBOT.torque_max[joint])
+        self.expect(limiter_at(full), full, moving(joint, MIDDLE[joint], fastest), None)
+        over = limiter_at(full)
+        self.expect(over, full, moving(joint, MIDDLE[joint], fastest + sign * 1e-4), joint)
+        assert sign * over.last[joint] == pytest.approx(ROBOT.torque_max[joint] * (1.0 - 1e-4 / FASTER))
+
+    @pytest.mark.parametrize("part", [0.25, 0.5, 1.0, 2.0])
+    def test_nothing_drives_a_joint_on_past_the_margin(self, joint: int, sign: float, part: float):
+        limit = (ROBOT.position_max if sign > 0 else ROBOT.position_min)[joint]
+        for motion in (
+            moving(joint, limit + sign * part * PAST),
+            moving(joint, MIDDLE[joint], sign * (ROBOT.velocity_max[joint] + part * FASTER)),
+        ):
+            limiter = Limiter(ROBOT, PERIOD)
+            for _ in range(20):
+                limiter.apply(only(joint, sign * ROBOT.torque_max[joint]), motion)
+            assert sign * limiter.last[joint] == pytest.approx(max(0.0, 1.0 - part) * ROBOT.torque_max[joint])
+
+    def test_a_brake_keeps_the_whole_limit(self, joint: int, sign: float):
+        limit = (ROBOT.position_max if sign > 0 else ROBOT.position_min)[joint]
+        brake = only(joint, -sign * ROBOT.torque_max[joint])
+        motion = moving(joint, limit + sign * PAST, sign * (ROBOT.velocity_max[joint] + 2.0 * FASTER))
+        limiter = limiter_at(brake)
+        self.expect(limiter, brake, motion, None)
+        assert limiter.last.tobytes() == brake.tobytes()
+
+    def test_where_the_envelope_closes_the_torque_falls_at_the_rate_limit(self, joint: int, sign: float):
+        limit = (ROBOT.position_max if sign > 0 else ROBOT.position_min)[joint]
+        limiter = limiter_at(only(joint, sign * 3.5 * STEP[joint]))
+        left = []
+        for _ in range(5):
+            limiter.apply(only(joint, sign * 1e3), moving(joint, limit + sign * PAST))
+            left.append(sign * limiter.last[joint] / STEP[joint])
+        assert left == pytest.approx([2.5, 1.5, 0.5, 0.0, 0.0], abs=1e-9)
+
+
+def test_where_the_derated_limit_falls_the_torque_follows_at_the_rate_limit():
+    limiter = limiter_at(np.full(12, 3.5 * STEP[0]))
+    limiter.derate(np.full(12, STEP[0]))
+    left = []
+    for _ in range(4):
+        limiter.apply(np.full(12, 3.5 * STEP[0]), AT_REST)
+        left.append(float(limiter.last[0] / STEP[0]))
+    assert left == pytest.approx([2.5, 1.5, 1.0, 1.0])
+
+
+def test_no_limit_is_raised_above_the_robots_own():
+    limiter = Limiter(ROBOT, PERIOD)
+    assert limiter.limit.tobytes() == ROBOT.torque_max.tobytes()
+    limiter.derate(np.full(12, 1.0))
+    limiter.derate(np.full(12, 1e6))
+    assert limiter.limit.tobytes() == ROBOT.torque_max.tobytes()
+    assert limiter.apply(np.zeros(12), AT_REST) == FREE
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_one_bad_number_spoils_the_whole_command(bad: float):
-    limiter = Limiter(ROBOT, 1e-3)
-    for joint in range(12):
-        torque = np.zeros(12)
-        torque[joint] = bad
-        assert not limiter.apply(torque).finite
+@joints
+def test_one_bad_number_spoils_the_whole_command(joint: int, bad: float):
+    limiter = limiter_at(np.full(12, 5.0))
+    assert limiter.apply(only(joint, bad), AT_REST) == REFUSED
+    for motion in (moving(joint, np.nan), moving(joint, MIDDLE[joint], np.nan)):
+        assert limiter.apply(np.full(12, 5.0), motion) == REFUSED
+    assert limiter.last.tobytes() == np.full(12, 5.0).tobytes()
+
+
+def test_saturation_is_counted_while_it_lasts():
+    limiter = Limiter(ROBOT, PERIOD)
+    for cycle in range(3):
+        assert limiter.apply(only(4, 1e3), AT_REST) == CUT
+        assert limiter.saturated == cycle + 1
+    assert limiter.apply(limiter.last.copy(), AT_REST) == FREE
+    assert limiter.saturated == 0
+    assert not limiter.cut.any()
+
+
+def ends_outside_the_envelope(limiter: Limiter) -> None:
+    assert limiter.apply(np.zeros(12), moving(0, ROBOT.position_max[0] + PAST)) == FREE
+
+
+def ends_with_a_restart(limiter: Limiter) -> None:
+    limiter.restart(np.zeros(12))
+
+
+@pytest.mark.parametrize("end", [ends_outside_the_envelope, ends_with_a_restart])
+def test_saturation_ends(end: Callable[[Limiter], None]):
+    limiter = Limiter(ROBOT, PERIOD)
+    limiter.apply(only(0, STEP[0] * 1.5), AT_REST)
+    assert limiter.cut.any()
+    end(limiter)
+    assert limiter.saturated == 0
+    assert not limiter.cut.any()
 
 
 def test_restart_counts_from_the_drives_own_torque_within_the_limits():
-    limiter = Limiter(ROBOT, 1e-3)
-    limiter.restart(np.full(12, 40.0))
-    assert limiter.apply(np.full(12, 41.0)).clamped is False
-    limiter.restart(np.array([np.nan, np.inf, *np.full(10, -1e6)]))
-    assert (np.abs(limiter.last) <= ROBOT.torque_max).all()
+    limiter = limiter_at(np.full(12, 40.0))
+    assert limiter.last.tobytes() == np.full(12, 40.0).tobytes()
+    assert limiter.apply(np.full(12, 41.0), AT_REST) == FREE
+    limiter.derate(np.full(12, 30.0))
+    limiter.restart(np.array([np.nan, np.inf, -np.inf, *np.full(9, -1e6)]))
+    assert limiter.last.tolist() == [0.0, 0.0, 0.0, *[-30.0] * 9]
+    limiter.restart(np.full(12, 1e6))
+    assert limiter.last.tolist() == [30.0] * 12
