@@ -25,6 +25,7 @@ COMMANDS = {
     "validate": "Judge CAN logs or a live bus by everything the DBC says.",
     "decode": "The signals of CAN logs as Parquet or MCAP.",
     "conform": "An acceptance test of one node, with this computer in the place of the HAL.",
+    "faults": "The fault matrix, and runs of the walking robot that prove it.",
     "dbc": "Check, print and compare network descriptions, and make C code of one.",
     "model": "The patient-exoskeleton model: its links, checks, URDF and picture.",
     "bench": "How fast the stack is, with the baseline beside each figure.",

@@ -1,0 +1,206 @@
+"""Campaigns: what they run, over processes or a cluster with the same results, what they report, and how the command ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from atalante_tools.cli import cli
+from atalante_tools.faults import campaign, tasks
+from atalante_tools.faults.catalogue import SCENARIOS
+from atalante_tools.faults.matrix import load_matrix
+from atalante_tools.faults.report import Summary
+from atalante_tools.faults.scenario import Case, Host, Scenario
+from atalante_tools.faults.tasks import HORIZON, CaseTask, Endurance, EnduranceTask, PairTask, PairVerdict, plan
+from atalante_tools.faults.verdict import Verdict
+from atalante_tools.outcome import Failed
+
+OVERRUN = [CaseTask("F44", index) for index in range(len(SCENARIOS["F44"].cases))]
+
+
+def atalante(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, ["faults", *arguments])
+
+
+def by_case(results: Sequence[object]) -> list[object]:
+    return sorted(results, key=str)
+
+
+def test_a_plan_has_every_case_and_every_pair_once() -> None:
+    planned = plan(list(SCENARIOS), endurance=True, pairs=True)
+    cases = [task for task in planned if isinstance(task, CaseTask)]
+    assert len(cases) == len(set(cases)) == sum(len(scenario.cases) for scenario in SCENARIOS.values())
+    pairs = {frozenset((task.first, task.second)) for task in planned if isinstance(task, PairTask)}
+    count = len(tasks.REPRESENTATIVES)
+    assert len(pairs) == count * (count - 1) // 2
+    assert {task.id for task in planned if isinstance(task, EnduranceTask)} == {
+        s.id for s in SCENARIOS.values() if s.lasting
+    }
+
+
+def test_processes_give_what_this_process_gives() -> None:
+    here = list(campaign.results(OVERRUN))
+    assert by_case(list(campaign.results(OVERRUN, jobs=2))) == by_case(here)
+    assert all(isinstance(verdict, Verdict) and verdict.passed for verdict in here)
+
+
+@pytest.mark.filterwarnings("ignore")  # dask's own
+def test_a_cluster_gives_what_this_process_gives() -> None:
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, host="127.0.0.1", dashboard_address=None
+    ) as cluster:
+        there = list(campaign.results(OVERRUN, dask=cluster.scheduler_address))
+    assert by_case(there) == by_case(list(campaign.results(OVERRUN)))
+
+
+def test_no_scheduler_and_no_library_are_said_in_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(Failed, match="start one with `dask scheduler`"):
+        list(campaign.results(OVERRUN, dask="not an address"))
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(Failed, match=r"pip install 'atalante-hal\[dask\]'"):
+        list(campaign.results(OVERRUN, dask="tcp://127.0.0.1:1"))
+    monkeypatch.setitem(sys.modules, "joblib", None)
+    with pytest.raises(Failed, match=r"pip install 'atalante-hal\[campaign\]'"):
+        list(campaign.results(OVERRUN, jobs=2))
+
+
+def test_a_crash_of_the_stack_is_a_failed_case(monkeypatch: pytest.MonkeyPatch) -> None:
+    def crash(case: Case, bound: int, *, recovery: bool) -> None:
+        raise RuntimeError("the stack fell")
+
+    monkeypatch.setattr(tasks, "observe", crash)
+    verdict = tasks.attempt("F44", SCENARIOS["F44"].cases[0])
+    assert verdict.failures == ("crashed: RuntimeError: the stack fell",)
+    pair = PairTask(("F44", SCENARIOS["F44"].cases[0].name), ("F44", SCENARIOS["F44"].cases[1].name))()
+    assert pair.failures == ("crashed: RuntimeError: the stack fell",)
+
+
+def test_how_long_is_the_last_length_that_is_survived() -> None:
+    assert EnduranceTask("F44")() == Endurance("F44", SCENARIOS["F44"].lasting.name, 2)
+
+
+def test_what_never_ends_the_walk_is_survived_to_the_end_of_the_watch(monkeypatch: pytest.MonkeyPatch) -> None:
+    harmless = Scenario("F44", (), lasting=Case("in time", (Host("late", 0, None, 0.0),)))
+    monkeypatch.setitem(tasks.SCENARIOS, "F44", harmless)
+    assert EnduranceTask("F44")() == Endurance("F44", "in time", None)
+
+
+def test_two_faults_end_as_badly_as_the_worse_of_them() -> None:
+    late, raised = (("F44", "3 cycles"), ("F45", "ValueError"))
+    assert PairTask(late, raised)() == PairVerdict("F44 3 cycles", "F45 ValueError", "HOLD", ())
+
+
+GOOD = Verdict("F44", "3 cycles", "HOLD", 2, 3, "OVERRUN", ())
+BAD = replace(GOOD, case="4 cycles", cycles=9, failures=("HOLD after 9 cycles, and 3 are allowed",))
+PAIR = PairVerdict("F03 4 frames", "F04 LEFT_SK", "HOLD", ("crashed: X: y",))
+
+
+def test_the_worst_case_speaks_for_its_fault() -> None:
+    near, far = replace(GOOD, case="b", cycles=3), replace(GOOD, case="a", cycles=1)
+    assert Summary.of([far, near]).lines[0].cycles == 3
+    line = Summary.of([near, BAD]).lines[0]
+    assert (line.passed, line.cycles, line.cases) == (False, 9, 2)
+    assert line.failures == ("4 cycles: HOLD after 9 cycles, and 3 are allowed",)
+
+
+def test_a_report_says_what_failed_how_long_and_which_pairs(tmp_path: Path) -> None:
+    summary = Summary.of([PAIR, Endurance("F03", "for good", 4), Endurance("F11", "for good", None), BAD], 12.0)
+    assert not summary.passed
+    summary.write(tmp_path / "new")
+    text = (tmp_path / "new" / "report.md").read_text()
+    for piece in (
+        "| F44 |",
+        "**NO**",
+        "- F44 4 cycles: HOLD after 9",
+        "| 4 |",
+        f"| {HORIZON} and more |",
+        "and F04 LEFT_SK: crashed",
+    ):
+        assert piece in text
+    data = json.loads((tmp_path / "new" / "report.json").read_text())
+    assert not data["passed"]
+    assert data["lines"][0]["id"] == "F44"
+    assert data["endurance"][1]["survived"] is None
+    assert Summary.of([GOOD]).passed
+
+
+def test_list_is_the_matrix() -> None:
+    shown = [json.loads(line) for line in atalante("list", "--json").stdout.splitlines()]
+    assert [line["id"] for line in shown] == list(load_matrix())
+    assert "F44" in atalante("list").stdout
+
+
+def test_run_prints_a_table_or_one_object() -> None:
+    result = atalante("run", "f44")
+    assert result.exit_code == 0
+    assert "3 cycles" in result.stdout
+    shown = json.loads(atalante("run", "F44", "--case", "3 cycles", "--json").stdout)
+    keys = ("id", "passed", "state", "cycles", "bound", "dtc")
+    assert [shown[key] for key in keys] == ["F44", True, "HOLD", 3, 3, "OVERRUN"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("run", "F99"), "there is no fault 'F99'"),
+        (("run", "F08"), "type `pytest tests/faults/test_frames.py"),
+        (("run", "F44", "--case", "nothing like it"), "there are 2 cycles, 3 cycles"),
+        (("campaign", "F08"), "F08 has no scenario"),
+        (("campaign", "--jobs", "0"), "--jobs"),
+    ],
+)
+def test_what_cannot_be_run_is_misuse(arguments: tuple[str, ...], says: str) -> None:
+    result = atalante(*arguments)
+    assert result.exit_code == 2
+    assert says in result.stderr
+
+
+def test_a_campaign_writes_its_report_and_fails_with_its_faults(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = ("campaign", "F44", "--jobs", "1", "--out", str(tmp_path), "--json")
+    result = atalante(*arguments)
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["passed"]
+    assert "| F44 |" in (tmp_path / "report.md").read_text()
+    monkeypatch.setattr(campaign, "run_task", lambda task: BAD)
+    result = atalante(*arguments[:-1], "--no-endurance")
+    assert result.exit_code == 1
+    assert "1 of 1 faults and 0 of 0 pairs failed" in result.stderr
+
+
+def test_ctrl_c_ends_a_campaign_and_its_processes(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", "from atalante_tools.cli import main; main()", "faults", "campaign", "--jobs", "2"]
+    command += ["--out", str(tmp_path)]
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert process.stderr is not None
+    process.stderr.readline()
+    os.killpg(process.pid, signal.SIGINT)
+    _, stderr = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "Traceback" not in stderr
+    deadline = time.monotonic() + 10.0
+    while group_alive(process.pid):
+        assert time.monotonic() < deadline, "a process of the campaign is still there"
+        time.sleep(0.05)
+
+
+def group_alive(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True

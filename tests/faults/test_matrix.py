@@ -1,0 +1,95 @@
+"""The table of record, the scenarios and the tests say the same: each differs from the others on purpose or fails here."""
+
+from __future__ import annotations
+
+import ast
+import fnmatch
+import re
+from fnmatch import fnmatchcase
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from atalante_hal.diagnostics import Dtc
+from atalante_hal.types import SupervisorState
+from atalante_tools.faults.catalogue import SCENARIOS
+from atalante_tools.faults.matrix import COLUMNS, SCENARIO, MatrixError, load_matrix
+from atalante_tools.faults.verdict import Expectation
+
+TESTS = Path(__file__).parents[1]
+MATRIX = load_matrix()
+S = SupervisorState
+#: A test that proves a row is named after it.
+PROOF = re.compile(r"test_f(\d\d)_")
+
+
+@cache
+def functions_of(path: Path) -> frozenset[str]:
+    """Functions and methods of a test file."""
+    tree = ast.parse(path.read_text())
+    return frozenset(node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+
+
+def test_ids_count_up_without_a_gap() -> None:
+    assert list(MATRIX) == [f"F{number:02d}" for number in range(1, len(MATRIX) + 1)]
+
+
+def test_a_row_is_proved_by_a_scenario_exactly_if_there_is_one() -> None:
+    assert {id_ for id_, row in MATRIX.items() if SCENARIO in row.proof} == set(SCENARIOS)
+
+
+@pytest.mark.parametrize("row", MATRIX.values(), ids=list(MATRIX))
+def test_the_tests_a_row_names_are_there(row) -> None:
+    for proof in row.tests:
+        path, name = proof.split("::")
+        assert (TESTS / path).is_file(), f"{row.id}: no {path}"
+        assert fnmatch.filter(functions_of(TESTS / path), name), f"{row.id}: no {name} in {path}"
+
+
+def test_a_test_named_after_a_row_is_in_its_row() -> None:
+    for path in TESTS.rglob("test_*.py"):
+        for name in functions_of(path):
+            if match := PROOF.match(name):
+                where = f"{path.relative_to(TESTS)}::{name}"
+                named = MATRIX[f"F{match[1]}"].tests
+                assert any(fnmatchcase(where, proof) for proof in named), f"{where} is not in the row of F{match[1]}"
+
+
+@pytest.mark.parametrize("row", [row for row in MATRIX.values() if row.dtc], ids=lambda row: row.id)
+def test_the_code_of_a_row_is_one_the_hal_knows(row) -> None:
+    assert any(re.fullmatch(row.dtc.replace("x", "[0-9A-Fx]"), dtc.value) for dtc in Dtc)
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=list(SCENARIOS))
+def test_cases_are_told_apart_and_have_a_bound(scenario) -> None:
+    names = [case.name for case in scenario.cases]
+    assert len(set(names)) == len(names) > 0
+    for case in scenario.cases:
+        assert Expectation.of(case, MATRIX[scenario.id]).reacted > 0
+    if scenario.lasting is not None:
+        assert scenario.lasting.ends is None
+
+
+def test_what_is_not_a_table_is_refused(tmp_path) -> None:
+    good = "| F01 | a | b | 1 / 5 | c | HOLD | - | scenario, `test_x.py::test_y` |"
+    head = f"| {' | '.join(COLUMNS)} |\n|---|\n"
+
+    def load(text: str):
+        path = tmp_path / "FAULTS.md"
+        path.write_text(text)
+        return load_matrix.__wrapped__(path)
+
+    row = load(head + good)["F01"]
+    assert (row.noticed, row.reacted, row.state, row.dtc) == (1, 5, S.HOLD, "")
+    assert row.tests == ("test_x.py::test_y",)
+    for text, says in (
+        ("", "no table"),
+        (head + good + "\n" + good, "line 4: F01 has a row already"),
+        (head + good.replace("F01", "X1"), "'X1' is no ID"),
+        (head + good.replace("HOLD", "STOP"), "no state 'STOP'"),
+        (head + good.replace("| - ", ""), "7 columns"),
+        (head + good.replace("scenario", "sure"), "proof 'sure'"),
+    ):
+        with pytest.raises(MatrixError, match=says):
+            load(text)

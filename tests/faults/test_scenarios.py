@@ -1,0 +1,17 @@
+"""One fault, one ID, one test: every case of every scenario of the matrix, HAL and emulated robot in lock-step."""
+
+from __future__ import annotations
+
+import pytest
+
+from atalante_tools.faults.catalogue import SCENARIOS
+from atalante_tools.faults.scenario import Case
+from atalante_tools.faults.tasks import attempt
+
+CASES = [(scenario.id, case) for scenario in SCENARIOS.values() for case in scenario.cases]
+
+
+@pytest.mark.parametrize(("id_", "case"), CASES, ids=[f"{id_}-{case.name}" for id_, case in CASES])
+def test_fault(id_: str, case: Case) -> None:
+    verdict = attempt(id_, case)
+    assert verdict.passed, "\n".join(verdict.failures)

@@ -1,0 +1,133 @@
+"""The judge: each of the four questions can be answered with no."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from atalante_dbc import Network
+from atalante_hal.cia402 import Controlword
+from atalante_hal.image import TransmitImage
+from atalante_hal.robot import Robot
+from atalante_hal.telemetry.events import Event
+from atalante_hal.types import SupervisorState
+from atalante_tools.faults.matrix import Row
+from atalante_tools.faults.observation import Observation
+from atalante_tools.faults.scenario import Case
+from atalante_tools.faults.verdict import Expectation, Verdict, judge
+from atalante_tools.faults.witness import Commands, Witness
+
+S = SupervisorState
+FIRST, PRESSED = 11, 41
+ROW = Row("F99", "", "", "2 / 5", "", S.HOLD, "NODE_TIMEOUT", ())
+#: Walks, holds in the fifth faulty cycle, walks again on the operator's word.
+HELD = [S.ACTIVE] * 14 + [S.HOLD] * 28 + [S.ACTIVE] * 8
+NOTED = (Event(12, "NODE_TIMEOUT", "", node="LEFT_SK"),)
+
+
+@pytest.fixture
+def seen(network: Network, robot: Robot) -> Any:
+    def make(
+        states: Sequence[S] = HELD,
+        events: Sequence[Event] = NOTED,
+        *,
+        held: int | None = None,
+        pressed: int | None = PRESSED,
+        **arrays: Any,
+    ) -> Observation:
+        """A robot in these states, whose HOLD frames begin in cycle `held` or with the state."""
+        witness = Witness()
+        tx = TransmitImage([network.message(f"COMMAND_{side}_LEG") for side in ("LEFT", "RIGHT")])
+        for cycle, state in enumerate(states, 1):
+            holds = state >= S.HOLD or (held is not None and held <= cycle < PRESSED)
+            tx.values[tx.codec.slice("Controlword")] = Controlword.QUICK_STOP if holds else Controlword.ENABLE_OPERATION
+            witness.cycle = cycle
+            witness.sent(tx.seal())
+        joints = np.zeros((len(states), 12))
+        rows = dict.fromkeys(("drive_state", "torque", "position", "velocity", "temperature"), joints)
+        return Observation(
+            network=network, robot=robot, first=FIRST, over=None, pressed=pressed, states=tuple(states), events=tuple(events),
+            commands=Commands(network, *witness.frames()), age=np.zeros((len(states), 18), np.int64),
+            guide_exit=np.zeros(len(states)), messages=(), **{**rows, **arrays},
+        )  # fmt: skip
+
+    return make
+
+
+def verdict(observation: Observation, **case: Any) -> Verdict:
+    return judge(ROW, Case("a case", (), **case), observation)
+
+
+def test_what_should_be_passes(seen: Any) -> None:
+    assert verdict(seen(), node="LEFT_SK") == Verdict("F99", "a case", "HOLD", 5, 5, "NODE_TIMEOUT", ())
+
+
+def test_the_hold_frame_counts_before_the_state_does(seen: Any) -> None:
+    assert verdict(seen(held=12)).cycles == 2
+
+
+@pytest.mark.parametrize(
+    ("states", "case", "says"),
+    [
+        ([S.ACTIVE] * 15 + [S.HOLD] * 27 + [S.ACTIVE], {}, ["HOLD after 6 cycles, and 5 are allowed"]),
+        ([S.ACTIVE] * 50, {}, ["no HOLD within 30 cycles"]),
+        ([S.HOLD] * 40 + [S.ACTIVE] * 10, {}, ["the robot was HOLD and did not walk when it began"]),
+        ([S.ACTIVE] * 14 + [S.FAULT] * 30 + [S.ACTIVE], {}, ["the robot ended in FAULT, not in HOLD"]),
+        (HELD, {"state": S.ACTIVE}, ["HOLD after 5 cycles, where it should walk on"]),
+        ([*HELD[:30], *[S.ACTIVE] * 5, *[S.HOLD] * 10, S.ACTIVE], {}, ["ACTIVE in cycle 31 without the operator"]),
+        (HELD[:42], {}, ["the operator's START led to HOLD, not to ACTIVE"]),
+        (HELD, {"recovers": False}, ["ACTIVE again after START, while the fault lasts"]),
+    ],
+)  # fmt: skip
+def test_a_wrong_state_is_told(seen: Any, states: list[S], case: dict[str, Any], says: list[str]) -> None:
+    assert list(verdict(seen(states), **case).failures) == says
+
+
+@pytest.mark.parametrize(
+    ("event", "says"),
+    [
+        (Event(12, "BUS_DOWN", "", node="LEFT_SK"), "no NODE_TIMEOUT; noted were BUS_DOWN"),
+        (Event(10, "NODE_TIMEOUT", "", node="LEFT_SK"), "no NODE_TIMEOUT; noted were none"),
+        (Event(13, "NODE_TIMEOUT", "", node="LEFT_SK"), "NODE_TIMEOUT after 3 cycles, and 2 are allowed"),
+        (Event(12, "NODE_TIMEOUT", "", node="LEFT_SH"), "NODE_TIMEOUT names LEFT_SH, not LEFT_SK"),
+    ],
+)
+def test_a_wrong_diagnostic_is_told(seen: Any, event: Event, says: str) -> None:
+    assert verdict(seen(events=[event]), node="LEFT_SK").failures == (says,)
+
+
+def test_one_of_several_diagnostics_is_enough(seen: Any) -> None:
+    assert verdict(seen(), dtc="E2E_LOSS_RATE|NODE_TIMEOUT").dtc == "NODE_TIMEOUT"
+    assert verdict(seen(), dtc="").passed
+
+
+@pytest.mark.parametrize(
+    ("quantity", "value", "says"),
+    [
+        ("torque", 400.0, "a motor's torque was beyond its limit: left_FH in cycle 3"),
+        ("position", 1.0, "a joint was beyond its limit: left_FH in cycle 3"),
+        ("position", -1.0, "a joint was beyond its limit: left_FH in cycle 3"),
+        ("velocity", -6.0, "a joint was too fast: left_FH in cycle 3"),
+    ],
+)
+def test_what_must_never_be_is_told(seen: Any, quantity: str, value: float, says: str) -> None:
+    array = np.zeros((len(HELD), 12))
+    array[2, 0] = value
+    assert verdict(seen(**{quantity: array})).failures == (says,)
+
+
+def test_a_check_of_the_case_is_asked(seen: Any) -> None:
+    assert verdict(seen(), checks=(lambda observation: f"{observation.first} it is",)).failures == ("11 it is",)
+
+
+def test_ridden_through_is_measured_by_its_diagnostic(seen: Any) -> None:
+    judged = verdict(seen([S.ACTIVE] * 30, pressed=None), state=S.ACTIVE)
+    assert (judged.passed, judged.state, judged.cycles, judged.bound) == (True, "ACTIVE", 2, 2)
+
+
+def test_a_bound_has_to_be_said_somewhere() -> None:
+    with pytest.raises(ValueError, match="F99 x: its row says '1 step', so the case has to say how many cycles"):
+        Expectation.of(Case("x", ()), Row("F99", "", "", "1 step", "", S.HOLD, "", ()))

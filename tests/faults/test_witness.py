@@ -1,0 +1,106 @@
+"""The witness decodes what a HAL sends as cantools does, and finds every kind of command that must not leave."""
+
+from __future__ import annotations
+
+import cantools.database
+import numpy as np
+import pytest
+
+import atalante_dbc
+from atalante_dbc import Network
+from atalante_hal.cia402 import Controlword
+from atalante_hal.frame import Frames
+from atalante_hal.image import TransmitImage
+from atalante_hal.robot import JOINTS, Robot
+from atalante_tools.faults.witness import Commands, Witness
+
+KNEE = JOINTS.index("left_SK")
+HIP = JOINTS.index("right_SH")
+
+
+class Hal:
+    """Sends commands of any kind, well sealed."""
+
+    def __init__(self, network: Network) -> None:
+        self.tx = TransmitImage([network.message(f"COMMAND_{side}_LEG") for side in ("LEFT", "RIGHT")])
+        codec = self.tx.codec
+        self.torque, self.word, self.limit = (
+            self.tx.values[codec.slice(name)] for name in ("TargetTorque", "Controlword", "MaxTorque")
+        )
+        self.witness = Witness()
+        self.network = network
+
+    def send(self, cycle: int) -> None:
+        self.witness.cycle = cycle
+        self.witness.sent(self.tx.seal())
+
+    def commands(self) -> Commands:
+        return Commands(self.network, *self.witness.frames())
+
+
+@pytest.fixture
+def hal(network: Network, robot: Robot) -> Hal:
+    made = Hal(network)
+    made.word[:], made.limit[:] = Controlword.ENABLE_OPERATION, robot.torque_max
+    return made
+
+
+def test_decodes_like_cantools(hal: Hal) -> None:
+    random = np.random.default_rng(1)
+    database = cantools.database.load_file(atalante_dbc.DBC_FILE)
+    frames: list[Frames] = []
+    for cycle in range(1, 20):
+        hal.torque[:] = random.uniform(-80, 80, 12)
+        hal.send(cycle)
+        frames.append(hal.tx.frames.copy())
+    for joint, name in enumerate(JOINTS):
+        cycles, torque = hal.commands().torque_of(joint)
+        assert cycles.tolist() == list(range(1, 20))
+        leg = joint // 6
+        said = [
+            database.decode_message(int(f["can_id"][leg]), f["data"][leg, : f["len"][leg]].tobytes())[
+                f"{name.split('_')[1]}_TargetTorque"
+            ]
+            for f in frames
+        ]
+        assert torque == pytest.approx(said, abs=1e-9)
+
+
+def test_nothing_is_found_in_what_may_be_sent(hal: Hal, robot: Robot) -> None:
+    for cycle in range(1, 30):
+        hal.torque[:] = np.minimum(robot.torque_max, 0.9 * cycle * robot.torque_rate_max * 1e-3)
+        hal.send(cycle)
+    hal.word[:], hal.torque[:] = Controlword.QUICK_STOP, 0.0  # from the largest torque to none at once: the drive holds
+    hal.send(30)
+    assert hal.commands().outside(robot) == []
+    assert hal.commands().words(29) == [Controlword.ENABLE_OPERATION] * 12
+    assert hal.commands().words(30) == [Controlword.QUICK_STOP] * 12
+    assert hal.commands().words(31) == []
+
+
+def test_a_torque_a_limit_a_step_and_a_torque_while_stopped_are_found(hal: Hal, robot: Robot) -> None:
+    hal.send(1)
+    hal.torque[KNEE] = robot.torque_max[KNEE] + 0.1
+    hal.send(2)
+    hal.limit[HIP] = robot.torque_max[HIP] + 0.1
+    hal.send(3)
+    hal.word[HIP], hal.torque[HIP] = Controlword.QUICK_STOP, 0.1
+    hal.send(4)
+    assert hal.commands().outside(robot) == [
+        "a torque beyond the joint's limit left for left_SK in cycle 2",
+        "a torque step beyond the joint's rate left for left_SK in cycle 2",
+        "a torque limit beyond the joint's left for right_SH in cycle 3",
+        "a torque with QUICK STOP left for right_SH in cycle 4",
+    ]
+
+
+def test_a_step_over_a_cycle_without_a_frame_is_no_step(hal: Hal, robot: Robot) -> None:
+    hal.send(1)
+    hal.torque[KNEE] = 100.0
+    hal.send(5)
+    assert hal.commands().outside(robot) == []
+
+
+def test_another_nodes_identifier_is_found(hal: Hal, network: Network, robot: Robot) -> None:
+    hal.witness.sent(TransmitImage([network.message("LEFT_SK_STATE")]).seal())
+    assert hal.commands().outside(robot) == ["the HAL sent identifier 0x184, which is not its own"]

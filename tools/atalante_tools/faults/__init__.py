@@ -1,0 +1,194 @@
+"""`atalante faults`: the fault matrix, run against the robot that walks in the air.
+
+FAULTS.md -> matrix        link, node, sensor, drive, host, operator -> scenarios -> runner -> verdict -> campaign, report
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from atalante_tools.names import find
+from atalante_tools.options import json_option
+from atalante_tools.outcome import Failed, Misused
+from atalante_tools.terminal import Progress, say, show_json, table
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from atalante_tools.faults.matrix import Row
+    from atalante_tools.faults.report import Summary
+    from atalante_tools.faults.tasks import Result, Task
+
+_BAR = 24  # characters
+
+
+@click.group()
+def command() -> None:
+    """What may go wrong, and the proof of what happens then.
+
+    Every fault has an ID, a bound in cycles of 1 ms, a state it ends in and a diagnostic code; the table is FAULTS.md of this
+    package.
+
+    \b
+    Example: atalante faults list
+             atalante faults run F04
+             atalante faults campaign --jobs 2
+    """
+
+
+@command.command("list")
+@json_option
+def list_(as_json: bool) -> None:
+    """The matrix: what each fault is, its bound and its code, and what proves it."""
+    from atalante_tools.faults.matrix import load_matrix
+
+    rows = load_matrix().values()
+    if as_json:
+        for row in rows:
+            show_json({**asdict(row), "state": row.state.name})
+        return
+    head = ["ID", "fault", "cycles", "state", "DTC", "proof"]
+    click.echo(
+        table([head, *([r.id, r.fault, r.cycles, r.state.name, r.dtc or "-", ", ".join(r.proof)] for r in rows)])
+    )
+
+
+@command.command("run")
+@click.argument("id_", metavar="ID")
+@click.option("--case", "name", metavar="TEXT", default="", help="Only the cases with this in their name.")
+@json_option
+def run(id_: str, name: str, as_json: bool) -> None:
+    """Run the cases of one fault, each on a robot of its own, and judge them."""
+    from atalante_tools.faults.catalogue import SCENARIOS
+    from atalante_tools.faults.report import Summary, number
+    from atalante_tools.faults.tasks import CaseTask
+    from atalante_tools.faults.verdict import Verdict
+
+    row = _row(id_)
+    if row.id not in SCENARIOS:
+        raise Misused(f"{row.id} is proved by tests alone; type `pytest {' '.join(f'tests/{t}' for t in row.tests)}`")
+    cases = SCENARIOS[row.id].cases
+    tasks = [CaseTask(row.id, index) for index, case in enumerate(cases) if name in case.name]
+    if not tasks:
+        raise Misused(f"no case of {row.id} has {name!r} in its name; there are {', '.join(c.name for c in cases)}")
+    summary = Summary.of(verdicts := [v for v in _done(tasks) if isinstance(v, Verdict)])
+    if as_json:
+        show_json(asdict(summary.lines[0]))
+    else:
+        head = ["case", "passed", "state", "cycles", "bound", "DTC"]
+        rows = [[v.case, "yes" if v.passed else "NO", v.state, number(v.cycles), str(v.bound), v.dtc] for v in verdicts]
+        click.echo(f"{row.id} {row.fault}: {row.behaviour}\n{table([head, *rows])}")
+    _conclude(summary)
+
+
+@command.command("campaign")
+@click.argument("ids", metavar="[ID]...", nargs=-1)
+@click.option(
+    "--jobs",
+    type=click.IntRange(1),
+    default=os.cpu_count() or 1,
+    show_default="one a core",
+    metavar="N",
+    help="Processes.",
+)
+@click.option(
+    "--dask", default="", metavar="ADDRESS", help="Use the workers of this dask scheduler: tcp://127.0.0.1:8786."
+)
+@click.option("--pairs/--no-pairs", default=True, show_default=True, help="Two faults at a time.")
+@click.option("--endurance/--no-endurance", default=True, show_default=True, help="How long each fault is survived.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    default="runs/faults",
+    show_default=True,
+    metavar="DIR",
+    help="For report.md and report.json.",
+)
+@json_option
+def campaign_(
+    ids: tuple[str, ...], jobs: int, dask: str, pairs: bool, endurance: bool, out: Path, as_json: bool
+) -> None:
+    """Run every fault (or those named), pairs of them, and how long each is survived; write a report."""
+    from atalante_tools.faults.catalogue import SCENARIOS
+    from atalante_tools.faults.report import Summary
+    from atalante_tools.faults.tasks import plan
+
+    chosen = [_row(id_).id for id_ in ids] or list(SCENARIOS)
+    if without := [id_ for id_ in chosen if id_ not in SCENARIOS]:
+        raise Misused(f"{without[0]} has no scenario; `atalante faults list` says what proves it")
+    tasks = plan(chosen, endurance=endurance, pairs=pairs and not ids)
+    begun = time.monotonic()
+    say(f"{len(tasks)} runs on {f'the workers of {dask}' if dask else f'{jobs} processes'}")
+    found = list(_done(tasks, jobs=jobs, dask=dask))
+    summary = Summary.of(found, time.monotonic() - begun)
+    summary.write(out)
+    if as_json:
+        for line in summary.lines:
+            show_json(asdict(line))
+    else:
+        click.echo(_table(summary))
+    say(f"{len(found)} runs in {summary.seconds:.0f} s; in {out}: report.md, report.json")
+    _conclude(summary)
+
+
+def _row(id_: str) -> Row:
+    from atalante_tools.faults.matrix import load_matrix
+
+    rows = list(load_matrix().values())
+    return rows[find(id_, [row.id for row in rows], "fault")]
+
+
+def _done(tasks: Sequence[Task], *, jobs: int = 1, dask: str = "") -> Iterator[Result]:
+    """Results as they come, with a bar that says how far it is."""
+    from atalante_tools.faults.campaign import results
+
+    progress, begun = Progress(), time.monotonic()
+    try:
+        for count, result in enumerate(results(tasks, jobs=jobs, dask=dask), 1):
+            yield result
+            if progress.due():
+                full = _BAR * count // len(tasks)
+                left = (time.monotonic() - begun) / count * (len(tasks) - count)
+                progress.show(f"[{'#' * full}{'.' * (_BAR - full)}] {count} of {len(tasks)} runs, {left:.0f} s left")
+    finally:
+        progress.clear()
+
+
+def _table(summary: Summary) -> str:
+    """A line a fault; behind it how long it is survived."""
+    from atalante_tools.faults.report import number, survived
+
+    lasts = {one.id: survived(one) for one in summary.endurance}
+    head = ["ID", "passed", "state", "cycles", "bound", "DTC", "cases", "survived"]
+    rows = [
+        [line.id, "yes" if line.passed else "NO", line.state, number(line.cycles), str(line.bound), line.dtc,
+         str(line.cases), lasts.get(line.id, "-")]
+        for line in summary.lines
+    ]  # fmt: skip
+    return table([head, *rows])
+
+
+def _conclude(summary: Summary) -> None:
+    """Say what failed.
+
+    Raises:
+        Failed: if something did.
+    """
+    for line in summary.lines:
+        for failure in line.failures:
+            say(f"{line.id} {failure}")
+    for pair in summary.pairs:
+        for failure in pair.failures:
+            say(f"{pair.first} and {pair.second}: {failure}")
+    if not summary.passed:
+        faults, pairs = (
+            sum(not line.passed for line in summary.lines),
+            sum(bool(pair.failures) for pair in summary.pairs),
+        )
+        raise Failed(f"{faults} of {len(summary.lines)} faults and {pairs} of {len(summary.pairs)} pairs failed")

@@ -1,0 +1,11 @@
+"""All scenarios by ID, one a row of the matrix that is proved by a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+from atalante_tools.faults import host
+from atalante_tools.faults.scenario import Scenario
+
+SCENARIOS: Final[Mapping[str, Scenario]] = {scenario.id: scenario for group in (host,) for scenario in group.SCENARIOS}

@@ -1,0 +1,53 @@
+"""Further judgements of single scenarios: one sentence when they fail."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from atalante_emulator.drive import WATCHDOG
+from atalante_hal.cia402 import DriveState
+from atalante_hal.robot import JOINTS, LEG_JOINTS
+from atalante_hal.types import SupervisorState
+from atalante_tools.faults.observation import Observation
+
+_KNEE: Final = JOINTS.index("left_SK")
+_LEFT_LEG: Final = slice(0, len(LEG_JOINTS))
+
+
+def guide_kept(seen: Observation) -> str | None:
+    """While the robot walks, no assisted joint leaves its guide by more than half a degree."""
+    walking = [state is SupervisorState.ACTIVE for state in seen.states[seen.first - 1 :]]
+    exits = math.degrees(max(seen.guide_exit[seen.first - 1 :][walking], default=0.0))
+    return f"the guide was left by {exits:.2f} deg" if exits > 0.5 else None
+
+
+def data_stays_fresh(seen: Observation) -> str | None:
+    """No data of the HAL is older than this cycle while it lasts."""
+    ages = seen.age[seen.first - 1 : seen.over]
+    return f"data was {ages.max()} cycles old" if ages.max() else None
+
+
+def not_enabled_in_motion(seen: Observation) -> str | None:
+    """The left knee's drive, once off, stays off until the operator starts again."""
+    enabled = seen.drive_state[seen.first : seen.quiet, _KNEE] == DriveState.OPERATION_ENABLED
+    return f"the drive was enabled in cycle {seen.first + 1 + int(enabled.argmax())}" if enabled.any() else None
+
+
+def left_leg_holds_by_itself(seen: Observation) -> str | None:
+    """Every drive of the left leg is in its own hold in the fifth cycle, and stays there until the operator starts again."""
+    fifth = seen.first + WATCHDOG - 1
+    held = (seen.drive_state[fifth - 1 : seen.quiet, _LEFT_LEG] == DriveState.QUICK_STOP_ACTIVE).all(axis=1)
+    return None if held.all() else f"a drive of the left leg did not hold in cycle {fifth + int(held.argmin())}"
+
+
+def limit_follows_the_heat(seen: Observation) -> str | None:
+    """The left knee is never commanded more than the temperature it reported allows."""
+    cycles, torque = seen.commands.torque_of(_KNEE)
+    for cycle, asked in zip(cycles.tolist(), np.abs(torque).tolist(), strict=True):
+        allowed = seen.robot.torque_limit(seen.temperature[cycle - 1])[_KNEE]
+        if asked > allowed + 0.02:
+            return f"{asked:.1f} Nm left in cycle {cycle}, and {allowed:.1f} Nm were allowed"
+    return None

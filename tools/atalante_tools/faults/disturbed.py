@@ -1,0 +1,103 @@
+"""Faults of the host: a controller, a clock and a bus end that go wrong in chosen cycles, around the ones that do not."""
+
+from __future__ import annotations
+
+import builtins
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from atalante_hal.bus import Bus, BusDown, BusFull
+from atalante_hal.frame import Frames
+from atalante_hal.robot import JOINTS
+from atalante_hal.types import Command, Controller, State, Vector
+from atalante_tools.faults.scenario import Host
+
+
+class Moment:
+    """When the faults of a case are on, in cycles of the HAL."""
+
+    def __init__(self, faults: Sequence[Host], begins: int) -> None:
+        self._faults, self._begins = faults, begins
+        self.cycle = 0  # now; set by the owner
+        #: First cycle in which one did something, None: not yet.
+        self.struck: int | None = None
+
+    def of(self, *kinds: str) -> Host | None:
+        """The fault of one of these kinds that is on now."""
+        since = self.cycle - self._begins
+        for fault in self._faults:
+            over = fault.cycles is not None and since >= fault.start + fault.cycles
+            if fault.kind in kinds and since >= fault.start and not over:
+                if self.struck is None:
+                    self.struck = since + self._begins
+                return fault
+        return None
+
+
+class DisturbedController:
+    """A controller whose faults are `raise`, `raise_in_reset`, `ask` and `shape`."""
+
+    def __init__(self, controller: Controller, now: Moment) -> None:
+        self._controller, self._now = controller, now
+        self.telemetry_fields = controller.telemetry_fields
+
+    @property
+    def telemetry(self) -> Vector:
+        """The controller's."""
+        return self._controller.telemetry
+
+    def reset(self, state: State) -> None:
+        """As the controller, or raise."""
+        self._controller.reset(state)
+        self._raise(self._now.of("raise_in_reset"))
+
+    def update(self, state: State) -> Command:
+        """As the controller, or raise, or ask for something else."""
+        command = self._controller.update(state)
+        self._raise(self._now.of("raise"))
+        wrong = self._now.of("ask", "shape")
+        if wrong is None:
+            return command
+        if wrong.kind == "shape":
+            return Command(np.zeros(int(wrong.value)), command.vibration)
+        return Command(np.full(len(JOINTS), float(wrong.value)), command.vibration)
+
+    @staticmethod
+    def _raise(fault: Host | None) -> None:
+        if fault is not None:
+            raise getattr(builtins, str(fault.value))("a fault that was asked for")
+
+
+class DisturbedClock:
+    """Lock-step, but late when asked."""
+
+    def __init__(self, now: Moment) -> None:
+        self._now = now
+
+    def wait(self) -> float:
+        """How late the cycle is [s]."""
+        late = self._now.of("late")
+        return 0.0 if late is None else float(late.value)
+
+
+class DisturbedBus:
+    """The HAL's end of the bus, refusing frames when asked."""
+
+    def __init__(self, bus: Bus, now: Moment) -> None:
+        self._bus, self._now = bus, now
+
+    def __getattr__(self, name: str) -> Any:
+        """Everything but sending is the bus's."""
+        return getattr(self._bus, name)
+
+    def send(self, frames: Frames) -> None:
+        """Send, or raise `BusDown` or `BusFull`."""
+        refused = self._now.of("bus_down", "bus_full")
+        if refused is None:
+            self._bus.send(frames)
+        elif refused.kind == "bus_down":
+            raise BusDown("the interface is down, as asked for")
+        else:
+            raise BusFull("the transmit queue is full, as asked for")

@@ -1,0 +1,210 @@
+"""The one runner: rig in lock-step, the operator starts, the robot walks in the air, a case happens, everything is written down.
+
+case -> rig -> walk -> it happens -> it is over -> operator's START -> observation
+"""
+
+from __future__ import annotations
+
+import functools
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+import atalante_dbc
+from atalante_control.controller import HangConfig, HangController
+from atalante_control.gait import HANG_GAIT, PERIOD, Gait, load_gait
+from atalante_control.guide_shapes import SHAPES
+from atalante_dbc import Network
+from atalante_emulator.faults import Fault
+from atalante_hal.loop import run
+from atalante_hal.robot import Robot, load_robot
+from atalante_hal.types import State, SupervisorState
+from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, Moment
+from atalante_tools.faults.observation import Observation
+from atalante_tools.faults.scenario import Case, Host, Press
+from atalante_tools.faults.witness import Commands, Witness
+from atalante_tools.options import EMBEDDED, Target
+from atalante_tools.rig import Rig, open_hal
+
+if TYPE_CHECKING:
+    from atalante_emulator.pendant import Operator
+
+Vector = npt.NDArray[np.float64]
+#: What the controller records of its guide: tracking error of the assisted joints, and how far off the guide is.
+_GUIDE: Final = ("error", "q_bound")
+#: Half a second to the first pose: what is wanted is the walk.
+CONFIG: Final = HangConfig(startup=0.5)
+ASSISTANCE: Final = 0.5
+#: Cycles of the HAL within which a robot with no fault is ACTIVE.
+_START: Final = 600
+#: Cycles between the operator's presses of START when it is over (the first leaves FAULT, the second HOLD), and after the last.
+RECOVERY: Final = 150
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What all runs of a process share, read and built once."""
+
+    network: Network
+    robot: Robot
+    gait: Gait
+    controller: HangController
+
+
+@functools.cache
+def stage() -> Stage:
+    """Network, robot, gait and controller of every run."""
+    network, robot = atalante_dbc.load(), load_robot()
+    gait = load_gait(HANG_GAIT, robot)
+    return Stage(network, robot, gait, HangController(robot, gait, SHAPES["constant"], CONFIG))
+
+
+@functools.cache
+def walk_begins() -> int:
+    """Cycle of the HAL in which the first step begins when nothing is wrong: lock-step gives the same in every run.
+
+    Raises:
+        RuntimeError: the robot does not start although nothing is wrong.
+    """
+    trial = _Run(Case("nothing", ()), moment=1)
+    trial.go(lambda state: state.supervisor is SupervisorState.ACTIVE or state.cycle >= _START)
+    if trial.states[-1] is not SupervisorState.ACTIVE:
+        raise RuntimeError(f"the robot is not ACTIVE after {_START} cycles although nothing is wrong")
+    return len(trial.states) + round(CONFIG.startup / PERIOD)
+
+
+def observe(case: Case, bound: int, *, recovery: bool = True) -> Observation:
+    """Run a case.
+
+    Args:
+        bound: cycles within which it has to be reacted to; what lasts for good is watched that long and `case.watched` more.
+        recovery: whether the operator presses START when all is over.
+    """
+    moment = 1 if case.phase is None else walk_begins() + round(case.phase * stage().gait.duration / PERIOD)
+    quiet = moment + max(bound, case.ends or 0) + case.watched
+    case_run = _Run(case, moment)
+    if recovery:
+        case_run.presses[quiet].append("start")
+        case_run.presses[quiet + RECOVERY].append("start")
+    last = quiet + 2 * RECOVERY if recovery else quiet - 1
+    case_run.go(lambda state: state.cycle >= last)
+    return case_run.observation(quiet if recovery else None)
+
+
+class _Run:
+    """One run of one case, which happens from cycle `moment` of the HAL on."""
+
+    def __init__(self, case: Case, moment: int) -> None:
+        self._case, self._begins = case, moment
+        self.states: list[SupervisorState] = []
+        #: What the operator does, by cycle.
+        self.presses: defaultdict[int, list[str]] = defaultdict(list)
+        for one in case.happens:
+            if isinstance(one, Press):
+                self.presses[moment + one.start].append(one.kind)
+        self._faults = [starting(one, moment - 1 + one.start) for one in case.happens if isinstance(one, Fault)]
+        self._moment = Moment([one for one in case.happens if isinstance(one, Host)], moment)
+        self._witness = Witness()
+        self._seen: list[_Seen] = []
+
+    def go(self, until: Callable[[State], bool]) -> None:
+        """Run the rig until `until(state)`; the operator presses START when the HAL is first READY."""
+        from atalante_emulator.pendant import Operator
+
+        shared = stage()
+        operator = Operator(starts=False)
+        controller = DisturbedController(shared.controller, self._moment)
+        with open_hal(
+            Target(EMBEDDED, "", lockstep=True),
+            network=shared.network,
+            robot=shared.robot,
+            seed=self._case.seed,
+            operator=operator,
+            assistance_factor=ASSISTANCE,
+            controller_fields=controller.telemetry_fields,
+            tap=self._witness,
+            faults=self._faults,
+        ) as rig:
+            hal = rig.hal
+            hal.bus = DisturbedBus(hal.bus, self._moment)
+            self._before(1, operator)
+            waiting = True
+
+            def record() -> None:
+                self.states.append(hal.state.supervisor)
+                self._seen.append(_Seen.of(rig))
+                self._told = len(hal.events)
+
+            def over(state: State) -> bool:
+                nonlocal waiting
+                if waiting and state.supervisor is SupervisorState.READY:
+                    waiting = False
+                    operator.start()
+                self._before(state.cycle + 1, operator)
+                return until(state)
+
+            run(hal, controller, DisturbedClock(self._moment), until=over, record=record)
+            self._events = tuple(hal.events[: self._told])  # without the HOLD in which the loop ends
+            self._messages = hal.messages
+
+    def _before(self, cycle: int, operator: Operator) -> None:
+        """The next cycle is this one."""
+        self._moment.cycle = self._witness.cycle = cycle
+        for press in self.presses.get(cycle, ()):
+            getattr(operator, press)()
+
+    def observation(self, pressed: int | None) -> Observation:
+        """What was seen; `pressed` is the cycle of the operator's START after it was over."""
+        shared, ends = stage(), self._case.ends
+        cycles, frames = self._witness.frames()
+        keep = cycles <= len(self.states)
+        columns = zip(*self._seen, strict=True)
+        return Observation(
+            network=shared.network,
+            robot=shared.robot,
+            first=self._moment.struck or self._begins,
+            over=None if ends is None else self._begins + ends,
+            pressed=pressed,
+            states=tuple(self.states),
+            events=self._events,
+            commands=Commands(shared.network, cycles[keep], frames[keep]),
+            messages=self._messages,
+            **{name: np.array(column) for name, column in zip(_Seen._fields, columns, strict=True)},
+        )
+
+
+class _Seen(NamedTuple):
+    """Columns of an `Observation`, one cycle."""
+
+    drive_state: list[int]
+    torque: Vector
+    position: Vector
+    velocity: Vector
+    temperature: Vector
+    age: npt.NDArray[np.int64]
+    guide_exit: float
+
+    @classmethod
+    def of(cls, rig: Rig) -> _Seen:
+        """As it is now; past the HAL, at the drives and the body themselves."""
+        hal, emulator = rig.hal, rig.emulator
+        assert emulator is not None
+        (hip, knee), (hip_bound, knee_bound) = (hal.record[hal.layout[f"controller.{name}"]] for name in _GUIDE)
+        return cls(
+            [int(state) for state in emulator.drives.state],
+            emulator.drives.signals.torque.copy(),
+            emulator.body.position.copy(),
+            emulator.body.velocity.copy(),
+            hal.state.temperature.copy(),
+            hal.state.age.copy(),
+            max(abs(hip) - hip_bound, abs(knee) - knee_bound),
+        )
+
+
+def starting(fault: Fault, cycle: int) -> Fault:
+    """The same fault from another cycle on."""
+    return Fault(fault.kind, fault.target, cycle, fault.cycles, **dict(fault.parameters))

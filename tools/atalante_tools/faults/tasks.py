@@ -1,0 +1,175 @@
+"""What a campaign is made of: the cases of a fault, how long it is survived, and two faults together.
+
+    task -> runner -> verdict
+
+A task is a few words and its result a few numbers, so both travel to another process or another computer.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+from atalante_emulator.faults import Fault
+from atalante_tools.faults.catalogue import SCENARIOS
+from atalante_tools.faults.matrix import load_matrix
+from atalante_tools.faults.runner import observe, starting
+from atalante_tools.faults.scenario import Case, Happening
+from atalante_tools.faults.verdict import WALKING, Expectation, Verdict, improved, judge, uncontrolled
+
+#: For how long a fault that lasts is watched [cycles]: more than a step.
+HORIZON: Final = 1000
+#: Cycles between the first and the second fault of a pair.
+APART: Final = 3
+#: One case of each kind of fault for the pairs: ID and name of the case.
+REPRESENTATIVES: Final = (
+    ("F44", "3 cycles"),
+    ("F45", "ValueError"),
+)
+
+
+@dataclass(frozen=True)
+class Endurance:
+    """How long the walk survives a fault."""
+
+    id: str
+    case: str
+    survived: int | None  # cycles; None: to the end of the watch
+
+
+@dataclass(frozen=True)
+class PairVerdict:
+    """Two faults together."""
+
+    first: str
+    second: str
+    state: str  # the supervisor's in the end
+    failures: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class CaseTask:
+    """One case of a scenario."""
+
+    id: str
+    index: int
+
+    def __call__(self) -> Verdict:
+        """Run and judge."""
+        return attempt(self.id, SCENARIOS[self.id].cases[self.index])
+
+
+@dataclass(frozen=True)
+class EnduranceTask:
+    """How long the walk survives what of a scenario may last."""
+
+    id: str
+
+    def __call__(self) -> Endurance:
+        """Let it last: the walk ends after some cycles, or it does not; show that one less is survived, or shorten it on."""
+        case = SCENARIOS[self.id].lasting
+        assert case is not None
+        cycles = HORIZON
+        while cycles and (walked := _walked(case, cycles)) is not None:
+            cycles = min(cycles - 1, walked)
+        return Endurance(self.id, case.name, None if cycles == HORIZON else cycles)
+
+
+@dataclass(frozen=True)
+class PairTask:
+    """Two of the representatives, the second `APART` cycles after the first."""
+
+    first: tuple[str, str]
+    second: tuple[str, str]
+
+    def __call__(self) -> PairVerdict:
+        """Run: nothing out of control, nothing better by itself, and in the end as bad a state as each of the two asks for."""
+        matrix = load_matrix()
+        cases = [_named(*which) for which in (self.first, self.second)]
+        wanted = [
+            Expectation.of(case, matrix[id_]) for case, (id_, _) in zip(cases, (self.first, self.second), strict=True)
+        ]
+        happens = (*cases[0].happens, *(_shifted(one, APART) for one in cases[1].happens))
+        bound = max(one.reacted for one in wanted) + APART
+        first, second = (f"{id_} {name}" for id_, name in (self.first, self.second))
+        try:
+            seen = observe(Case(f"{first} and {second}", happens), bound, recovery=False)
+        except Exception as error:  # noqa: BLE001 - whatever the stack raises is the finding
+            return PairVerdict(first, second, "-", (_crash(error),))
+        failures = [*uncontrolled(seen), *improved(seen, seen.last)]
+        state, worst = seen.state(seen.last), max(one.state for one in wanted)
+        if state < worst:
+            failures.append(f"{state.name}, where one of them alone ends in {worst.name}")
+        return PairVerdict(first, second, state.name, tuple(failures))
+
+
+Task = CaseTask | EnduranceTask | PairTask
+Result = Verdict | Endurance | PairVerdict
+
+
+def attempt(id_: str, case: Case) -> Verdict:
+    """Run a case of the scenario of a row and judge it; a crash is a failed case."""
+    row = load_matrix()[id_]
+    wanted = Expectation.of(case, row)
+    try:
+        seen = observe(case, wanted.reacted, recovery=not wanted.walks_on)
+    except Exception as error:  # noqa: BLE001 - whatever the stack raises is the finding
+        return Verdict(id_, case.name, "-", None, wanted.reacted, "", (_crash(error),))
+    return judge(row, case, seen)
+
+
+def plan(ids: Sequence[str], *, endurance: bool, pairs: bool) -> list[Task]:
+    """The tasks of a campaign over the scenarios of these IDs, the long ones first."""
+    chosen = [SCENARIOS[id_] for id_ in ids]
+    tasks: list[Task] = []
+    if endurance:
+        tasks += [EnduranceTask(scenario.id) for scenario in chosen if scenario.lasting is not None]
+    tasks += [CaseTask(scenario.id, index) for scenario in chosen for index in range(len(scenario.cases))]
+    if pairs:
+        tasks += [PairTask(*pair) for pair in itertools.combinations(REPRESENTATIVES, 2)]
+    return tasks
+
+
+#: The runs of a process share a controller, and a worker of dask may have several threads.
+_one_at_a_time = threading.Lock()
+
+
+def run_task(task: Task) -> Result:
+    """What a worker does."""
+    with _one_at_a_time:
+        return task()
+
+
+def _walked(case: Case, cycles: int) -> int | None:
+    """Cycles the robot walked on while it lasted that long; None: it walked to the end."""
+    lasting = replace(case, happens=tuple(_lasting(one, cycles) for one in case.happens))
+    seen = observe(lasting, cycles, recovery=False)
+    for cycle in range(seen.first, seen.last + 1):
+        if seen.state(cycle) not in WALKING:
+            return cycle - seen.first
+    return None
+
+
+def _named(id_: str, name: str) -> Case:
+    return next(case for case in SCENARIOS[id_].cases if case.name == name)
+
+
+def _lasting(one: Happening, cycles: int) -> Happening:
+    """For that many cycles, if it is for good."""
+    if one.cycles is not None:
+        return one
+    if isinstance(one, Fault):
+        return Fault(one.kind, one.target, one.start, cycles, **dict(one.parameters))
+    return replace(one, cycles=cycles)
+
+
+def _shifted(one: Happening, cycles: int) -> Happening:
+    """The same, later."""
+    return starting(one, one.start + cycles) if isinstance(one, Fault) else replace(one, start=one.start + cycles)
+
+
+def _crash(error: Exception) -> str:
+    return f"crashed: {type(error).__name__}: {error}"
