@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 OUT ?= runs
 
-.PHONY: demo test test-vcan lint bench messages clean
+.PHONY: demo test test-vcan fuzz lint bench messages clean
 
 demo: .venv/installed-all ## everything in one process tree: 30 steps in the air with each guide shape
 	$(BIN)/atalante demo --out $(OUT)/demo
@@ -13,6 +13,9 @@ test: .venv/installed-dev lint ## linters, types, layers and all tests but those
 
 test-vcan: .venv/installed-dev ## the tests on real SocketCAN, in a kernel of their own where this one has none
 	PYTHON=$(BIN)/python tests/vcan/run.sh
+
+fuzz: .venv/installed-dev ## 10 million random and mutated frames at the HAL and at every emulated node
+	PYTHONPATH=tests/fuzz $(BIN)/python tests/fuzz/frame_fuzzer.py --frames 10000000
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import hal_witness
 import numpy as np
 import pytest
+from command_limits import RECORD, CommandLimits
 
 import atalante_dbc
 from atalante_control.model import ExoskeletonParameters, urdf
@@ -20,6 +26,85 @@ from atalante_hal.frame import Frames
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot, load_robot
 from atalante_hal.types import Command, State, SupervisorState
+
+
+class Witness:
+    """Judges what every HAL of this process, and of those it started, has sent: one file of frames each."""
+
+    def __init__(self) -> None:
+        self.folder = Path(tempfile.mkdtemp(prefix="atalante-witness-"))
+        self._judges: dict[Path, CommandLimits] = {}
+        self._read: dict[Path, int] = {}
+        self._ours = f"{os.getpid()}-"
+
+    def judge(self) -> list[str]:
+        """Judge what came since the last call; the violations."""
+        told = []
+        for path in sorted(self.folder.iterdir()):
+            judge = self._judges.setdefault(path, CommandLimits())
+            done = self._read.get(path, 0)
+            with path.open("rb") as file:
+                file.seek(done)
+                content = file.read()
+            whole = len(content) - len(content) % RECORD.itemsize
+            if not whole:
+                continue
+            if path.name.startswith(self._ours):
+                os.truncate(path, 0)  # nobody writes now, and a suite sends gigabytes
+            else:
+                self._read[path] = done + whole
+            if judge.judge(np.frombuffer(content[:whole], RECORD)):
+                told.append(judge.told())
+        return told
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """HALs and command frames judged so far."""
+        return len(self._judges), sum(judge.command_frames for judge in self._judges.values())
+
+
+_witness_key = pytest.StashKey[Witness]()
+_counts_key = pytest.StashKey[list[tuple[int, int]]]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.stash[_witness_key] = Witness()
+    config.stash[_counts_key] = []
+    hal_witness.start(str(config.stash[_witness_key].folder))
+
+
+@pytest.fixture(scope="session")
+def witness(pytestconfig: pytest.Config) -> Witness:
+    return pytestconfig.stash[_witness_key]
+
+
+@pytest.fixture(autouse=True)
+def _commands_within_limits(witness: Witness) -> Iterator[None]:
+    """No HAL sends a frame that is not its own or beyond the limits, in no test."""
+    yield
+    if told := witness.judge():
+        pytest.fail("a HAL sent what it must not:\n" + "\n".join(told), pytrace=False)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    counts = session.config.stash[_witness_key].counts
+    session.config.stash[_counts_key].append(counts)
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["witness"] = counts
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    node.config.stash[_counts_key].append(tuple(getattr(node, "workeroutput", {}).get("witness", (0, 0))))
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    hals, frames = (sum(column) for column in zip(*config.stash[_counts_key], strict=True))
+    terminalreporter.write_line(f"{frames} command frames of {hals} HALs judged by cantools and the limits file")
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    shutil.rmtree(config.stash[_witness_key].folder)
 
 
 @pytest.fixture(scope="session")

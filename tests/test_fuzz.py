@@ -1,0 +1,99 @@
+"""A slice of the fuzz of `make fuzz` (10 million frames at each end), and that the fuzzer finds what is broken."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+from frame_fuzzer import RECEIVE_BUDGET, SWEEP, Finding, Fuzzer, Oracle, fuzz_image, fuzzed_robot, images
+
+import atalante_dbc
+from atalante_emulator.drive import Drives
+from atalante_hal.codec import Codec
+from atalante_hal.e2e import Check
+from atalante_hal.frame import as_words, new_frames
+from atalante_hal.image import ReceiveImage, TransmitImage
+from atalante_hal.types import SupervisorState
+
+NETWORK = atalante_dbc.load()
+IMAGES = images(NETWORK)
+
+
+@pytest.mark.parametrize("name", IMAGES)
+def test_an_image_takes_nothing_that_is_not_intact(name: str) -> None:
+    messages = IMAGES[name]
+    *_, tally = fuzz_image(messages, 20_000, seed=3, per_cycle=min(100, RECEIVE_BUDGET - len(messages)))
+    assert tally.frames == 20_000
+    assert 0.1 < tally.intact / tally.frames < 0.2
+
+
+def test_hal_and_nodes_live_through_it() -> None:
+    with fuzzed_robot(seed=5) as robot:
+        robot.run(20_000)
+        assert max(end.most for end in robot.ends) == RECEIVE_BUDGET
+        assert {SupervisorState.READY, SupervisorState.ACTIVE, SupervisorState.HOLD} <= robot.states_seen
+
+
+def test_every_identifier_length_and_flag_comes() -> None:
+    fuzzer, seen = Fuzzer(1, NETWORK.messages), set()
+    nothing = new_frames(0)
+    fuzzer._swept = 0
+    swept = new_frames(SWEEP)
+    fuzzer._sweep(swept, SWEEP)
+    seen = set(as_words(swept)[:, 0].tolist())
+    assert len(seen) == SWEEP
+    anything = fuzzer.frames(20_000, nothing)
+    assert anything["can_id"].max() > 1 << 31
+    assert anything["len"].max() == 255
+
+
+def test_frames_sealed_again_are_intact_and_damaged_ones_are_not() -> None:
+    messages = IMAGES["HAL, every cycle"]
+    genuine = TransmitImage(messages).seal()
+    fuzzer, oracle = Fuzzer(1, messages), Oracle(messages)
+    assert sum(map(len, oracle.intact(genuine).values())) == len(messages)
+    sealed = genuine.copy()
+    fuzzer._seal_again(sealed)
+    assert sum(map(len, oracle.intact(sealed).values())) == len(messages)
+    damaged = np.repeat(genuine, 50)
+    fuzzer._damage(damaged)
+    assert sum(map(len, oracle.intact(damaged).values())) < 3
+
+
+def run_image(name: str) -> None:
+    Counter(tally.cycles for tally in fuzz_image(IMAGES[name], 20_000, seed=1))
+
+
+@pytest.mark.parametrize("name", ["HAL, every cycle", "nodes"])
+def test_an_image_without_its_crc_check_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ReceiveImage, "_judge", lambda *_: Check.OK)
+    with pytest.raises(Finding, match="took a frame that is not intact"):
+        run_image(name)
+
+
+def test_an_image_without_its_range_check_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    decode = Codec.decode_row
+
+    def decode_anything(codec: Codec, row: int, payload: bytes, values: Any) -> bool:
+        if not decode(codec, row, payload, values):
+            values[np.flatnonzero(codec.row_of == row)] = 1e9
+        return True
+
+    monkeypatch.setattr(Codec, "decode_row", decode_anything)
+    with pytest.raises(Finding, match="left its range"):
+        run_image("HAL, every cycle")
+
+
+def test_a_drive_without_its_own_limit_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    command = Drives.command
+
+    def command_without_limit(drives: Drives, *arguments: Any) -> None:
+        command(drives, *arguments)
+        drives._upper.fill(1e6)
+        drives._lower.fill(-1e6)
+
+    monkeypatch.setattr(Drives, "command", command_without_limit)
+    with fuzzed_robot(seed=2) as robot, pytest.raises(Finding, match="a drive exerts"):
+        robot.run(60_000)

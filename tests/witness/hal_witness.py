@@ -1,0 +1,85 @@
+"""Every HAL that runs in a test has a witness: it writes the frames it sends into a file of its own, for `command_limits`.
+
+It writes at once, so that a killed process leaves what it sent. `start` watches the HALs of this process and names the folder
+in the environment; every Python that a test starts finds `sitecustomize` beside this file and does the same.
+"""
+
+from __future__ import annotations
+
+import importlib.abc
+import importlib.util
+import itertools
+import os
+import sys
+from typing import Any
+
+MODULE = "atalante_hal.hal"
+FOLDER = "ATALANTE_WITNESS"
+#: HALs of this process so far.
+_numbers = itertools.count()
+
+
+def watch(hal_type: type[Any]) -> None:
+    """Let every HAL of this class write what it sends. Raises AttributeError when the HAL sends in another way."""
+    make, send = hal_type.__init__, hal_type._send
+
+    def init(hal: Any, *arguments: Any, **options: Any) -> None:
+        hal.witness = None
+        make(hal, *arguments, **options)
+
+    def send_and_write(hal: Any, frames: Any) -> Any:
+        if hal.witness is None:
+            folder = os.environ[FOLDER]
+            path = os.path.join(folder, f"{os.getpid()}-{next(_numbers)}.frames")
+            hal.witness = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_EXCL | os.O_CLOEXEC, 0o600)
+            _close_with(hal)
+        os.write(hal.witness, frames.tobytes())
+        return send(hal, frames)
+
+    hal_type.__init__, hal_type._send = init, send_and_write
+
+
+def _close_with(hal: Any) -> None:
+    import weakref
+
+    weakref.finalize(hal, os.close, hal.witness)
+
+
+class _Finder(importlib.abc.MetaPathFinder):
+    """Watches the HAL as soon as somebody imports it."""
+
+    def find_spec(self, name: str, path: Any, target: Any = None) -> Any:
+        if name != MODULE:
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(name)
+        assert spec is not None
+        assert spec.loader is not None
+        execute = spec.loader.exec_module
+
+        def execute_and_watch(module: Any) -> None:
+            execute(module)
+            watch(module.Hal)
+
+        spec.loader.exec_module = execute_and_watch  # type: ignore[method-assign]
+        return spec
+
+
+def install() -> None:
+    """Watch the HAL of this process, now or when it is imported; once."""
+    if getattr(sys, "_atalante_witness", False):
+        return
+    sys._atalante_witness = True  # type: ignore[attr-defined]
+    if MODULE in sys.modules:
+        watch(sys.modules[MODULE].Hal)
+    else:
+        sys.meta_path.insert(0, _Finder())
+
+
+def start(folder: str) -> None:
+    """Watch the HALs of this process and of every process it starts from now on."""
+    here = os.path.dirname(__file__)
+    known = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path and path != here]
+    os.environ["PYTHONPATH"] = os.pathsep.join([here, *known])
+    os.environ[FOLDER] = folder
+    install()
