@@ -7,23 +7,18 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+from atalante_emulator import emergency
 from atalante_emulator.body import PERIOD
-from atalante_emulator.drive import (
-    COMMUNICATION_ERROR,
-    COUNTS,
-    TEMPERATURE_ERROR,
-    THERMAL_CYCLES,
-    WATCHDOG,
-    DriveParameters,
-    Drives,
-    DriveSignals,
-    Emergency,
-)
+from atalante_emulator.drive import NODES, SLOW_CYCLES, WATCHDOG, DriveParameters, Drives, DriveSignals
+from atalante_emulator.emergency import Emergency
+from atalante_emulator.encoder import COUNTS
+from atalante_emulator.motor import MotorParameters
 from atalante_hal.cia402 import Controlword, DriveState, controlword_towards_operation
 from atalante_hal.robot import Robot, load_robot
 
 ROBOT = load_robot()
-SMOOTH = DriveParameters(coulomb=(0.0,) * 6, viscous=(0.0,) * 6)
+SMOOTH_MOTOR = MotorParameters(coulomb=(0.0,) * 6, viscous=(0.0,) * 6)
+SMOOTH = DriveParameters(SMOOTH_MOTOR)
 BOTH = (True, True)
 
 
@@ -100,10 +95,11 @@ def test_without_operation_enabled_there_is_no_torque() -> None:
         assert not bench.cycle().any()
 
 
-def test_disabled_drives_still_rub(bench: Bench) -> None:
+def test_drives_without_power_rub_and_brake(bench: Bench) -> None:
     bench.velocity[:] = 1.0
-    p = bench.parameters
+    p = bench.parameters.motor
     expected = -(np.array(p.coulomb * 2) * math.tanh(1.0 / p.friction_speed) + np.array(p.viscous * 2))
+    expected -= np.array(p.brake * 2)
     np.testing.assert_allclose(bench.cycle(), expected)
 
 
@@ -119,7 +115,7 @@ def test_torque_follows_as_a_first_order_lag() -> None:
     bench.enable()
     bench.target[:] = 20.0
     for n in range(1, 6):
-        expected = 20.0 * (1.0 - math.exp(-n * PERIOD / SMOOTH.current_loop))
+        expected = 20.0 * (1.0 - math.exp(-n * PERIOD / SMOOTH_MOTOR.current_loop))
         np.testing.assert_allclose(bench.cycle(), expected, rtol=1e-12)
     bench.drives.sample(bench.position)
     np.testing.assert_allclose(bench.signals.torque, expected, rtol=1e-12)
@@ -149,7 +145,7 @@ def test_watchdog_trips_at_exactly_the_fifth_cycle_without_command(bench: Bench)
     bench.cycle((False, False))
     assert states(bench) == {DriveState.QUICK_STOP_ACTIVE}
     assert all(bench.drives.latched)
-    assert bench.drives.emergencies == [Emergency(drive, *COMMUNICATION_ERROR) for drive in range(12)]
+    assert bench.drives.emergencies == [Emergency(node, 0x11, 0x8250) for node in NODES]
 
 
 def test_lost_commands_below_the_watchdog_repeat_the_last(bench: Bench) -> None:
@@ -260,37 +256,6 @@ def test_a_joint_that_stands_somewhere_at_switch_on_does_not_seem_to_jump() -> N
     assert not bench.signals.velocity.any()
 
 
-def test_winding_temperature_follows_the_closed_form() -> None:
-    bench = Bench(SMOOTH)
-    bench.enable()
-    torque = 0.3 * ROBOT.torque_max
-    bench.target[:] = torque
-    cycles = 400 * THERMAL_CYCLES
-    for _ in range(cycles):
-        bench.cycle()
-    final = SMOOTH.heating * (torque / (0.5 * ROBOT.torque_max)) ** 2
-    expected = SMOOTH.ambient + final * (1.0 - math.exp(-cycles * PERIOD / SMOOTH.thermal_time))
-    np.testing.assert_allclose(bench.signals.temperature, expected, rtol=1e-3)
-
-
-def test_a_hot_drive_switches_itself_off_and_tells() -> None:
-    bench = Bench(dataclasses.replace(SMOOTH, thermal_time=2.0, trip_temperature=40.0))
-    bench.enable()
-    bench.target[3] = 150.0
-    for _ in range(20 * THERMAL_CYCLES):
-        torque = bench.cycle()
-    assert [s is DriveState.FAULT for s in bench.drives.state] == [d == 3 for d in range(12)]
-    assert bench.drives.emergencies == [Emergency(3, *TEMPERATURE_ERROR)]
-    assert torque[3] == pytest.approx(0.0, abs=1e-6)
-    bench.word[3] = Controlword.FAULT_RESET
-    bench.cycle()
-    assert bench.drives.state[3] is DriveState.SWITCH_ON_DISABLED
-    for _ in range(2 * THERMAL_CYCLES):
-        bench.cycle()
-    hot = bench.signals.temperature[3] >= 40.0
-    assert (bench.drives.emergencies[-1].code, len(bench.drives.emergencies)) == (TEMPERATURE_ERROR[1], 1 + hot)
-
-
 def test_torque_noise_is_seeded_and_of_the_stated_size(bench: Bench) -> None:
     first, again, other = np.zeros((3, 500, 12))
     bench.drives.draw_noise(np.random.default_rng(1), first)
@@ -298,3 +263,269 @@ def test_torque_noise_is_seeded_and_of_the_stated_size(bench: Bench) -> None:
     bench.drives.draw_noise(np.random.default_rng(2), other)
     assert first.tobytes() == again.tobytes() != other.tobytes()
     assert first.std() == pytest.approx(DriveParameters().torque_noise, rel=0.05)
+
+
+class TestHeat:
+    """A drive warms up, gives less when it is hot, and trips when it is too hot."""
+
+    def test_winding_temperature_follows_the_closed_form(self) -> None:
+        bench = Bench(SMOOTH)
+        bench.enable()
+        torque = 0.3 * ROBOT.torque_max
+        bench.target[:] = torque
+        cycles = 400 * SLOW_CYCLES
+        for _ in range(cycles):
+            bench.cycle()
+        final = SMOOTH_MOTOR.heating * (torque / (0.5 * ROBOT.torque_max)) ** 2
+        expected = SMOOTH_MOTOR.ambient + final * (1.0 - math.exp(-cycles * PERIOD / SMOOTH_MOTOR.thermal_time))
+        np.testing.assert_allclose(bench.signals.temperature, expected, rtol=1e-3)
+
+    @pytest.mark.parametrize("degrees", [20.0, 89.0, 90.4, 91.0, 100.2, 115.0, 119.9])
+    def test_the_torque_limit_is_the_curve_at_the_temperature_that_is_told(self, degrees: float) -> None:
+        bench = Bench(SMOOTH)
+        bench.enable()
+        bench.target[:] = 1e4
+        bench.drives.heat(3, degrees)
+        for _ in range(30):
+            torque = bench.cycle()
+        told = np.full(12, SMOOTH_MOTOR.ambient)
+        told[3] = round(degrees)
+        np.testing.assert_allclose(torque, ROBOT.torque_limit(told), rtol=1e-6)
+
+    def test_a_hot_drive_holds_with_what_it_has_left(self) -> None:
+        bench = Bench(SMOOTH)
+        bench.enable()
+        bench.drives.heat(3, 118.0)
+        bench.word[:] = Controlword.QUICK_STOP
+        bench.cycle()
+        bench.position[:] = -3.0
+        for _ in range(60):
+            torque = bench.cycle()
+        assert torque[3] == pytest.approx(ROBOT.derating.floor * ROBOT.torque_max[3])
+        assert torque[2] == pytest.approx(ROBOT.torque_max[2])
+
+    def test_a_drive_that_has_cooled_gives_all_again(self) -> None:
+        bench = Bench(SMOOTH)
+        bench.enable()
+        bench.target[:] = 1e4
+        bench.drives.heat(3, 110.0)
+        bench.cycle()
+        bench.drives.heat(3, 60.0)
+        for _ in range(30):
+            torque = bench.cycle()
+        np.testing.assert_allclose(torque, ROBOT.torque_max, rtol=1e-6)
+
+    def test_what_is_heated_by_torque_is_noticed_by_the_slow_turn(self) -> None:
+        bench = Bench(DriveParameters(dataclasses.replace(SMOOTH_MOTOR, thermal_time=1.0, heating=2000.0)))
+        bench.enable()
+        bench.target[3] = 0.5 * ROBOT.torque_max[3]
+        seen = []
+        for _ in range(10 * SLOW_CYCLES):
+            bench.cycle()
+            seen.append(bench.drives.state[3])
+        assert seen.index(DriveState.FAULT_REACTION_ACTIVE) % SLOW_CYCLES == SLOW_CYCLES - 1 - 3  # 3 cycles to enable
+        assert bench.drives.emergencies == [Emergency("LEFT_SK", 0x09, 0x4310)]
+
+    def test_a_trip_lowers_the_joint_and_the_others_go_on(self) -> None:
+        bench = Bench(SMOOTH)
+        bench.enable()
+        bench.target[:] = 30.0
+        bench.drives.heat(3, 120.0)
+        assert bench.drives.state[3] is DriveState.FAULT_REACTION_ACTIVE
+        bench.velocity[:] = 0.4
+        for _ in range(30):
+            torque = bench.cycle()
+        assert [s is DriveState.OPERATION_ENABLED for s in bench.drives.state] == [d != 3 for d in range(12)]
+        assert torque[3] == pytest.approx(-0.4 * SMOOTH_MOTOR.brake[3])
+        assert torque[4] == pytest.approx(30.0)
+        assert bench.signals.torque[3] == pytest.approx(0.0, abs=1e-6)
+
+    def test_fault_when_the_joint_has_come_to_rest(self) -> None:
+        bench = Bench(SMOOTH)
+        bench.enable()
+        bench.drives.heat(3, 120.0)
+        for _ in range(3 * SLOW_CYCLES):
+            bench.position[3] += 1.1 * SMOOTH.rest_speed * PERIOD
+            bench.cycle()
+        assert bench.drives.state[3] is DriveState.FAULT_REACTION_ACTIVE
+        for _ in range(SLOW_CYCLES):
+            bench.position[3] += 0.9 * SMOOTH.rest_speed * PERIOD
+            bench.cycle()
+        assert bench.drives.state[3] is DriveState.FAULT
+        assert bench.signals.state[3] == DriveState.FAULT
+
+    def test_a_fault_cannot_be_reset_while_the_drive_is_hot(self) -> None:
+        bench = Bench(SMOOTH)
+        bench.enable()
+        bench.drives.heat(3, 125.0)
+        for _ in range(SLOW_CYCLES):
+            bench.cycle()
+        bench.word[3] = Controlword.FAULT_RESET
+        for degrees in (125.0, 119.0, 100.5):
+            bench.drives.heat(3, degrees)
+            bench.cycle()
+            assert bench.drives.state[3] is DriveState.FAULT
+        bench.drives.heat(3, 100.0)
+        assert bench.drives.emergencies == [Emergency("LEFT_SK", 0x09, 0x4310)]
+        bench.cycle()
+        assert bench.drives.state[3] is DriveState.SWITCH_ON_DISABLED
+        assert bench.drives.emergencies[1:] == [Emergency("LEFT_SK", 0, 0)]
+
+
+class TestErrors:
+    """What a drive does by itself about each class of error."""
+
+    @pytest.mark.parametrize("code", [0x2310, 0x2110, 0x3222, 0x4110, 0x4310, 0x7305, 0x7121])
+    def test_a_drive_that_cannot_hold_lowers(self, bench: Bench, code: int) -> None:
+        bench.enable()
+        bench.drives.fail(7, code)
+        assert bench.drives.state[7] is DriveState.FAULT_REACTION_ACTIVE
+        assert not bench.drives.latched[7]
+        assert [e.code for e in bench.drives.emergencies] == [code]
+
+    @pytest.mark.parametrize("code", [0x1000, 0x3210, 0x3220, 0x6100, 0x8130, 0x8150, 0x8250, 0xFF00])
+    def test_a_drive_that_can_hold_holds(self, bench: Bench, code: int) -> None:
+        bench.enable()
+        bench.drives.fail(7, code)
+        assert bench.drives.state[7] is DriveState.QUICK_STOP_ACTIVE
+        assert [d for d in range(12) if bench.drives.latched[d]] == [7]
+
+    @pytest.mark.parametrize("code", [0x3220, 0x8250])
+    def test_a_drive_without_power_has_nothing_to_hold(self, bench: Bench, code: int) -> None:
+        bench.drives.fail(7, code)
+        assert bench.drives.state[7] is DriveState.SWITCH_ON_DISABLED
+        assert not bench.drives.latched[7]
+
+    def test_a_hold_that_was_commanded_becomes_the_drives_own_where_it_is(self, bench: Bench) -> None:
+        bench.position[:] = 0.1
+        bench.enable()
+        bench.word[:] = Controlword.QUICK_STOP
+        bench.cycle()
+        bench.position[:] = 0.11
+        bench.cycle()
+        bench.drives.fail(7, 0x8250)
+        for _ in range(30):
+            torque = bench.cycle()
+        assert bench.drives.latched[7] is False  # acknowledged by the QUICK_STOP that goes on
+        np.testing.assert_allclose(torque, -0.01 * ROBOT.hold_kp, rtol=0.02)
+
+    def test_an_error_in_a_fault_changes_nothing(self, bench: Bench) -> None:
+        bench.drives.fail(7, 0x4310)
+        bench.drives.leave(7, DriveState.FAULT)
+        bench.drives.fail(7, 0x2310)
+        assert bench.drives.state[7] is DriveState.FAULT
+
+    def test_an_error_that_stands_cannot_be_acknowledged(self, bench: Bench) -> None:
+        bench.enable()
+        bench.drives.fail(7, 0x3220, stands=True)
+        bench.word[:] = Controlword.QUICK_STOP
+        for _ in range(3):
+            bench.cycle()
+        assert bench.drives.latched[7]
+        bench.drives.recover(7, 0x3220)
+        assert [e.code for e in bench.drives.emergencies] == [0x3220]
+        bench.cycle()
+        assert not bench.drives.latched[7]
+        assert bench.drives.emergencies == [Emergency("RIGHT_TH", 0x05, 0x3220), Emergency("RIGHT_TH", 0, 0)]
+
+    def test_a_drive_with_an_error_that_stands_can_be_lowered_and_not_enabled(self, bench: Bench) -> None:
+        bench.enable()
+        bench.drives.fail(7, 0x3220, stands=True)
+        bench.word[7] = Controlword.DISABLE_VOLTAGE
+        bench.cycle()
+        assert bench.drives.state[7] is DriveState.SWITCH_ON_DISABLED
+        for _ in range(5):
+            bench.word[:] = [controlword_towards_operation(state) for state in bench.drives.state]
+            bench.cycle()
+        assert bench.drives.state[7] is DriveState.SWITCHED_ON
+        bench.drives.recover(7, 0x3220)
+        assert [e.code for e in bench.drives.emergencies] == [0x3220, 0]
+        bench.cycle()
+        assert bench.drives.state[7] is DriveState.OPERATION_ENABLED
+
+    def test_nobody_leaves_a_fault_reaction(self, bench: Bench) -> None:
+        bench.drives.fail(7, 0x2310)
+        for word in Controlword:
+            bench.word[:] = word
+            bench.cycle()
+        assert bench.drives.state[7] is DriveState.FAULT_REACTION_ACTIVE
+
+    def test_a_reset_drive_has_forgotten_everything(self, bench: Bench) -> None:
+        bench.enable()
+        bench.drives.fail(7, 0x3220, stands=True)
+        bench.drives.reset(7)
+        assert (bench.drives.state[7], bench.drives.latched[7]) == (DriveState.SWITCH_ON_DISABLED, False)
+        assert not bench.drives.errors.stand(7)
+        assert [e.code for e in bench.drives.emergencies] == [0x3220]
+
+    def test_leaving_unasked_is_told_by_the_state_alone(self, bench: Bench) -> None:
+        bench.enable()
+        bench.drives.leave(7, DriveState.SWITCHED_ON)
+        assert bench.signals.state[7] == DriveState.SWITCHED_ON
+        assert not bench.drives.emergencies
+
+    def test_notices_go_on_and_are_told_by_the_whole_leg(self, bench: Bench) -> None:
+        bench.enable()
+        bench.drives.notice(1, emergency.COMMAND_LOST)
+        assert states(bench) == {DriveState.OPERATION_ENABLED}
+        assert bench.drives.emergencies == [Emergency(node, 0x11, 0x8110) for node in NODES[6:]]
+        for _ in range(2 * SLOW_CYCLES):
+            bench.cycle()
+        assert bench.drives.emergencies[6:] == [Emergency(node, 0, 0) for node in NODES[6:]]
+
+
+class TestSync:
+    def test_holds_at_exactly_the_fifth_cycle_without_sync(self, bench: Bench) -> None:
+        bench.enable()
+        for cycle in range(100, 100 + WATCHDOG - 1):
+            bench.drives.miss_sync(1, cycle)
+        assert states(bench) == {DriveState.OPERATION_ENABLED}
+        bench.drives.miss_sync(1, 100 + WATCHDOG - 1)
+        assert set(bench.drives.state[:6]) == {DriveState.OPERATION_ENABLED}
+        assert set(bench.drives.state[6:]) == {DriveState.QUICK_STOP_ACTIVE}
+        assert bench.drives.emergencies == [Emergency(node, 0x11, 0x8130) for node in NODES[6:]]
+
+    def test_only_cycles_in_a_row_count(self, bench: Bench) -> None:
+        bench.enable()
+        for cycle in (1, 2, 3, 4, 6, 7, 8, 9, 11):
+            bench.drives.miss_sync(0, cycle)
+        assert states(bench) == {DriveState.OPERATION_ENABLED}
+
+    def test_a_sync_that_came_late_was_not_missed(self, bench: Bench) -> None:
+        bench.enable()
+        for cycle in range(20):
+            bench.drives.miss_sync(0, cycle)
+            bench.drives.find_sync(0)
+        assert states(bench) == {DriveState.OPERATION_ENABLED}
+
+
+class TestSupply:
+    @pytest.mark.parametrize(
+        ("volts", "state", "told"),
+        [
+            (48.0, DriveState.OPERATION_ENABLED, []),
+            (40.0, DriveState.OPERATION_ENABLED, []),
+            (39.9, DriveState.QUICK_STOP_ACTIVE, [0x3220]),
+            (20.0, DriveState.QUICK_STOP_ACTIVE, [0x3220]),
+            (19.9, DriveState.FAULT_REACTION_ACTIVE, [0x3220, 0x3222]),
+        ],
+    )
+    def test_thresholds(self, bench: Bench, volts: float, state: DriveState, told: list[int]) -> None:
+        bench.enable()
+        for _ in range(3):
+            bench.drives.supply(2, volts)
+        assert bench.drives.state[2] is state
+        assert [e.code for e in bench.drives.emergencies] == told
+        assert bench.drives.voltage == [48.0, 48.0, volts] + [48.0] * 9
+
+    def test_the_hold_stays_when_the_voltage_is_back(self, bench: Bench) -> None:
+        bench.enable()
+        bench.drives.supply(2, 30.0)
+        bench.drives.supply(2, 48.0)
+        for _ in range(5):
+            bench.cycle()
+        assert bench.drives.state[2] is DriveState.QUICK_STOP_ACTIVE
+        bench.word[:] = Controlword.QUICK_STOP
+        bench.cycle()
+        assert not bench.drives.latched[2]
+        assert [e.code for e in bench.drives.emergencies] == [0x3220, 0]

@@ -11,21 +11,24 @@ and a HAL in another process (`run`). One seed gives one sequence of bytes.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc import Network
 from atalante_emulator.body import PERIOD, Body
+from atalante_emulator.collision import two_senders
 from atalante_emulator.drive import WATCHDOG, DriveParameters, Drives, DriveSignals
-from atalante_emulator.faults import Fault
+from atalante_emulator.emergency import COMMAND_LOST, COMMAND_REFUSED, LIFE_GUARD, TWO_SENDERS, Emergency
+from atalante_emulator.faults import LINK_KINDS, NODE_KINDS, SENSOR_KINDS, Fault
 from atalante_emulator.foot import Feet, FootParameters
 from atalante_emulator.haptics import Haptics, HapticsParameters
+from atalante_emulator.heartbeat import Heartbeats
 from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
 from atalante_emulator.link import FaultyBus
+from atalante_emulator.node_faults import NodeFaults
 from atalante_emulator.pendant import Operator, PendantSignals
 from atalante_hal.bus import Bus, BusFull
 from atalante_hal.codec import Codec
@@ -42,12 +45,10 @@ _RECEIVE_BUDGET = 128
 _BATCH = 128
 #: Cycles of noise drawn at once.
 _NOISE_CYCLES = 128
+#: What a command frame is when it came, and is not to be followed.
+_REFUSED = (Check.CRC, Check.LENGTH, Check.RANGE)
 #: Longest wait [s] for the other SYNCs of a cycle once the first is there.
 _SYNC_SKEW = 200e-6
-#: Node states of the slow status, as CiA 301 heartbeat values.
-_BOOTUP, _OPERATIONAL = 0, 5
-_FIRMWARE_VERSION = 0x0100
-_SUPPLY_VOLTAGE = 48.0  # V
 
 
 @dataclass(frozen=True)
@@ -58,14 +59,6 @@ class EmulatorParameters:
     imu: ImuParameters = field(default_factory=ImuParameters)
     foot: FootParameters = field(default_factory=FootParameters)
     haptics: HapticsParameters = field(default_factory=HapticsParameters)
-
-
-class _Status(NamedTuple):
-    """The slow status of one node, and where its changing signals are."""
-
-    tx: TransmitImage
-    node_state: int
-    uptime: int
 
 
 class Emulator:
@@ -102,7 +95,7 @@ class Emulator:
         parameters = parameters or EmulatorParameters()
         self.network, self.body, self.bus, self.operator = network, body, bus, operator
         self._link: FaultyBus | None = None
-        if faults:
+        if any(fault.kind in LINK_KINDS for fault in faults):
             self.bus = self._link = FaultyBus(bus, network, faults, lambda: self.cycle, seed=seed)
         self.cycle = 0
         self.frames_lost = 0  # nodes' frames that the bus had no room for
@@ -111,6 +104,13 @@ class Emulator:
         self._bind_commands()
         self._build_nodes(robot, parameters)
         self._build_noise(seed)
+        self._node_faults: NodeFaults | None = None
+        if any(fault.kind in NODE_KINDS or fault.kind in SENSOR_KINDS for fault in faults):
+            self._node_faults = NodeFaults(
+                faults, network, robot, self._tx.codec, self.drives, self._heartbeats, self._emergencies
+            )
+            if self._node_faults.rewrites:
+                self.before_send.append(self._node_faults.rewrite)
         self._look_ahead()
 
     @property
@@ -129,7 +129,8 @@ class Emulator:
         self._tx = TransmitImage(cyclic)
         self._unsent = False  # the frames have been sealed and not sent since
         self._haptics_tx = TransmitImage([network.message("HAPTICS_STATE")])
-        self._status_messages = [m for m in sent if m.name.endswith("_STATUS")]
+        self._heartbeats = Heartbeats(network, [m for m in sent if m.name.endswith("_STATUS")])
+        self._emergencies: list[Emergency] = []  # to be told in this cycle
         self._emergency_tx = TransmitImage([m for m in sent if m.name.endswith("_EMCY")])
 
         heard = [m for m in network.sent_by("HAL") if m.cycle_ms == 1]
@@ -148,6 +149,8 @@ class Emulator:
             rows = [row for row, m in enumerate(cyclic) if m.bus == sync.bus]
             self._shares.append(self._tx.frames[rows[0] : rows[-1] + 1])
         self._whole = [self._tx.frames]
+        #: Of each leg, the place of its SYNC among the SYNCs.
+        self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
         self._answered = self._shares  # shares of the last imperfect cycle
         batch = new_frames(_BATCH)
         self._batch = as_words(batch)
@@ -180,6 +183,7 @@ class Emulator:
             robot,
             parameters.drive,
             DriveSignals(*(joint(s) for s in ("Position", "Velocity", "Torque", "Temperature", "DriveState"))),
+            self._emergencies,
         )
         self._imus = Imus(
             parameters.imu,
@@ -198,21 +202,6 @@ class Emulator:
         self._haptics = Haptics(parameters.haptics, amplitude)
         self._haptics_cycles = self._haptics_tx.codec.messages[0].cycle_ms
         self._operator_said: PendantSignals | None = None
-        self._build_status()
-
-    def _build_status(self) -> None:
-        # Spread over the period: no two nodes send their status in the same cycle.
-        self._status_period = max(m.cycle_ms for m in self._status_messages)
-        gap = self._status_period // len(self._status_messages)
-        self._status_due: dict[int, _Status] = {}
-        for place, message in enumerate(self._status_messages):
-            tx = TransmitImage([message])
-            at = {signal.name: tx.codec.index(message.name, signal.name) for signal in message.signals}
-            tx.values[at["NodeState"]] = _BOOTUP
-            tx.values[at["DbcHash"]] = self.network.hash32
-            tx.values[at["FirmwareVersion"]] = _FIRMWARE_VERSION
-            tx.values[at["SupplyVoltage"]] = _SUPPLY_VOLTAGE
-            self._status_due[gap * place] = _Status(tx, at["NodeState"], at["Uptime"])
 
     def _build_noise(self, seed: int) -> None:
         codec = self._tx.codec
@@ -253,7 +242,7 @@ class Emulator:
             self._complete_answer()
             self._cycle((True, True), self._whole)
             return True
-        return self._imperfect_cycle()
+        return self._imperfect_cycle(count)
 
     def _receive_rest(self, count: int) -> int:
         """Wait until every SYNC of the cycle is there; returns 0 while there is none, and keeps what came for later."""
@@ -274,16 +263,18 @@ class Emulator:
             count += got
         return count
 
-    def _imperfect_cycle(self) -> bool:
+    def _imperfect_cycle(self, count: int) -> bool:
         """Something is missing or refused: run the cycle with what is there."""
         checks = self._rx.check.tolist()
-        for leg, row in enumerate(self._command_rows):
-            self._commanded[leg] |= checks[row] <= Check.SOME_LOST
+        self._judge_commands(checks, count)
         synced = [place for place, row in enumerate(self._sync_rows) if checks[row] <= Check.SOME_LOST]
         if not synced:
             return self._cycle_without_sync()
         number = int(max(self._sync_cycles[synced]))
         if number == self._last_sync:  # the rest of a cycle that has already run
+            for leg, place in enumerate(self._leg_syncs):
+                if place in synced:
+                    self.drives.find_sync(leg)
             self._send([self._answered[place] for place in synced])
             return False
         self._last_sync = number
@@ -291,14 +282,31 @@ class Emulator:
         self._commanded = [False] * len(SIDES)
         self._complete_answer()
         self._answered = [share.copy() for share in self._shares]
+        for leg, place in enumerate(self._leg_syncs):
+            if place not in synced:
+                self.drives.miss_sync(leg, self.cycle)
         self._cycle(fresh, [self._answered[place] for place in synced])
         return True
+
+    def _judge_commands(self, checks: list[int], count: int) -> None:
+        """What the drives of each leg make of their command message."""
+        for leg, row in enumerate(self._command_rows):
+            check = checks[row]
+            self._commanded[leg] |= check <= Check.SOME_LOST
+            if check == Check.SOME_LOST:
+                self.drives.notice(leg, COMMAND_LOST)
+            elif check in _REFUSED:
+                self.drives.notice(leg, COMMAND_REFUSED)
+            if two_senders(self._scratch[:count], self._rx.codec.messages[row]):
+                self.drives.hold(leg, TWO_SENDERS)
 
     def _cycle_without_sync(self) -> bool:
         """Whether the wire lost or spoilt this cycle's SYNC: then the millisecond goes by all the same."""
         lost = self._link is not None and self._link.synced
         if lost:
-            self._alone(hold=())
+            for leg in range(len(SIDES)):
+                self.drives.miss_sync(leg, self.cycle)
+            self._alone()
         return lost
 
     def _send(self, parts: Sequence[Frames]) -> None:
@@ -321,7 +329,10 @@ class Emulator:
     def _look_ahead(self) -> None:
         """What the sensors say in the coming cycle: known as soon as the body has moved."""
         body = self.body
-        self.drives.sample(body.position)
+        position = body.position
+        if self._node_faults is not None:
+            position = self._node_faults.begin(self.cycle, position)
+        self.drives.sample(position)
         self._imus.sample(body.imu)
         self._feet.sample(body.contact, body.foot_rotation)
         if not self.cycle % _NOISE_CYCLES:
@@ -373,27 +384,24 @@ class Emulator:
 
     def _with_slow(self, parts: list[Frames]) -> list[Frames]:
         """`parts`, and the messages slower than the cycle that are due."""
+        parts = list(parts)
         if self.cycle % self._haptics_cycles == 0:
             self._haptics.advance(self._level, int(self._rx.age[self._level_row]), self._haptics_cycles)
-            parts = [*parts, self._haptics_tx.seal()]
-        status = self._status_due.get(self.cycle % self._status_period)
-        if status is not None:
-            tx, node_state, uptime = status
-            tx.values[uptime] = self.cycle * PERIOD
-            parts = [*parts, tx.seal()]
-            tx.values[node_state] = _OPERATIONAL
-        if self.drives.emergencies:
-            parts = [*parts, *self._seal_emergencies()]
+            parts.append(self._haptics_tx.seal())
+        parts += self._heartbeats.due(self.cycle)
+        if self._emergencies:
+            parts += self._seal_emergencies()
         return parts
 
     def _seal_emergencies(self) -> list[Frames]:
         tx, parts = self._emergency_tx, []
-        for drive, register, code in self.drives.emergencies:
-            name = f"{JOINTS[drive].upper()}_EMCY"
+        for node, register, code in self._emergencies:
+            name = f"{node}_EMCY"
             tx.values[tx.codec.index(name, "ErrorRegister")] = register
             tx.values[tx.codec.index(name, "ErrorCode")] = code
             parts.append(tx.seal_row(tx.codec.rows[name]).copy())
-        self.drives.emergencies.clear()
+            self._heartbeats.set(node, "ErrorFlags", register)
+        self._emergencies.clear()
         return parts
 
     # -- wall clock --------------------------------------------------------------------------------------------------
@@ -416,14 +424,14 @@ class Emulator:
 
     def idle(self) -> None:
         """One millisecond without a HAL: the nodes say nothing but their heartbeat, and enabled drives hold."""
-        self._alone(hold=range(len(SIDES)))
+        for leg in range(len(SIDES)):
+            self.drives.hold(leg, LIFE_GUARD)
+        self._alone()
 
-    def _alone(self, hold: Iterable[int]) -> None:
-        """One millisecond without SYNC; the legs of `hold` hold at once, the other by their watchdog."""
+    def _alone(self) -> None:
+        """One millisecond in which no node can answer."""
         drives = self.drives
         self._rx.new_cycle()
-        for leg in hold:
-            drives.hold(leg)
         drives.command((False, False), self._controlword, self._target, self._limit)
         if parts := self._with_slow([]):
             self._send(parts)

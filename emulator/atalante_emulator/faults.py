@@ -9,12 +9,14 @@ are. All are the emulator's: the HAL never knows that a fault is a staged one.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 from atalante_dbc import Message, Network
+from atalante_hal.cia402 import DriveState
 from atalante_hal.frame import FD_LENGTHS
+from atalante_hal.robot import CELLS
 
 Value = float | int | str
 
@@ -64,8 +66,15 @@ def _is_number(value: object) -> bool:
     return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
 
 
+def _choice(names: Sequence[str]) -> Parameter:
+    return Parameter(f"one of {', '.join(names)}", lambda value: value in names)
+
+
 _P = _number(0.0, 1.0, default=1.0)
 _MESSAGE = Parameter("the name of a message", lambda value: isinstance(value, str))
+#: Target that is no node: what feeds all drives.
+BATTERY: Final = "battery"
+_SUPPLIED: Final = f"drive or {BATTERY}"
 _PLACES: Final = "message, node or bus"
 
 #: Faults of the wire. `p` is the chance of each frame to be hit.
@@ -99,13 +108,59 @@ LINK_KINDS: Final[Mapping[str, Kind]] = {
         },
     ),
     "silence": Kind("a node says nothing", "node"),
+    "heartbeat_lost": Kind("a node sends its state, but no status", "node"),
+    "reset": Kind("a node is off, then begins anew with a boot-up heartbeat; a drive brakes meanwhile", "node"),
     "error_frame": Kind(
         "the HAL's controller reports errors (class bits of linux/can/error.h)", "bus", {"error": _whole(1, 0x1FF)}
     ),
     "bus_off": Kind("the HAL's controller goes bus-off: one error frame, then neither sends nor receives", "bus"),
 }
 
-KINDS: Final[Mapping[str, Kind]] = {**LINK_KINDS}
+#: Faults inside the nodes.
+NODE_KINDS: Final[Mapping[str, Kind]] = {
+    "reset": LINK_KINDS["reset"],
+    "emergency": Kind(
+        "a node tells an error and, being a drive, does what it does about its class",
+        "node",
+        {"code": _whole(1, 0xFFFF)},
+    ),
+    "leave_operation": Kind(
+        "a drive goes to a state unasked, every cycle",
+        "drive",
+        {"state": _choice([state.name for state in DriveState])},
+    ),
+    "torque_weak": Kind("a motor makes a share of the torque it measures", "drive", {"share": _number(0.0, 1.0)}),
+    "over_temperature": Kind("a drive is this hot", "drive", {"degrees": _number(-40.0, 214.0, "degC")}),
+    "heat_ramp": Kind(
+        "a drive grows hotter",
+        "drive",
+        {"rate": _number(0.0, 1e5, "K/s"), "up_to": _number(-40.0, 214.0, "degC", default=214.0)},
+    ),
+    "under_voltage": Kind(
+        "the supply of one drive or of all is this low", _SUPPLIED, {"volts": _number(0.0, 60.0, "V")}
+    ),
+    "battery_removed": Kind(
+        "the drives live on the charge of the DC link", BATTERY, {"capacity": _number(1e-3, 10.0, "F", default=0.1)}
+    ),
+    "encoder_stuck": Kind("an encoder shows the joint where it was", "drive"),
+    "encoder_jump": Kind("an encoder is off by an angle of the joint", "drive", {"by": _number(-7.0, 7.0, "rad")}),
+    "encoder_drift": Kind("an encoder goes off", "drive", {"rate": _number(-10.0, 10.0, "rad/s of the joint")}),
+    "dbc_hash": Kind("a node reports another network", "node", {"hash": _whole(0, 0xFFFF_FFFF, default=0xDEADBEEF)}),
+}
+
+#: Faults of what sensors say, noise and all.
+SENSOR_KINDS: Final[Mapping[str, Kind]] = {
+    "imu_invalid": Kind("an IMU sends the invalid code for all it measures", "imu"),
+    "imu_saturated": Kind("gyroscope and accelerometer stand at the end of their range", "imu"),
+    "imu_frozen": Kind("an IMU says the same again and again, with a live counter", "imu"),
+    "cell_stuck": Kind(
+        "a force cell reads this vertically; 0 is a dead one",
+        "foot",
+        {"cell": _choice(CELLS), "force": _number(-3000.0, 3000.0, "N", default=0.0)},
+    ),
+}
+
+KINDS: Final[Mapping[str, Kind]] = {**LINK_KINDS, **NODE_KINDS, **SENSOR_KINDS}
 
 
 @dataclass(frozen=True, init=False)
@@ -158,6 +213,11 @@ class Fault:
         known = KINDS[self.kind].parameters
         return {name: float(value) for name, value in self.parameters if name not in known}
 
+    def starting(self, cycle: int) -> Fault:
+        """The same fault from another cycle on."""
+        parameters: Any = dict(self.parameters)
+        return Fault(self.kind, self.target, cycle, self.cycles, **parameters)
+
     def __str__(self) -> str:
         """As one would type it."""
         return " ".join([self.kind, self.target, *(f"{name}={value}" for name, value in self.parameters)])
@@ -194,12 +254,13 @@ def messages_of(fault: Fault, network: Network) -> tuple[Message, ...]:
     places: dict[str, tuple[Message, ...]] = {}
     if "message" in wanted:
         places |= {message.name: (message,) for message in network.messages}
-    if "node" in wanted:
+    if fault.kind == "heartbeat_lost":
+        places = {m.sender: (m,) for m in network.messages if m.name.endswith("_STATUS")}
+    elif "node" in wanted:
         places |= {node.name: network.sent_by(node.name) for node in network.nodes}
     if "bus" in wanted:
         places |= {bus: tuple(m for m in network.messages if m.bus == bus) for bus in network.buses}
-    if fault.target not in places:
-        raise FaultError(f"{fault.kind}: {fault.target!r} is no {wanted}; there are {', '.join(places)}")
+    _check_target(fault, wanted, list(places))
     messages = places[fault.target]
     if "like" in dict(fault.parameters) and fault["like"] not in (known := [m.name for m in network.messages]):
         raise FaultError(f"{fault.kind}: like is a message, not {fault['like']!r}; there are {', '.join(known)}")
@@ -207,3 +268,27 @@ def messages_of(fault: Fault, network: Network) -> tuple[Message, ...]:
         if signal not in (known := [s.name for s in messages[0].signals]):
             raise FaultError(f"{fault.kind}: no signal {signal!r} in {fault.target}; there are {', '.join(known)}")
     return messages
+
+
+def nodes_of(fault: Fault, network: Network) -> tuple[str, ...]:
+    """The nodes a fault inside nodes is about; of the battery: all drives.
+
+    Raises:
+        FaultError: the network has no such node of the kind it takes; names those there are.
+    """
+    wanted = KINDS[fault.kind].targets
+    drives = tuple(node.name for node in network.of_kind("drive"))
+    places: dict[str, tuple[str, ...]] = {
+        node.name: (node.name,)
+        for node in network.nodes
+        if node.kind in wanted or (wanted == "node" and node.kind != "master")
+    }
+    if BATTERY in wanted:
+        places[BATTERY] = drives
+    _check_target(fault, wanted, list(places))
+    return places[fault.target]
+
+
+def _check_target(fault: Fault, wanted: str, places: Sequence[str]) -> None:
+    if fault.target not in places:
+        raise FaultError(f"{fault.kind}: {fault.target!r} is no {wanted}; there are {', '.join(places)}")

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from atalante_dbc import Message, Network
-from atalante_emulator.faults import Fault, messages_of
+from atalante_emulator.faults import LINK_KINDS, Fault, messages_of
 from atalante_hal.bus import Bus, Stamps
 from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
 from atalante_hal.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, ID_EXTENDED, Frames, new_frames
@@ -160,6 +160,8 @@ class _Disturbance:
 _EFFECTS: Final[dict[str, Callable[[_Disturbance, Frames, Message, int], Sequence[Frames]]]] = {
     "drop": _Disturbance._lose,
     "silence": _Disturbance._lose,
+    "heartbeat_lost": _Disturbance._lose,
+    "reset": _Disturbance._lose,
     "bus_off": _Disturbance._lose,
     "duplicate": _Disturbance._duplicate,
     "delay": _Disturbance._delay,
@@ -191,7 +193,7 @@ class FaultyBus:
 
         Args:
             bus: the wire.
-            faults: of `LINK_KINDS`.
+            faults: those of `LINK_KINDS` among them are its.
             clock: the emulator's cycle.
             seed: of what is left to chance.
 
@@ -202,7 +204,11 @@ class FaultyBus:
         #: The HAL sent a SYNC in the last `receive`, whatever became of it.
         self.synced = False
         self._clock, self._cycle, self._begun = clock, -1, -1
-        self._all = [_Disturbance(fault, network, f"{seed} {place}") for place, fault in enumerate(faults)]
+        self._all = [
+            _Disturbance(fault, network, f"{seed} {place}")
+            for place, fault in enumerate(faults)
+            if fault.kind in LINK_KINDS
+        ]
         self._active: list[_Disturbance] = []
         self._syncs = {m.frame_id for m in network.messages if m.name.startswith("SYNC_")}
         self._from_hal = {m.frame_id for m in network.sent_by("HAL")}

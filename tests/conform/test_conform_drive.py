@@ -197,11 +197,16 @@ def _without_emergency(code: int) -> Callable[[MakeDesk, Patch], Desk]:
     def broken(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
         del monkeypatch
         desk = make_desk(NODE)
-        message = desk.message("EMCY")
+        message, kept_back = desk.message("EMCY"), 0
 
         def from_node(frame: Frames) -> Frames:
-            mine = int(frame["can_id"][0]) == message.frame_id
-            return NO_FRAME if mine and raw(frame, message, "ErrorCode") == code else frame
+            nonlocal kept_back
+            if int(frame["can_id"][0]) != message.frame_id:
+                return frame
+            if raw(frame, message, "ErrorCode") == code:
+                kept_back += 1
+                return NO_FRAME
+            return protect(frame, message, counter=int(frame["data"][0][2]) - kept_back)
 
         desk.wire.from_node = from_node
         return desk
@@ -249,7 +254,7 @@ BROKEN: dict[str, tuple[Callable[[MakeDesk, Patch], Desk], dict[str, Verdict]]] 
     "gives up after 4 commands": (_with_watchdog(4), {"DRIVE-12": F}),
     "waits for 6 commands": (_with_watchdog(6), {"DRIVE-13": F}),
     "enables a latched hold": (_with_rule(_enables_a_latched_hold), {"DRIVE-14": F}),
-    "does not tell the latch": (_without_emergency(0x8130), {"DRIVE-15": F}),
+    "does not tell the latch": (_without_emergency(0x8250), {"DRIVE-15": F}),
     "ignores the loss of SYNC": (ignores_the_loss_of_sync, {"DRIVE-16": F}),
     "checks no CRC": (_on_command(no_crc), {"DRIVE-17": F}),
     "checks no Data ID": (_on_command(no_data_id), {"DRIVE-18": F}),

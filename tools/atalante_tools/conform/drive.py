@@ -42,8 +42,8 @@ RIDDEN, LATCHED = 4, 5
 _NOISE: Final = 0.3
 #: A joint that holds may give way by this much [rad].
 _GIVE: Final = math.radians(1.0)
-#: CiA 301 emergency code of a lost HAL: life guard.
-LIFE_GUARD: Final = 0x8130
+#: CiA 301 emergency code of a lost HAL: its command came no more (RPDO timeout).
+COMMAND_TIMEOUT: Final = 0x8250
 #: Class of emergency codes of temperatures.
 TEMPERATURE_CLASS: Final = 0x4000
 
@@ -152,9 +152,9 @@ def requirements(bench: Bench) -> list[Requirement]:
         ),
         Requirement(
             "DRIVE-15",
-            "Tells the latched hold by one emergency 0x8130.",
+            "Tells the latched hold by one emergency 0x8250.",
             "EMCY after 20 cycles without command",
-            "CiA 301 EMCY, life guard",
+            "CiA 301 EMCY, RPDO timeout",
             tells_the_latch,
         ),
         Requirement(
@@ -441,7 +441,7 @@ def tells_the_latch(bench: Bench) -> Outcome:
     first = len(bench.heard)
     bench.idle(20)
     told = _emergencies(bench, first)
-    return Outcome(told == [LIFE_GUARD], f"emergencies: {_codes(told)}")
+    return Outcome(told == [COMMAND_TIMEOUT], f"emergencies: {_codes(told)}")
 
 
 def latches_without_sync(bench: Bench) -> Outcome:

@@ -68,7 +68,7 @@ class EmulatorTechnician:
                 pass  # it has just begun
             case Action.OVERHEAT | Action.COOL:
                 drive = [joint.upper() for joint in JOINTS].index(node)
-                self._emulator.drives.signals.temperature[drive] = 150.0 if action is Action.OVERHEAT else 25.0
+                self._emulator.drives.heat(drive, 150.0 if action is Action.OVERHEAT else 25.0)
             case Action.RELEASE_DEAD_MAN:
                 operator.release()
             case Action.SQUEEZE_DEAD_MAN:

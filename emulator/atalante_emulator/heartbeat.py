@@ -1,0 +1,78 @@
+"""The slow status of every node: one BOOTUP when it begins, then OPERATIONAL, each node in its own cycle of the period."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from atalante_dbc import Message, Network
+from atalante_emulator.body import PERIOD
+from atalante_hal.frame import Frames
+from atalante_hal.image import TransmitImage
+
+#: Node states, as CiA 301 heartbeat values.
+BOOTUP: Final = 0
+OPERATIONAL: Final = 5
+_FIRMWARE_VERSION: Final = 0x0100
+_SUPPLY_VOLTAGE: Final = 48.0  # V
+
+
+@dataclass
+class _Status:
+    """The status of one node, and where its signals are."""
+
+    tx: TransmitImage
+    at: dict[str, int]
+    booted: int = 0  # cycle in which the node began
+
+
+class Heartbeats:
+    """The status messages of the emulated nodes."""
+
+    def __init__(self, network: Network, messages: Sequence[Message]) -> None:
+        self._period = max(m.cycle_ms for m in messages)
+        # Spread over the period: no two nodes send their status in the same cycle.
+        gap = self._period // len(messages)
+        self._due: dict[int, _Status] = {}
+        self._of: dict[str, _Status] = {}
+        self._booting: list[_Status] = []
+        for place, message in enumerate(messages):
+            tx = TransmitImage([message])
+            status = _Status(tx, {signal.name: tx.codec.index(message.name, signal.name) for signal in message.signals})
+            self._due[gap * place] = self._of[message.sender] = status
+            self.set(message.sender, "NodeState", BOOTUP)
+            self.set(message.sender, "DbcHash", network.hash32)
+            self.set(message.sender, "FirmwareVersion", _FIRMWARE_VERSION)
+            self.set(message.sender, "SupplyVoltage", _SUPPLY_VOLTAGE)
+
+    def set(self, node: str, signal: str, value: float) -> None:
+        """What a node says of itself from now on, DBC units."""
+        status = self._of[node]
+        status.tx.values[status.at[signal]] = value
+
+    def boot(self, node: str, cycle: int) -> None:
+        """A node begins anew in this cycle: it says so at once, uptime and alive counter count from 0."""
+        status = self._of[node]
+        status.booted = cycle
+        status.tx.resume(0, 0xFF)
+        self.set(node, "NodeState", BOOTUP)
+        self.set(node, "ErrorFlags", 0.0)
+        self._booting.append(status)
+
+    def due(self, cycle: int) -> list[Frames]:
+        """The frames of this cycle, most often none. Shape (1,) each."""
+        due = self._due.get(cycle % self._period)
+        if due is None and not self._booting:
+            return []
+        due_now = [*self._booting, *([due] if due is not None and due not in self._booting else [])]
+        self._booting = []
+        return [self._sealed(status, cycle) for status in due_now]
+
+    @staticmethod
+    def _sealed(status: _Status, cycle: int) -> Frames:
+        values = status.tx.values
+        values[status.at["Uptime"]] = (cycle - status.booted) * PERIOD
+        frames = status.tx.seal()
+        values[status.at["NodeState"]] = OPERATIONAL
+        return frames

@@ -1,0 +1,214 @@
+"""Faults inside the nodes: what goes wrong before the sensors of a cycle are read, and in what they say.
+
+body -> NodeFaults.begin -> encoders, drives -> truth + noise -> NodeFaults.rewrite -> frames
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_dbc import Network
+from atalante_emulator.body import PERIOD
+from atalante_emulator.drive import NODES, Drives
+from atalante_emulator.emergency import ERROR_RESET, Emergency, register_of
+from atalante_emulator.faults import NODE_KINDS, SENSOR_KINDS, Fault, nodes_of
+from atalante_emulator.heartbeat import Heartbeats
+from atalante_emulator.supply import HoldUp
+from atalante_hal.cia402 import DriveState
+from atalante_hal.codec import Codec
+from atalante_hal.robot import Robot
+
+Vector = npt.NDArray[np.float64]
+Nodes = Sequence[str]
+
+#: Quantities of an IMU that a fault of it spoils.
+_MEASURED: Final = ("Quaternion", "Gyro", "Accel")
+
+
+class NodeFaults:
+    """The faults of `NODE_KINDS` at work in one emulator."""
+
+    def __init__(
+        self,
+        faults: Sequence[Fault],
+        network: Network,
+        robot: Robot,
+        codec: Codec,
+        drives: Drives,
+        heartbeats: Heartbeats,
+        outbox: list[Emergency],
+    ) -> None:
+        """Put faults into nodes.
+
+        Args:
+            codec: of the values of the 1 ms messages.
+            outbox: takes emergencies of nodes that are no drives.
+
+        Raises:
+            FaultError: no such node, or one of another kind.
+        """
+        self._network, self._robot, self._codec = network, robot, codec
+        self._drives, self._heartbeats, self._outbox = drives, heartbeats, outbox
+        self._faults = [(fault, nodes_of(fault, network)) for fault in faults if fault.kind in NODE_KINDS]
+        self._sensors = [(fault, nodes_of(fault, network)[0]) for fault in faults if fault.kind in SENSOR_KINDS]
+        self.rewrites = bool(self._sensors)
+        self._position: Vector = np.zeros(len(NODES))  # rad, as the encoders see the joints
+        self._stuck_at: dict[Fault, float] = {}
+        self._frozen: dict[Fault, Vector] = {}
+        self._hold_up: dict[Fault, HoldUp] = {}
+
+    def begin(self, cycle: int, position: Vector) -> Vector:
+        """Let go wrong what does in this cycle, and let end what is over.
+
+        Args:
+            position: of the joints, shape (12,) [rad].
+
+        Returns:
+            What the encoders see of it, shape (12,) [rad].
+        """
+        self._position = position.copy()
+        for fault, nodes in self._faults:
+            if fault.start <= cycle <= fault.end:
+                _EFFECTS[fault.kind](self, fault, nodes, cycle)
+        return self._position
+
+    def rewrite(self, cycle: int, values: Vector) -> None:
+        """Spoil what sensors say in this cycle: values of the 1 ms messages, DBC units."""
+        for fault, node in self._sensors:
+            if fault.start <= cycle < fault.end:
+                _SENSOR_EFFECTS[fault.kind](self, fault, node, values)
+
+    # -- drives ------------------------------------------------------------------------------------------------------
+
+    def _emergency(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
+        (node,), code = nodes, fault["code"]
+        begins, ends = cycle == fault.start, cycle == fault.end
+        if node in NODES:
+            if begins:
+                self._drives.fail(NODES.index(node), code, stands=True)
+            elif ends:
+                self._drives.recover(NODES.index(node), code)
+        elif begins:
+            self._outbox.append(Emergency(node, register_of([code]), code))
+        elif ends:
+            self._outbox.append(Emergency(node, register_of([]), ERROR_RESET))
+
+    def _leave_operation(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
+        if cycle < fault.end:
+            self._drives.leave(_drive(nodes), DriveState[fault["state"]])
+
+    def _reset(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
+        """Nothing is heard of the node meanwhile: `link` sees to that."""
+        (node,) = nodes
+        if cycle == fault.end:
+            self._heartbeats.boot(node, cycle)
+        elif node in NODES:
+            self._drives.reset(NODES.index(node))
+
+    def _torque_weak(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
+        if cycle in (fault.start, fault.end):
+            self._drives.motors.weaken(_drive(nodes), fault["share"] if cycle < fault.end else 1.0)
+
+    def _over_temperature(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
+        if cycle < fault.end:
+            self._drives.heat(_drive(nodes), fault["degrees"])
+
+    def _heat_ramp(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
+        if cycle < fault.end:
+            temperature = float(self._drives.motors.temperature[_drive(nodes)])
+            self._drives.heat(_drive(nodes), min(temperature + fault["rate"] * PERIOD, fault["up_to"]))
+
+    # -- supply ------------------------------------------------------------------------------------------------------
+
+    def _under_voltage(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
+        self._supply(nodes, fault["volts"] if cycle < fault.end else self._drives.parameters.supply)
+
+    def _battery_removed(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
+        voltage = self._drives.parameters.supply
+        if cycle < fault.end:
+            link = self._hold_up.setdefault(fault, HoldUp(self._robot, fault["capacity"], voltage))
+            voltage = link.draw(self._drives.signals.torque, self._drives.encoders.speed)
+        self._supply(nodes, voltage)
+
+    def _supply(self, nodes: Nodes, voltage: float) -> None:
+        for node in nodes:
+            self._drives.supply(NODES.index(node), voltage)
+            self._heartbeats.set(node, "SupplyVoltage", voltage)
+
+    # -- encoders ----------------------------------------------------------------------------------------------------
+
+    def _encoder_stuck(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
+        if cycle < fault.end:
+            drive = _drive(nodes)
+            self._position[drive] = self._stuck_at.setdefault(fault, float(self._position[drive]))
+
+    def _encoder_jump(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
+        if cycle < fault.end:
+            self._position[_drive(nodes)] += fault["by"]
+
+    def _encoder_drift(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
+        if cycle < fault.end:
+            self._position[_drive(nodes)] += fault["rate"] * (cycle - fault.start) * PERIOD
+
+    # -- what a node says of itself ----------------------------------------------------------------------------------
+
+    def _dbc_hash(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
+        (node,) = nodes
+        self._heartbeats.set(node, "DbcHash", fault["hash"] if cycle < fault.end else self._network.hash32)
+
+    # -- sensors -----------------------------------------------------------------------------------------------------
+
+    def _measured(self, node: str) -> list[int]:
+        """Places of what an IMU measures."""
+        return [
+            place
+            for place, (message, signal) in enumerate(self._codec.signals)
+            if message.sender == node and signal.name.rstrip("WXYZ") in _MEASURED
+        ]
+
+    def _imu_invalid(self, fault: Fault, node: str, values: Vector) -> None:
+        values[self._measured(node)] = np.nan
+
+    def _imu_saturated(self, fault: Fault, node: str, values: Vector) -> None:
+        for place in self._measured(node):
+            signal = self._codec.signals[place][1]
+            if not signal.name.startswith("Quaternion"):
+                values[place] = signal.maximum
+
+    def _imu_frozen(self, fault: Fault, node: str, values: Vector) -> None:
+        places = self._measured(node)
+        values[places] = self._frozen.setdefault(fault, values[places])
+
+    def _cell_stuck(self, fault: Fault, node: str, values: Vector) -> None:
+        values[self._codec.index(f"{node}_STATE", f"{fault['cell']}_ForceZ")] = fault["force"]
+
+
+def _drive(nodes: Nodes) -> int:
+    (node,) = nodes
+    return NODES.index(node)
+
+
+_EFFECTS: Final[dict[str, Callable[[NodeFaults, Fault, Nodes, int], None]]] = {
+    "emergency": NodeFaults._emergency,
+    "leave_operation": NodeFaults._leave_operation,
+    "reset": NodeFaults._reset,
+    "torque_weak": NodeFaults._torque_weak,
+    "over_temperature": NodeFaults._over_temperature,
+    "heat_ramp": NodeFaults._heat_ramp,
+    "under_voltage": NodeFaults._under_voltage,
+    "battery_removed": NodeFaults._battery_removed,
+    "encoder_stuck": NodeFaults._encoder_stuck,
+    "encoder_jump": NodeFaults._encoder_jump,
+    "encoder_drift": NodeFaults._encoder_drift,
+    "dbc_hash": NodeFaults._dbc_hash,
+}
+_SENSOR_EFFECTS: Final[dict[str, Callable[[NodeFaults, Fault, str, Vector], None]]] = {
+    "imu_invalid": NodeFaults._imu_invalid,
+    "imu_saturated": NodeFaults._imu_saturated,
+    "imu_frozen": NodeFaults._imu_frozen,
+    "cell_stuck": NodeFaults._cell_stuck,
+}

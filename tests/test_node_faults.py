@@ -1,0 +1,427 @@
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from atalante_dbc import Network
+from atalante_emulator.body import PERIOD, PyBulletBody
+from atalante_emulator.emulator import Emulator
+from atalante_emulator.faults import Fault, FaultError
+from atalante_emulator.pendant import Operator
+from atalante_hal.bus.pair import PairBus, lockstep_pair
+from atalante_hal.cia402 import DriveState, controlword_towards_operation
+from atalante_hal.frame import Frames, new_frames
+from atalante_hal.image import ReceiveImage, TransmitImage
+from atalante_hal.robot import Robot
+
+CROUCHED = [0.0, 0.0, -0.4, 0.7, -0.1, 0.0] * 2
+KNEE, HENKE = 3, 5  # of the left leg
+ENABLED, HOLDING = DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE
+#: Cycle in which the faults of most tests begin, drives enabled and holding their pose.
+BEGIN = 30
+
+
+class Walker:
+    """The least that speaks as a HAL: enables the drives and holds the pose with its own position loop."""
+
+    def __init__(self, network: Network, robot: Robot, bus: PairBus) -> None:
+        cyclic = [m for m in network.sent_by("HAL") if m.cycle_ms == 1]
+        self.robot, self.bus, self.cycle = robot, bus, 0
+        self.tx = TransmitImage(
+            [m for m in cyclic if not m.name.startswith("SYNC_")] + [m for m in cyclic if m.name.startswith("SYNC_")]
+        )
+        received = network.received_by("HAL")
+        self.fast, self.slow = (
+            ReceiveImage([m for m in received if (m.cycle_ms == 1) is fast]) for fast in (True, False)
+        )
+        values, codec = self.tx.values, self.tx.codec
+        self.word, self.target = values[codec.slice("Controlword")], values[codec.slice("TargetTorque")]
+        values[codec.slice("MaxTorque")] = robot.torque_max
+        self._sync_cycle = codec.slice("Cycle")
+        self._names = {m.frame_id: m.name for m in network.messages}
+        self._buffer = new_frames(128)
+        self.said: list[list[str]] = []
+        self.frames: list[Frames] = []
+        self.states: list[list[int]] = []
+        self.enabling = True
+
+    def run(self, cycles: int) -> None:
+        for _ in range(cycles):
+            self.cycle += 1
+            self.tx.values[self._sync_cycle] = self.cycle
+            self.bus.send(self.tx.seal())
+            count = self.bus.receive(self._buffer)
+            self.frames.append(self._buffer[:count].copy())
+            self.said.append([self._names[i] for i in self.frames[-1]["can_id"].tolist()])
+            self.fast.accept(self._buffer, count)
+            self.slow.new_cycle()
+            self.slow.accept_each(self._buffer, count)
+            self.states.append([int(s) for s in self.joints("DriveState")])
+            if self.enabling:
+                self.word[:] = [controlword_towards_operation(state) for state in self.states[-1]]
+            position, velocity = (
+                self.joints(s) / (self.robot.gear * self.robot.polarity) for s in ("Position", "Velocity")
+            )
+            self.target[:] = self.robot.hold_kp * (CROUCHED - position) - self.robot.hold_kd * velocity
+
+    def joints(self, signal: str) -> np.ndarray:
+        first = self.fast.codec.index("LEFT_FH_STATE", signal)
+        return self.fast.values[first : first + 12].copy()
+
+    def value(self, message: str, signal: str) -> float:
+        image = self.fast if message in self.fast.codec.rows else self.slow
+        return float(image.values[image.codec.index(message, signal)])
+
+    def emergencies(self) -> list[tuple[int, str]]:
+        """Cycle and name of every emergency."""
+        return [(cycle, name) for cycle, names in enumerate(self.said) for name in names if name.endswith("_EMCY")]
+
+
+World = tuple[Walker, Emulator]
+
+
+@pytest.fixture
+def world(network: Network, robot: Robot, urdf_text: str) -> Iterator[Callable[..., World]]:
+    bodies: list[PyBulletBody] = []
+
+    def build(*faults: Fault, cycles: int = 0, seed: int = 0) -> World:
+        ours, theirs = lockstep_pair()
+        body = PyBulletBody(urdf_text)
+        body.reset(CROUCHED)
+        bodies.append(body)
+        emulator = Emulator(network, robot, body, theirs, seed=seed, operator=Operator(), faults=faults)
+        ours.step = emulator.poll
+        walker = Walker(network, robot, ours)
+        walker.run(cycles)
+        return walker, emulator
+
+    yield build
+    for body in bodies:
+        body.close()
+
+
+Make = Callable[..., World]
+
+
+def test_without_an_active_fault_every_byte_is_the_same(world: Make) -> None:
+    plain, _ = world(cycles=150)
+    waiting, _ = world(
+        Fault("encoder_jump", "LEFT_SK", 10_000, by=1.0),
+        Fault("imu_frozen", "IMU_TORSO", 10_000),
+        Fault("drop", "LEFT_SK", 10_000),
+        cycles=150,
+    )
+    assert [f.tobytes() for f in plain.frames] == [f.tobytes() for f in waiting.frames]
+    assert set(plain.states[BEGIN]) == {ENABLED}
+
+
+class TestDrives:
+    @pytest.mark.parametrize("state", ["SWITCHED_ON", "READY_TO_SWITCH_ON", "FAULT", "QUICK_STOP_ACTIVE"])
+    def test_leave_operation(self, world: Make, state: str) -> None:
+        walker, _ = world(Fault("leave_operation", "LEFT_SK", BEGIN, 3, state=state), cycles=BEGIN + 3)
+        assert [row[KNEE] for row in walker.states[BEGIN - 1 :]] == [ENABLED] + [DriveState[state]] * 3
+        assert {s for row in walker.states[BEGIN:] for d, s in enumerate(row) if d != KNEE} == {ENABLED}
+
+    def test_emergency_of_a_drive(self, world: Make) -> None:
+        walker, emulator = world(Fault("emergency", "LEFT_HA", BEGIN, 50, code=0x7305), cycles=BEGIN + 1)
+        assert walker.emergencies() == [(BEGIN, "LEFT_HA_EMCY")]
+        said = [walker.value("LEFT_HA_EMCY", signal) for signal in ("ErrorCode", "ErrorRegister")]
+        assert said == [0x7305, 0x21]
+        assert walker.states[BEGIN][HENKE] == DriveState.FAULT_REACTION_ACTIVE
+        walker.run(250)
+        assert [name for _, name in walker.emergencies()] == ["LEFT_HA_EMCY"] * 2
+        assert walker.value("LEFT_HA_EMCY", "ErrorCode") == 0
+        assert emulator.drives.state[HENKE] is ENABLED  # by a HAL that acknowledges everything
+
+    def test_an_emergency_that_stands_cannot_be_reset(self, world: Make) -> None:
+        walker, _ = world(Fault("emergency", "LEFT_HA", BEGIN, code=0x2310), cycles=BEGIN + 300)
+        assert walker.states[-1][HENKE] == DriveState.FAULT
+        assert len(walker.emergencies()) == 1
+
+    def test_emergency_of_a_sensor(self, world: Make) -> None:
+        walker, _ = world(Fault("emergency", "IMU_TORSO", BEGIN, 5, code=0x5000), cycles=BEGIN + 1)
+        assert walker.value("IMU_TORSO_EMCY", "ErrorCode") == 0x5000
+        walker.run(10)
+        assert walker.emergencies() == [(BEGIN, "IMU_TORSO_EMCY"), (BEGIN + 5, "IMU_TORSO_EMCY")]
+        assert walker.value("IMU_TORSO_EMCY", "ErrorCode") == 0
+
+    def test_error_register_in_the_heartbeat(self, world: Make) -> None:
+        walker, _ = world(Fault("emergency", "LEFT_SK", BEGIN, code=0x2310), cycles=BEGIN + 120)
+        assert walker.value("LEFT_SK_STATUS", "ErrorFlags") == 0x03
+        assert walker.value("LEFT_SH_STATUS", "ErrorFlags") == 0
+
+    def test_weak_torque(self, world: Make) -> None:
+        walker, emulator = world(Fault("torque_weak", "LEFT_SK", BEGIN, 200, share=0.5), cycles=BEGIN + 100)
+        sag = CROUCHED[KNEE] - emulator.body.position[KNEE]
+        healthy, other = world(cycles=BEGIN + 100)
+        assert sag > 1.5 * (CROUCHED[KNEE] - other.body.position[KNEE])
+        assert walker.joints("Torque")[KNEE] > 1.2 * healthy.joints("Torque")[KNEE] > 0.0
+        walker.run(400)
+        assert CROUCHED[KNEE] - emulator.body.position[KNEE] < 0.9 * sag
+
+    def test_over_temperature(self, world: Make) -> None:
+        walker, emulator = world(Fault("over_temperature", "LEFT_SK", BEGIN, 20, degrees=130.0), cycles=BEGIN + 1)
+        assert walker.joints("Temperature")[KNEE] == 130.0
+        assert walker.states[-1][KNEE] == DriveState.FAULT_REACTION_ACTIVE
+        assert walker.value("LEFT_SK_EMCY", "ErrorCode") == 0x4310
+        before = emulator.body.position[KNEE]
+        walker.run(150)
+        assert emulator.body.position[KNEE] < before - 0.005  # sinks
+        assert np.abs(emulator.body.velocity).max() < 0.4  # slowly
+
+    def test_heat_ramp(self, world: Make) -> None:
+        walker, _ = world(Fault("heat_ramp", "LEFT_SK", BEGIN, rate=1000.0, up_to=110.0), cycles=BEGIN + 40)
+        assert walker.joints("Temperature")[KNEE] == pytest.approx(25.0 + 40.0, abs=1.0)
+        walker.run(60)
+        assert walker.joints("Temperature")[KNEE] == 110.0
+        assert walker.states[-1][KNEE] == ENABLED
+
+    def test_reset(self, world: Make) -> None:
+        walker, _ = world(Fault("reset", "LEFT_SK", BEGIN, 40), cycles=BEGIN + 100)
+        mine = [[n for n in names if n.startswith("LEFT_SK_")] for names in walker.said]
+        assert mine[BEGIN - 1] == ["LEFT_SK_STATE"]
+        assert mine[BEGIN : BEGIN + 40] == [[]] * 40
+        assert mine[BEGIN + 40] == ["LEFT_SK_STATE", "LEFT_SK_STATUS"]
+        status = next(f for f in walker.frames[BEGIN + 40] if int(f["can_id"]) == 0x704)
+        assert (status["data"][2], status["data"][3]) == (0, 0)  # counter, BOOTUP
+        assert walker.states[BEGIN + 42][KNEE] == DriveState.SWITCH_ON_DISABLED
+        walker.run(100)
+        assert walker.value("LEFT_SK_STATUS", "NodeState") == 5
+
+    def test_reset_of_a_sensor(self, world: Make) -> None:
+        walker, _ = world(Fault("reset", "FOOT_LEFT", BEGIN, 5), cycles=BEGIN + 6)
+        assert "FOOT_LEFT_STATE" not in walker.said[BEGIN + 4]
+        assert {"FOOT_LEFT_STATE", "FOOT_LEFT_STATUS"} <= set(walker.said[BEGIN + 5])
+        assert walker.value("FOOT_LEFT_STATUS", "NodeState") == 0
+
+
+class TestEncoders:
+    def test_stuck(self, world: Make) -> None:
+        walker, emulator = world(Fault("encoder_stuck", "LEFT_SK", 0, 60), cycles=1)
+        seen = walker.joints("Position")[KNEE]
+        emulator.body.reset([angle + 0.1 for angle in CROUCHED])
+        for _ in range(58):
+            walker.run(1)
+            assert walker.joints("Position")[KNEE] == seen
+        walker.run(5)
+        assert abs(walker.joints("Position")[KNEE] - seen) > 0.05 * 100
+
+    @pytest.mark.parametrize("by", [0.02, -0.02])
+    def test_jump(self, world: Make, by: float) -> None:
+        walker, _ = world(Fault("encoder_jump", "LEFT_SK", BEGIN, 1, by=by), cycles=BEGIN)
+        before = walker.joints("Position")
+        walker.run(1)
+        moved = (walker.joints("Position") - before) / 100.0
+        assert moved[KNEE] == pytest.approx(by, abs=2e-3)
+        assert np.abs(np.delete(moved, KNEE)).max() < 2e-3
+        walker.run(1)
+        assert walker.joints("Position")[KNEE] == pytest.approx(before[KNEE], abs=0.5)
+
+    def test_drift(self, world: Make) -> None:
+        walker, emulator = world(Fault("encoder_drift", "LEFT_SK", BEGIN, rate=0.5), cycles=BEGIN + 101)
+        error = walker.joints("Position")[KNEE] / 100.0 - emulator.body.position[KNEE]
+        assert error == pytest.approx(0.5 * 100 * PERIOD, abs=2e-3)
+
+    def test_the_drives_own_hold_is_deceived_too(self, world: Make) -> None:
+        walker, emulator = world(Fault("encoder_drift", "LEFT_SK", BEGIN, rate=0.2), cycles=BEGIN)
+        before = emulator.body.position.copy()
+        walker.bus.step = None
+        for _ in range(300):
+            emulator.idle()
+        moved = emulator.body.position - before
+        assert moved[KNEE] == pytest.approx(-0.06, abs=0.01)
+
+
+class TestSupply:
+    def test_one_drive(self, world: Make) -> None:
+        walker, emulator = world(Fault("under_voltage", "LEFT_SK", BEGIN, 150, volts=30.0), cycles=BEGIN + 1)
+        assert walker.emergencies() == [(BEGIN, "LEFT_SK_EMCY")]
+        assert [s == HOLDING for s in walker.states[-1]] == [d == KNEE for d in range(12)]
+        walker.run(110)
+        assert walker.value("LEFT_SK_STATUS", "SupplyVoltage") == pytest.approx(30.0)
+        assert walker.value("LEFT_SH_STATUS", "SupplyVoltage") == pytest.approx(48.0)
+        walker.run(150)
+        assert emulator.drives.voltage == [48.0] * 12
+        assert walker.value("LEFT_SK_STATUS", "SupplyVoltage") == pytest.approx(48.0)
+
+    def test_battery_removed(self, world: Make) -> None:
+        walker, emulator = world(Fault("battery_removed", "battery", BEGIN, capacity=0.02), cycles=BEGIN)
+        volts = [48.0]
+        for _ in range(60):
+            walker.run(10)
+            volts.append(emulator.drives.voltage[0])
+        assert volts == sorted(volts, reverse=True)
+        assert volts[-1] < 20.0
+        hold, dead = [cycle for cycle, name in walker.emergencies() if name == "LEFT_SK_EMCY"]
+        assert set(walker.states[hold]) == {HOLDING}
+        assert dead - hold > 150  # cycles of hold on what is left
+        assert set(walker.states[dead]) == {DriveState.FAULT_REACTION_ACTIVE}
+
+    def test_battery_back(self, world: Make) -> None:
+        _, emulator = world(Fault("battery_removed", "battery", BEGIN, 20, capacity=0.5), cycles=BEGIN + 21)
+        assert emulator.drives.voltage == [48.0] * 12
+
+
+class TestSensors:
+    def test_invalid(self, world: Make) -> None:
+        walker, _ = world(Fault("imu_invalid", "IMU_TORSO", BEGIN, 2), cycles=BEGIN + 1)
+        raw = next(f for f in walker.frames[-1] if int(f["can_id"]) == 397)["data"][8:30].tobytes()
+        assert {raw[i : i + 2] for i in (*range(0, 14, 2), *range(16, 22, 2))} == {b"\x00\x80"}
+        row = walker.fast.codec.rows["IMU_TORSO_STATE"]
+        assert (walker.fast.check > 1).nonzero()[0].tolist() == [row]
+        walker.run(2)
+        assert walker.fast.check[row] <= 1
+
+    def test_saturated(self, world: Make) -> None:
+        walker, _ = world(Fault("imu_saturated", "IMU_PELVIS", BEGIN), cycles=BEGIN + 1)
+        assert walker.value("IMU_PELVIS_STATE", "GyroX") == pytest.approx(40.95875)
+        assert walker.value("IMU_PELVIS_STATE", "AccelZ") == pytest.approx(163.835)
+        assert walker.value("IMU_PELVIS_STATE", "QuaternionW") == pytest.approx(1.0, abs=0.2)
+        assert abs(walker.value("IMU_TORSO_STATE", "GyroX")) < 1.0
+
+    def test_frozen(self, world: Make) -> None:
+        walker, _ = world(Fault("imu_frozen", "IMU_TORSO", BEGIN, 20), cycles=BEGIN + 22)
+        payloads = [next(f for f in frames if int(f["can_id"]) == 397)["data"] for frames in walker.frames[BEGIN - 1 :]]
+        measured = [p[8:30].tobytes() for p in payloads]
+        assert len(set(measured[1:21])) == 1
+        assert len({measured[0], measured[1], measured[21]}) == 3
+        assert len({int(p[2]) for p in payloads}) == len(payloads)
+
+    def test_cell(self, world: Make) -> None:
+        walker, _ = world(Fault("cell_stuck", "FOOT_RIGHT", BEGIN, cell="RL", force=321.0), cycles=BEGIN + 2)
+        assert walker.value("FOOT_RIGHT_STATE", "RL_ForceZ") == pytest.approx(321.0)
+        assert abs(walker.value("FOOT_RIGHT_STATE", "RR_ForceZ")) < 100.0
+        assert abs(walker.value("FOOT_LEFT_STATE", "RL_ForceZ")) < 100.0
+
+
+def test_dbc_hash(world: Make, network: Network) -> None:
+    walker, _ = world(Fault("dbc_hash", "LEFT_SK", 0, 150, hash=7), cycles=140)
+    assert walker.value("LEFT_SK_STATUS", "DbcHash") == 7
+    assert walker.value("LEFT_SH_STATUS", "DbcHash") == network.hash32
+    walker.run(130)
+    assert walker.value("LEFT_SK_STATUS", "DbcHash") == network.hash32
+
+
+def test_heartbeat_lost(world: Make) -> None:
+    walker, _ = world(Fault("heartbeat_lost", "LEFT_SK"), cycles=210)
+    said = {name for names in walker.said for name in names}
+    assert "LEFT_SK_STATUS" not in said
+    assert {"LEFT_SK_STATE", "LEFT_SH_STATUS"} <= said
+
+
+class TestWire:
+    """What the drives make of a disturbed wire."""
+
+    def test_lost_command_is_told_and_ridden_through(self, world: Make) -> None:
+        walker, emulator = world(Fault("drop", "COMMAND_LEFT_LEG", BEGIN, 1), cycles=BEGIN + 5)
+        told = walker.emergencies()
+        assert {cycle for cycle, _ in told} == {BEGIN + 1}
+        assert len(told) == 6
+        assert walker.value("LEFT_SK_EMCY", "ErrorCode") == 0x8110
+        assert set(emulator.drives.state) == {ENABLED}
+
+    def test_damaged_command_is_told(self, world: Make) -> None:
+        walker, _ = world(Fault("flip", "COMMAND_RIGHT_LEG", BEGIN, 1), cycles=BEGIN + 1)
+        assert walker.value("RIGHT_SK_EMCY", "ErrorCode") == 0x8200
+        assert {name[:5] for _, name in walker.emergencies()} == {"RIGHT"}
+
+    @pytest.mark.parametrize(("lost", "state"), [(4, ENABLED), (5, HOLDING)])
+    def test_commands(self, world: Make, lost: int, state: DriveState) -> None:
+        walker, emulator = world(Fault("drop", "COMMAND_LEFT_LEG", BEGIN, lost), cycles=BEGIN + lost + 2)
+        assert set(emulator.drives.state[:6]) == {state}
+        assert set(emulator.drives.state[6:]) == {ENABLED}
+        assert walker.value("LEFT_SK_EMCY", "ErrorCode") == (0x8250 if lost == 5 else 0x8110)
+
+    @pytest.mark.parametrize(("lost", "state"), [(4, ENABLED), (5, HOLDING)])
+    @pytest.mark.parametrize("kind", ["drop", "flip"])
+    def test_sync_of_a_leg(self, world: Make, kind: str, lost: int, state: DriveState) -> None:
+        walker, emulator = world(Fault(kind, "SYNC_LEFT_LEG", BEGIN, lost), cycles=BEGIN + lost + 2)
+        assert emulator.cycle == BEGIN + lost + 2
+        assert not any(name.endswith("LEFT_SK_STATE") for names in walker.said[BEGIN : BEGIN + lost] for name in names)
+        assert set(emulator.drives.state[:6]) == {state}
+        assert set(emulator.drives.state[6:]) == {ENABLED}
+        assert lost != 5 or walker.value("LEFT_SK_EMCY", "ErrorCode") == 0x8130
+
+    @pytest.mark.parametrize(("lost", "state"), [(4, ENABLED), (5, HOLDING)])
+    @pytest.mark.parametrize("kind", ["drop", "flip"])
+    def test_every_sync(self, world: Make, kind: str, lost: int, state: DriveState) -> None:
+        faults = [
+            Fault(kind, f"SYNC_{bus}", BEGIN, lost) for bus in ("LEFT_LEG", "RIGHT_LEG", "LEFT_SENSE", "RIGHT_SENSE")
+        ]
+        walker, emulator = world(*faults, cycles=BEGIN + lost)
+        assert emulator.cycle == BEGIN + lost
+        assert not any(
+            name.endswith("_STATE") and name != "HAPTICS_STATE" for names in walker.said[BEGIN:] for name in names
+        )
+        walker.run(2)
+        assert set(emulator.drives.state) == {state}
+        assert lost != 5 or walker.value("RIGHT_SK_EMCY", "ErrorCode") == 0x8130
+
+    def test_second_sender(self, world: Make) -> None:
+        walker, emulator = world(Fault("inject", "COMMAND_LEFT_LEG", BEGIN, 1, SK_TargetTorque=100.0), cycles=BEGIN + 2)
+        assert walker.value("LEFT_SK_EMCY", "ErrorCode") == 0x8150
+        assert {cycle for cycle, _ in walker.emergencies()} == {BEGIN}
+        assert set(emulator.drives.state[:6]) == {HOLDING}
+        assert all(emulator.drives.latched[:6])
+
+    def test_a_frame_that_comes_twice_is_no_second_sender(self, world: Make) -> None:
+        walker, emulator = world(Fault("duplicate", "COMMAND_LEFT_LEG", BEGIN, 10, copies=3), cycles=BEGIN + 12)
+        assert walker.emergencies() == []
+        assert set(emulator.drives.state) == {ENABLED}
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        (
+            Fault("encoder_stuck", "IMU_TORSO"),
+            "encoder_stuck: 'IMU_TORSO' is no drive; there are LEFT_FH, .*, RIGHT_HA$",
+        ),
+        (Fault("imu_frozen", "LEFT_SK"), "imu_frozen: 'LEFT_SK' is no imu; there are IMU_TORSO, .*, IMU_RIGHT_TIBIA$"),
+        (Fault("cell_stuck", "IMU_TORSO", cell="FL"), "'IMU_TORSO' is no foot; there are FOOT_LEFT, FOOT_RIGHT$"),
+        (Fault("reset", "HAL", 0, 5), "reset: 'HAL' is no node; there are LEFT_FH, .*, PENDANT$"),
+        (Fault("battery_removed", "LEFT_SK"), "battery_removed: 'LEFT_SK' is no battery; there are battery$"),
+        (
+            Fault("under_voltage", "HAPTICS", volts=1.0),
+            "'HAPTICS' is no drive or battery; there are LEFT_FH, .*, battery$",
+        ),
+        (Fault("heartbeat_lost", "left_leg"), "heartbeat_lost: 'left_leg' is no node; there are HAL, LEFT_FH, "),
+    ],
+    ids=str,
+)
+def test_a_fault_that_fits_no_node(world: Make, fault: Fault, says: str) -> None:
+    with pytest.raises(FaultError, match=says):
+        world(fault)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "says"),
+    [
+        (
+            "leave_operation",
+            {"state": "LIMP"},
+            "leave_operation: state is one of NOT_READY_TO_SWITCH_ON, .*, not 'LIMP'",
+        ),
+        ("cell_stuck", {"cell": "FLL"}, "cell_stuck: cell is one of FL, FR, RL, RR, not 'FLL'"),
+        ("torque_weak", {}, "torque_weak: share has to be given, a number from 0 to 1"),
+        ("emergency", {"code": 0}, "emergency: code is a whole number from 1 to 65535, not 0"),
+        ("under_voltage", {"volts": -1.0}, re.escape("under_voltage: volts is a number from 0 to 60 V, not -1.0")),
+    ],
+)
+def test_what_is_valid_is_said(kind: str, options: dict, says: str) -> None:
+    with pytest.raises(FaultError, match=says):
+        Fault(kind, "LEFT_SK", **options)
+
+
+def test_one_seed_gives_one_sequence_of_bytes(world: Make) -> None:
+    faults = (
+        Fault("drop", "left_leg", 10, p=0.2),
+        Fault("flip", "IMU_TORSO", 5, p=0.5),
+        Fault("encoder_drift", "LEFT_SK", 20, rate=1.0),
+    )
+    one, again, other = (world(*faults, cycles=100, seed=seed)[0] for seed in (3, 3, 4))
+    assert [f.tobytes() for f in one.frames] == [f.tobytes() for f in again.frames]
+    assert [f.tobytes() for f in one.frames] != [f.tobytes() for f in other.frames]
