@@ -1,0 +1,96 @@
+"""Inverse dynamics in CasADi symbols against Pinocchio: torques, ground wrench, kinematics, impulses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi
+import numpy as np
+import pinocchio
+import pytest
+
+from atalante_control.generation.dynamics import STANCE_FOOT, SWING_FOOT, Chain, bodies
+from atalante_control.model import BASE_LINK, ExoskeletonParameters, Patient, links, pinocchio_model, urdf_text
+from atalante_control.stance_dynamics import stance_dynamics
+from atalante_hal.robot import JOINTS, load_robot
+
+PATIENT = Patient(91.0, 1.62, thigh_length=0.42)
+UP = np.array([0.0, 0.0, 9.81])
+
+
+@pytest.fixture(scope="module")
+def chain() -> Chain:
+    return Chain(links(ExoskeletonParameters(), Patient(75.0, 1.75)))
+
+
+def inverse_dynamics(chain: Chain) -> Any:
+    q, qd, qdd = (casadi.SX.sym(name, len(JOINTS)) for name in ("q", "qd", "qdd"))
+    torque, ground = chain.inverse_dynamics(q, qd, qdd, casadi.DM(UP), casadi.SX(3, 1))
+    return casadi.Function("inverse_dynamics", [q, qd, qdd, chain.symbols], [torque, ground.force, ground.moment])
+
+
+def states(count: int) -> np.ndarray:
+    return np.random.default_rng(4).normal(size=(count, 3, len(JOINTS))) * np.array([0.4, 1.0, 5.0])[:, None]
+
+
+@pytest.mark.parametrize("patient", [None, PATIENT, Patient(45.0, 2.0)])
+def test_torques_and_ground_wrench_are_pinocchios(chain: Chain, patient: Patient | None) -> None:
+    worn = links(ExoskeletonParameters(), patient)
+    # One set of expressions serves every patient; the empty exoskeleton has more zeros and gets its own.
+    own = chain if patient else Chain(worn)
+    function, witness = inverse_dynamics(own), stance_dynamics(load_robot(), patient)
+    for state in states(20):
+        torque, force, moment = (np.array(value).ravel() for value in function(*state, own.values(worn)))
+        expected = witness.forces(*state)
+        np.testing.assert_allclose(torque, expected.torque, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(force, expected.force, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(moment, expected.moment, rtol=1e-9, atol=1e-9)
+
+
+def test_kinematics_are_pinocchios(chain: Chain) -> None:
+    worn = links(ExoskeletonParameters(), PATIENT)
+    q, qd = casadi.SX.sym("q", len(JOINTS)), casadi.SX.sym("qd", len(JOINTS))
+    frames = chain.frames(q, qd)
+    articulated = pinocchio_model(urdf_text(worn, load_robot()))
+    model, data = articulated.model, articulated.model.createData()
+    stance, swing, pelvis = (model.getFrameId(name) for name in (STANCE_FOOT, SWING_FOOT, BASE_LINK))
+    for position, velocity, _ in states(10):
+        configuration, rate = np.zeros(model.nq), np.zeros(model.nv)
+        configuration[articulated.q], rate[articulated.v] = position, velocity
+        pinocchio.forwardKinematics(model, data, configuration, rate)
+        pinocchio.updateFramePlacements(model, data)
+        for index, frame in ((chain.swing_foot, swing), (chain.pelvis, pelvis)):
+            outcome = casadi.Function(
+                "f",
+                [q, qd, chain.symbols],
+                [frames[index].rotation, frames[index].position, frames[index].linear, frames[index].angular],
+            )(position, velocity, chain.values(worn))
+            rotation, place, linear, angular = (np.array(value) for value in outcome)
+            relative = data.oMf[stance].actInv(data.oMf[frame])
+            np.testing.assert_allclose(rotation, relative.rotation, atol=1e-12)
+            np.testing.assert_allclose(place.ravel(), relative.translation, atol=1e-12)
+            # As seen from the stance foot, which moves in this model: its twist is taken off.
+            local = pinocchio.ReferenceFrame.LOCAL
+            own = pinocchio.getFrameVelocity(model, data, frame, local)
+            carried = relative.actInv(pinocchio.getFrameVelocity(model, data, stance, local))
+            np.testing.assert_allclose(linear.ravel(), (own - carried).linear, atol=1e-12)
+            np.testing.assert_allclose(angular.ravel(), (own - carried).angular, atol=1e-12)
+
+
+def test_weight_rests_on_the_ground(chain: Chain) -> None:
+    worn = links(ExoskeletonParameters(), PATIENT)
+    still = np.zeros(len(JOINTS))
+    force = np.array(inverse_dynamics(chain)(states(1)[0, 0], still, still, chain.values(worn))[1]).ravel()
+    np.testing.assert_allclose(force, UP * sum(link.inertia.mass for link in worn), rtol=1e-12, atol=1e-9)
+
+
+def test_fixed_links_belong_to_the_body_that_carries_them() -> None:
+    worn = links(ExoskeletonParameters(), PATIENT)
+    assert len(bodies(worn)) == 1 + len(JOINTS)
+    assert sum(body.mass for body in bodies(worn)) == pytest.approx(sum(link.inertia.mass for link in worn), rel=1e-14)
+
+
+def test_a_robot_the_expressions_do_not_fit_is_refused(chain: Chain) -> None:
+    worn = links(ExoskeletonParameters(ha_axis=(1.0, 0.0, 0.0)), PATIENT)
+    with pytest.raises(ValueError, match="another topology"):
+        chain.values(worn)
