@@ -19,6 +19,7 @@ from atalante_hal.cia402 import DriveState
 from atalante_hal.frame import Frames, new_frames
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import Command, State, SupervisorState
+from atalante_tools.body import open_body
 from atalante_tools.options import Target
 from atalante_tools.outcome import Failed, FaultLatched
 from atalante_tools.pose_hold import PoseHold
@@ -28,7 +29,6 @@ from atalante_tools.rig import (
     Rig,
     Watch,
     join,
-    open_body,
     open_buses,
     open_hal,
     waiting_for,

@@ -44,20 +44,22 @@ class Answering:
 
     def __init__(self, bus: SharedBus) -> None:
         self.heard: list[list[int]] = []
+        self.pause = 0.0
         self._bus = bus
+        self._block = new_frames(8)
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
     def _run(self) -> None:
-        block = new_frames(8)
-        try:
-            while True:
-                count = self._bus.receive(block, LONG)
-                self.heard.append(block["data"][:count, 0].tolist())
-                if count and block["data"][0, 0] < 100:
-                    self._bus.send(block[:count].copy())
-        except BusDown:
-            pass
+        with pytest.raises(BusDown):
+            self._bus.serve(self._step)
+
+    def _step(self) -> None:
+        count = self._bus.receive(self._block, LONG)  # which does not wait
+        self.heard.append(self._block["data"][:count, 0].tolist())
+        time.sleep(self.pause)
+        if count and self._block["data"][0, 0] < 100:
+            self._bus.send(self._block[:count].copy())
 
     def join(self) -> None:
         self._thread.join(LONG)
@@ -86,15 +88,16 @@ def test_the_asker_hands_over_everything_at_once_and_gets_the_answer(asker: tupl
     assert answering.heard == [[cycle] * 3 + [cycle + 1] for cycle in range(50)]
 
 
-def test_who_is_not_answered_gets_nothing_as_soon_as_all_is_taken(asker: tuple[SharedBus, Answering]) -> None:
+def test_every_receive_without_frames_is_one_step_as_in_a_pair(asker: tuple[SharedBus, Answering]) -> None:
     ours, answering = asker
     block = new_frames(8)
-    assert ours.receive(block) == 0  # nothing was asked
+    assert ours.receive(block) == 0
     ours.send(frames_of(100))
     assert ours.receive(block) == 0
-    assert answering.heard == [[100]]
     ours.send(frames_of(7))
     assert ours.receive(block) == 1
+    assert ours.receive(block) == 0
+    assert answering.heard == [[], [100], [7], []]
 
 
 def test_what_does_not_fit_comes_with_the_next_receive_without_asking(asker: tuple[SharedBus, Answering]) -> None:
@@ -104,36 +107,26 @@ def test_what_does_not_fit_comes_with_the_next_receive_without_asking(asker: tup
     assert len(answering.heard) == 1
 
 
-def test_a_late_answer_wakes_the_asker_and_a_late_question_the_other(ends: tuple[SharedBus, SharedBus]) -> None:
-    """Both ends fall asleep, as on a machine with one core."""
-    ours, theirs = ends
-    ours.patience = LONG
-    block, asked = new_frames(4), new_frames(4)
-
-    def answer() -> None:
-        for _ in range(3):
-            theirs.receive(asked, LONG)
-            time.sleep(0.01)
-            theirs.send(asked[:1])
-
-    thread = threading.Thread(target=answer)
-    thread.start()
+def test_a_late_answer_wakes_the_asker_and_a_late_question_the_other(asker: tuple[SharedBus, Answering]) -> None:
+    """Both ends fall asleep, as they do on a machine with one core."""
+    ours, answering = asker
+    answering.pause = 0.01
+    block = new_frames(4)
     for cycle in range(3):
         time.sleep(0.01)
         ours.send(frames_of(cycle))
         assert ours.receive(block) == 1
         assert block["data"][0, 0] == cycle
-    thread.join(LONG)
 
 
-def test_patience_with_an_end_that_never_listens_is_limited(ends: tuple[SharedBus, SharedBus]) -> None:
+def test_patience_with_an_end_that_never_serves_is_limited(ends: tuple[SharedBus, SharedBus]) -> None:
     ours, _ = ends
     ours.patience = 0.03
     ours.send(frames_of(1))
     begun = time.monotonic()
     assert ours.receive(new_frames(1)) == 0
     assert time.monotonic() - begun >= 0.03
-    with pytest.raises(BusDown, match="nobody listens at the other end after 0 s"):
+    with pytest.raises(BusDown, match="nobody serves the other end after 0 s"):
         ours.meet(0.03)
 
 
@@ -180,16 +173,14 @@ def test_a_killed_process_at_the_other_end_is_noticed(patience: float) -> None:
     program = (
         "import sys\n"
         "from atalante_hal.bus.shared import SharedBus\n"
-        "from atalante_hal.frame import new_frames\n"
         "bus = SharedBus('other', int(sys.argv[1]), int(sys.argv[2]), 1)\n"
-        "while True: bus.receive(new_frames(1), 3600.0)\n"
+        "bus.serve(lambda: None)\n"
     )
     child = subprocess.Popen([sys.executable, "-c", program, str(memory), str(theirs)], pass_fds=(memory, theirs))
     os.close(theirs)
     bus = SharedBus("embedded", memory, bell, 0)
     bus.patience = patience
     bus.meet(LONG)
-    assert bus.receive(new_frames(1)) == 0
     child.send_signal(signal.SIGKILL)
     child.wait()
     bus.send(frames_of(1))

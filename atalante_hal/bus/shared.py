@@ -5,19 +5,21 @@ there. This relies on stores being seen in program order, as on x86-64. An end t
 letting other processes run in between, and then sleeps until the other end rings: a byte through a socket pair. The socket is
 also how each end notices that the other has died, whatever of.
 
-In lock-step one end is the asker: its `receive()` is what hands over everything it sent, and returns with the answer, or with
-nothing when the other end has taken all of it and waits for more. So the two run the same sequence of calls as the two ends of a
-`PairBus`, and the same bytes come out; only what the answering end does after its answer happens while the asker goes on.
+In lock-step one end asks and the other serves: `receive()` of the asker hands over everything it sent, lets the other end make
+one step, and returns with what that sends, or with nothing when the step is over. So the two run the same sequence of calls as
+the two ends of a `PairBus`, and the same bytes come out; only what a step does after its answer happens while the asker goes on.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import mmap
 import os
 import select
 import socket
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -26,8 +28,9 @@ from atalante_hal.bus.batch import Batches
 from atalante_hal.frame import FRAME_BYTES, Frames
 from atalante_hal.memory import anonymous_file
 
-#: 64-bit words of an end in the header, a cache line: frames sent and taken so far, and what the end is doing.
-_SENT, _TAKEN, _LISTENING, _ASLEEP, _CLOSED = range(5)
+#: 64-bit words of an end in the header, a cache line: frames sent and taken so far; steps asked for and made so far; and
+#: what the end is doing.
+_SENT, _TAKEN, _ASKED, _MADE, _SERVES, _ASLEEP, _CLOSED = range(7)
 _LINE = 8
 _HEADER_BYTES = mmap.PAGESIZE
 #: How long an end looks again and again before it sleeps [s]: longer than either end of the stack works on a cycle.
@@ -46,7 +49,7 @@ class SharedBus:
     """One end; `shared_pair()` makes both, `descriptors()` what another process makes its end of.
 
     Attributes:
-        patience: 0, or of the asker in lock-step the longest wait for an answer [s].
+        patience: longest wait of the asker in lock-step for an answer [s]; 0: this end does not ask.
     """
 
     def __init__(self, name: str, memory: int, bell: int, end: int) -> None:
@@ -107,7 +110,9 @@ class SharedBus:
             self._outgoing[: end - size] = memory[size - place :]
         self._sent = sent
         if not self.patience:
-            self._hand_over()
+            self._mine[_SENT] = sent
+            if self._peers[_ASLEEP]:
+                self._ring()
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
         """Fill `frames[:n]`, see `Bus.receive`; the asker in lock-step waits for the answer instead. Shape (m,), n <= m.
@@ -117,11 +122,8 @@ class SharedBus:
         """
         if self._closed:
             raise BusDown(f"{self.name} is closed")
-        if self._peers[_SENT] == self._taken:
-            if self.patience:
-                self._hand_over()
-            if not self._wait(self.patience or timeout):
-                return 0
+        if self._peers[_SENT] == self._taken and not (self._ask() if self.patience else self._wait(timeout)):
+            return 0
         memory = self._batches.to_fill(frames)
         place = self._taken * FRAME_BYTES % self._size
         size = min((self._peers[_SENT] - self._taken) * FRAME_BYTES, memory.nbytes)
@@ -137,19 +139,23 @@ class SharedBus:
         self._received_at = time.time_ns()
         return count
 
-    def meet(self, timeout: float) -> None:
-        """Wait until the other end listens for the first time, at most `timeout` [s].
+    def serve(self, step: Callable[[], object]) -> None:
+        """Call `step` whenever the other end asks, until this raises `BusDown`. In a step `receive` does not wait."""
+        mine, peers = self._mine, self._peers
+        mine[_SERVES] = 1
+        while True:
+            made = mine[_MADE]
+            self._until(lambda: peers[_ASKED] != made, math.inf)  # noqa: B023 - called in here alone
+            step()
+            mine[_MADE] = made + 1
+            if peers[_ASLEEP]:
+                self._ring()
 
-        Raises:
-            BusDown: it does not, or is gone; with its last words.
-        """
-        give_up = time.monotonic() + timeout
-        self._mine[_ASLEEP] = 1
-        while not self._peers[_LISTENING]:
-            if time.monotonic() > give_up:
-                raise BusDown(f"{self.name}: nobody listens at the other end after {timeout:.0f} s")
-            self._sleep(_SLEEP)
-        self._mine[_ASLEEP] = 0
+    def meet(self, timeout: float) -> None:
+        """Wait until the other end serves, at most `timeout` [s]. Raises `BusDown`: it does not, or is gone."""
+        peers = self._peers
+        if not self._until(lambda: peers[_SERVES], timeout):
+            raise BusDown(f"{self.name}: nobody serves the other end after {timeout:.0f} s")
 
     def close(self, last_words: str = "") -> None:
         """Leave the bus, with a reason for the other end if there is one; frames that were sent can still be received."""
@@ -164,53 +170,52 @@ class SharedBus:
             view.release()
         self._map.close()
 
-    def _hand_over(self) -> None:
-        self._mine[_SENT] = self._sent
-        if self._peers[_ASLEEP]:
-            self._ring()
-
     def _ring(self) -> None:
         # A full socket has bells enough, and who is gone is noticed by the next `receive`.
         with contextlib.suppress(OSError):
             self._bell.send(_BELL)
 
-    def _wait(self, limit: float) -> bool:
-        """Until there are frames to receive, at most `limit` [s]; False when there are none."""
-        mine, peers, taken = self._mine, self._peers, self._taken
-        asked = self._sent if self.patience else -1
+    def _ask(self) -> bool:
+        """Let the other end make a step; whether it sent something."""
+        peers, taken = self._peers, self._taken
+        self._mine[_SENT] = self._sent
+        self._mine[_ASKED] = asked = self._mine[_ASKED] + 1
+        if peers[_ASLEEP]:
+            self._ring()
+        # The step's frames are stored before its end.
+        self._until(lambda: peers[_SENT] != taken or peers[_MADE] == asked, self.patience)
+        return peers[_SENT] != taken
+
+    def _wait(self, timeout: float) -> bool:
+        """Whether something came within `timeout` [s]; who serves has what there is."""
+        peers, taken = self._peers, self._taken
+        return timeout > 0.0 and not self._mine[_SERVES] and self._until(lambda: peers[_SENT] != taken, timeout)
+
+    def _until(self, ready: Callable[[], object], limit: float) -> bool:
+        """Wait until `ready()`, at most `limit` [s]; whether it is. Raises `BusDown` when the other end is gone."""
         now = begun = time.monotonic()
         look = 0.0 if self._aside else _LOOK
         self._aside -= self._aside > 0
-        mine[_LISTENING] = 1
-        if peers[_ASLEEP]:
-            self._ring()  # it may be asking
-        try:
-            while True:
-                if peers[_TAKEN] == asked and peers[_LISTENING]:
-                    # It has everything and wants more: its answer, if there is one, was sent before.
-                    return peers[_SENT] != taken
-                if peers[_SENT] != taken:
-                    return True
-                if now - begun >= limit:
-                    return False
-                if peers[_CLOSED]:
-                    self._hear()
-                before = now
-                if before - begun < look:
-                    os.sched_yield()
-                    now = time.monotonic()
-                    if now - before > _CROWDED:
-                        look, self._aside = 0.0, _STEP_ASIDE
-                else:
-                    mine[_ASLEEP] = 1
-                    if peers[_SENT] == taken:
-                        self._sleep(min(_SLEEP, 1 + int(1e3 * (limit - (before - begun)))))
-                    mine[_ASLEEP] = 0
-                    now = time.monotonic()
-        finally:
-            mine[_LISTENING] = 0
+        while not ready():
+            waited = now - begun
+            if waited >= limit:
+                return False
+            if self._peers[_CLOSED]:
+                self._hear()
+            if waited < look:
+                os.sched_yield()
+                before, now = now, time.monotonic()
+                if now - before > _CROWDED:
+                    look, self._aside = 0.0, _STEP_ASIDE
+            else:
+                self._mine[_ASLEEP] = 1
+                if not ready():
+                    self._sleep(min(_SLEEP, 1e3 * (limit - waited)))
+                self._mine[_ASLEEP] = 0
+                now = time.monotonic()
+        return True
 
-    def _sleep(self, longest: int) -> None:
+    def _sleep(self, longest: float) -> None:
         """Sleep until the bell rings, at most `longest` [ms]; raises `BusDown` when the other end is gone."""
         if self._ringing.poll(longest):
             self._hear()

@@ -1,4 +1,4 @@
-"""One seed, one sequence of bytes: on the bus, whatever else the machine does."""
+"""One seed, one sequence of bytes: on the bus, whatever else the machine does, and in whatever process the robot is."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ import pytest
 from atalante_control.controller import HangConfig, HangController
 from atalante_control.gait import HANG_GAIT, load_gait
 from atalante_control.guide_shapes import SHAPES
-from atalante_emulator.body import PyBulletBody
-from atalante_emulator.emulator import Emulator
-from atalante_emulator.pendant import Operator
-from atalante_hal.bus.pair import lockstep_pair
+from atalante_emulator.faults import Fault
 from atalante_hal.frame import Frames
-from atalante_hal.hal import Hal
-from atalante_hal.loop import LockStep, run
+from atalante_tools.embedded import EmbeddedRobot
+from atalante_tools.options import Target
+from atalante_tools.rig import open_hal
 
 
 class Log:
@@ -35,18 +33,22 @@ class Log:
 
 
 @pytest.fixture
-def log_of(network, robot, urdf_text):
-    def walk(seed: int, cycles: int = 1500) -> bytes:
-        ours, theirs = lockstep_pair()
-        body = PyBulletBody(urdf_text)
-        emulator = Emulator(network, robot, body, theirs, seed=seed, operator=Operator(0.5))
-        ours.step = emulator.poll
+def log_of(network, robot):
+    def walk(seed: int, cycles: int = 1500, apart: EmbeddedRobot | None = None) -> bytes:
         controller = HangController(robot, load_gait(HANG_GAIT, robot), SHAPES["pinched"], HangConfig(startup=0.3))
         log = Log()
-        hal = Hal(network, robot, ours, controller_fields=controller.telemetry_fields, tap=log)
-        run(hal, controller, LockStep(), until=lambda state: state.cycle >= cycles)
-        assert np.ptp(hal.state.position) > 0.3
-        body.close()
+        fields = controller.telemetry_fields
+        faults = [
+            Fault("drop", "LEFT_SK_STATE", start=1100, cycles=2),
+            Fault("drop", "SYNC_RIGHT_LEG", start=1150, cycles=1),
+            Fault("drop", "COMMAND_LEFT_LEG", start=1200, cycles=2),
+        ]
+        with open_hal(
+            Target("embedded", "", lockstep=True), network=network, robot=robot, seed=seed, assistance_factor=0.5,
+            controller_fields=fields, tap=log, faults=faults, apart=apart,
+        ) as rig:  # fmt: skip
+            rig.run(controller, until=lambda state: state.cycle >= cycles)
+            assert np.ptp(rig.hal.state.position) > 0.3
         return bytes(log.data)
 
     return walk
@@ -54,6 +56,7 @@ def log_of(network, robot, urdf_text):
 
 def test_one_seed_gives_the_same_bytes_and_another_does_not(log_of):
     first = log_of(7)
-    assert len(first) > 1500 * 20 * 12
+    assert len(first) > 1400 * 20 * 12
     assert log_of(7) == first
     assert log_of(8) != first
+    assert log_of(7, apart=EmbeddedRobot()) == first

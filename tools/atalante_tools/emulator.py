@@ -45,7 +45,8 @@ def command(target: Target, seed: int, operator: bool, xi: float | None) -> None
         raise click.UsageError("--xi is what the operator sets: leave --no-operator out, or use `atalante pendant xi`")
     import atalante_dbc
     from atalante_hal.robot import load_robot
-    from atalante_tools.rig import join, open_body, open_buses
+    from atalante_tools.body import open_body
+    from atalante_tools.rig import join, open_buses
 
     network, robot = atalante_dbc.load(), load_robot()
     with stop_requested() as stop, open_body(robot) as body:

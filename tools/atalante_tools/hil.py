@@ -21,9 +21,10 @@ from atalante_hal.loop import Clock
 from atalante_hal.robot import Robot
 from atalante_hal.telemetry.can_log import CanLog
 from atalante_hal.types import Command, Controller, State, SupervisorState
+from atalante_tools.body import open_body
 from atalante_tools.options import Target
 from atalante_tools.pose_hold import PoseHold
-from atalante_tools.rig import join, open_body, open_buses
+from atalante_tools.rig import join, open_buses
 
 if TYPE_CHECKING:
     from atalante_emulator.emulator import Emulator

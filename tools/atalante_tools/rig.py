@@ -1,12 +1,11 @@
 """A HAL ready to run, whatever carries its frames: `target -> buses -> Hal`, and the emulated robot when it is embedded.
 
-There is one HAL code path: an embedded robot differs from a real one in the bus alone.
+There is one HAL code path: an embedded robot differs from a real one in the bus alone. It lives in this process, where its
+emulator can be looked into, or in one of its own, where its body moves while the HAL works; the bytes on the bus are the same.
 """
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -22,13 +21,14 @@ from atalante_hal.hal import FrameTap, Hal
 from atalante_hal.loop import LockStep, Statistics, WallClock, realtime, run
 from atalante_hal.robot import Robot, load_robot
 from atalante_hal.types import Controller, State, SupervisorState
+from atalante_tools.body import describe, open_body
+from atalante_tools.embedded import EmbeddedRobot, Order
 from atalante_tools.options import Target
 from atalante_tools.outcome import Failed, FaultLatched
 from atalante_tools.signals import StopRequest
 from atalante_tools.terminal import Progress, say
 
 if TYPE_CHECKING:
-    from atalante_emulator.body import PyBulletBody
     from atalante_emulator.emulator import Emulator
     from atalante_emulator.faults import Fault
     from atalante_emulator.pendant import Operator
@@ -40,7 +40,7 @@ LOCKSTEP_PATIENCE: Final = 2.0
 
 @dataclass
 class Rig:
-    """A HAL on its bus; `emulator` and `operator` are those of an embedded robot."""
+    """A HAL on its bus; `emulator` and `operator` are those of a robot embedded in this process."""
 
     target: Target
     hal: Hal
@@ -72,6 +72,7 @@ def open_hal(
     gait_hash: int = 0,
     tap: FrameTap | None = None,
     faults: Sequence[Fault] = (),
+    apart: EmbeddedRobot | None = None,
 ) -> Iterator[Rig]:
     """Assemble a HAL for a command and take it apart in order.
 
@@ -82,8 +83,11 @@ def open_hal(
         operator: who holds the embedded pendant; one who starts as soon as the HAL is ready unless given.
         assistance_factor, controller_fields, gait_hash, tap: see `Hal`.
         faults: of the embedded robot.
+        apart: a process that is to be the embedded robot, with an operator who starts as soon as the HAL is ready; closed in
+            the end. None: this process is.
 
     Raises:
+        ValueError: an operator of this process for a robot in another.
         FaultError: the network has no such target or signal.
         BusError, ChannelMapError: the buses cannot be opened.
         Failed: the embedded robot needs PyBullet and it is not installed.
@@ -92,9 +96,15 @@ def open_hal(
     robot = robot or load_robot()
     with ExitStack() as stack:
         emulator = None
-        if target.embedded:
+        if apart is not None:
+            stack.enter_context(apart)
+            if operator is not None:
+                raise ValueError("the operator of a robot in a process of its own is there, too: leave `operator` out")
+            apart.begin(Order(network, robot, describe(robot), pose, seed, faults))
+            bus: Bus = apart.bus
+        elif target.embedded:
             ours, theirs = lockstep_pair()
-            bus: Bus = ours
+            bus = ours
             body = stack.enter_context(open_body(robot, pose))
             from atalante_emulator.emulator import Emulator
             from atalante_emulator.pendant import Operator
@@ -116,31 +126,6 @@ def open_hal(
             tap=tap,
         )
         yield Rig(target, hal, emulator, operator if emulator else None)
-
-
-@contextmanager
-def open_body(robot: Robot, pose: Sequence[float] | None = None) -> Iterator[PyBulletBody]:
-    """The empty exoskeleton hanging from its pelvis, in PyBullet. `pose` shape (12,) [rad].
-
-    Raises:
-        Failed: PyBullet is not installed.
-    """
-    from atalante_control.model import ExoskeletonParameters, urdf
-
-    try:
-        with no_banner():
-            from atalante_emulator.body import PyBulletBody
-    except ModuleNotFoundError as error:
-        if error.name != "pybullet":
-            raise
-        raise Failed("the emulated robot needs PyBullet: type `pip install 'atalante-hal[emulator]'`") from error
-    body = PyBulletBody(urdf(ExoskeletonParameters(), robot))
-    try:
-        if pose is not None:
-            body.reset(pose)
-        yield body
-    finally:
-        body.close()
 
 
 def open_buses(network: Network, target: Target) -> dict[str, Bus]:
@@ -216,17 +201,3 @@ def waiting_for(rig: Rig) -> str:
         return f"waiting for {', '.join(missing)}" if missing else "the nodes are there"
     state = hal.state.supervisor.name
     return f"{state}: waiting for the operator, who is `atalante pendant start {target.arguments}`"
-
-
-@contextmanager
-def no_banner() -> Iterator[None]:
-    """Keep what a library's C code prints on import off the terminal."""
-    sys.stderr.flush()
-    terminal, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        yield
-    finally:
-        os.dup2(terminal, 2)
-        os.close(terminal)
-        os.close(nowhere)

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from atalante_hal.robot import Robot
     from atalante_hal.telemetry.process import TelemetryProcess
     from atalante_hal.types import State
+    from atalante_tools.embedded import EmbeddedRobot
     from atalante_tools.rig import Rig
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
@@ -109,17 +110,21 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
     from atalante_hal.robot import load_robot
 
     shapes = [tuple(SHAPES)[find(name, tuple(SHAPES), "guide shape")] for name in shapes]
-    network, robot = atalante_dbc.load(), load_robot()
-    gait = load_gait(HANG_GAIT, robot)
-    controllers = {name: HangController(robot, gait, SHAPES[name]) for name in shapes}
-    certified = {name: _announce(controller, options.xi) for name, controller in controllers.items()}
-    options.out.mkdir(parents=True, exist_ok=True)
     results: list[Result] = []
     try:
-        with stop_requested() as stop, ExitStack() as stack:
+        with ExitStack() as stack:
+            apart = _start_robot(target, stack)  # it loads what it needs while the controllers are made
+            network, robot = atalante_dbc.load(), load_robot()
+            gait = load_gait(HANG_GAIT, robot)
+            controllers = {name: HangController(robot, gait, SHAPES[name]) for name in shapes}
+            certified = {name: _announce(controller, options.xi) for name, controller in controllers.items()}
+            options.out.mkdir(parents=True, exist_ok=True)
+            stop = stack.enter_context(stop_requested())
             telemetry: TelemetryProcess | None = None
+            last = [*controllers][-1]
             for name, controller in controllers.items():
-                with _open(target, options, network, robot, controller, gait.hash32) as rig:
+                with _open(target, options, network, robot, controller, gait.hash32, apart) as rig:
+                    apart = _start_robot(target, stack) if name != last else None
                     if telemetry is None:
                         telemetry = _telemetry(target, options, rig.hal, network, gait.hash32)
                         stack.enter_context(telemetry)
@@ -199,8 +204,20 @@ def _announce(controller: HangController, xi: float) -> bool:
     return certificate.certified
 
 
+def _start_robot(target: Target, stack: ExitStack) -> EmbeddedRobot | None:
+    from atalante_tools.embedded import EmbeddedRobot
+
+    return stack.enter_context(EmbeddedRobot()) if target.embedded else None
+
+
 def _open(
-    target: Target, options: Options, network: Network, robot: Robot, controller: HangController, gait_hash: int
+    target: Target,
+    options: Options,
+    network: Network,
+    robot: Robot,
+    controller: HangController,
+    gait_hash: int,
+    apart: EmbeddedRobot | None,
 ) -> Any:
     from atalante_tools.rig import open_hal
 
@@ -212,6 +229,7 @@ def _open(
         assistance_factor=options.xi,
         controller_fields=controller.telemetry_fields,
         gait_hash=gait_hash,
+        apart=apart,
     )
 
 

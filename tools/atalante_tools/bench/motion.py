@@ -8,25 +8,21 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import cycle
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from atalante_control.controller import HangController
 from atalante_control.guide_shapes import CONSTANT
 from atalante_control.stepped import SteppedRollouts
-from atalante_hal.bus.pair import PairBus, lockstep_pair
-from atalante_hal.hal import PERIOD, Hal
-from atalante_hal.loop import LockStep, run
+from atalante_hal.hal import PERIOD
 from atalante_hal.telemetry.ring import RingWriter
 from atalante_hal.types import State, SupervisorState
 from atalante_tools.bench.measure import Effort, Measurement, require, timed
 from atalante_tools.bench.nodes import ASSISTANCE, ERROR, ERROR_RATE, walk
-from atalante_tools.rig import open_body
-
-if TYPE_CHECKING:
-    from atalante_emulator.body import LinkState, PyBulletBody, Vector, Vector3
-    from atalante_emulator.emulator import Emulator
+from atalante_tools.embedded import EmbeddedRobot
+from atalante_tools.options import EMBEDDED, Target
+from atalante_tools.rig import Rig, open_hal
 
 #: Exact flow and step-by-step integration agree within this [rad].
 AGREEMENT: Final = 1e-6
@@ -69,9 +65,11 @@ def emulator_tick(effort: Effort) -> Measurement:
     now = time.perf_counter
     ours: list[float] = []
     theirs: list[float] = []
-    with _stack() as stack:
-        poll, engine = stack.emulator.poll, stack.body.engine
-        exchange = engine.exchange
+    with _stack(None) as stack:
+        emulator = stack.rig.emulator
+        assert emulator is not None
+        poll, body, bus = emulator.poll, emulator.body, stack.rig.hal.bus
+        exchange = body.exchange  # type: ignore[attr-defined]
 
         def timed_exchange(torque: Sequence[float]) -> Any:
             began = now()
@@ -86,8 +84,8 @@ def emulator_tick(effort: Effort) -> Measurement:
             if ran:
                 ours.append(polled - begin)
 
-        engine.exchange = timed_exchange  # type: ignore[method-assign]
-        stack.bus.step = tick
+        body.exchange = timed_exchange  # type: ignore[attr-defined]
+        bus.step = tick  # type: ignore[attr-defined]
         cycles = stack.walk(effort)
         # What came before was not walking, what came after was holding.
         walked = slice(_BEFORE_WALKING, _BEFORE_WALKING + cycles)
@@ -97,7 +95,7 @@ def emulator_tick(effort: Effort) -> Measurement:
 
 def lockstep(effort: Effort) -> Measurement:
     """Wall time of a simulated second: HAL, controller, emulator, and a record into the ring every cycle."""
-    with _stack() as stack:
+    with _stack(EmbeddedRobot()) as stack:
         stack.walk(effort)
     seconds = statistics.median(stack.blocks) / (_BLOCK * PERIOD)
     return Measurement(seconds, 1.0, (f"{1.0 / seconds:.1f} times real time",))
@@ -105,14 +103,10 @@ def lockstep(effort: Effort) -> Measurement:
 
 @dataclass
 class _Stack:
-    """Everything in one process, in the air, as `atalante demo` runs it."""
+    """Everything in the air, as `atalante demo` runs it."""
 
-    hal: Hal
+    rig: Rig
     controller: HangController
-    bus: PairBus
-    emulator: Emulator
-    body: _Tap
-    pose: list[float]
     ring: RingWriter
     blocks: list[float] = field(default_factory=list)  # s, wall time of each block of walking
 
@@ -140,8 +134,8 @@ class _Stack:
                 begun = time.perf_counter()
             return walked == cycles
 
-        hal, ring = self.hal, self.ring
-        run(hal, self.controller, LockStep(), until=over, record=lambda: ring.write(hal.record))
+        hal, ring = self.rig.hal, self.ring
+        self.rig.run(self.controller, until=over, record=lambda: ring.write(hal.record))
         require(
             ring.written == _BEFORE_WALKING + cycles, f"{ring.written} records in {_BEFORE_WALKING + cycles} cycles"
         )
@@ -151,54 +145,28 @@ class _Stack:
 
     def _require_walking(self, state: State) -> None:
         """A robot that fell or hangs limp is cheaper to simulate."""
-        require(
-            state.supervisor is SupervisorState.ACTIVE, f"the robot is in {state.supervisor.name}: {self.hal.reason}"
-        )
-        desired = self.controller.telemetry[: len(state.position)]
-        error = max(np.abs(q - desired).max() for q in (state.position, self.body.position))
+        reason = self.rig.hal.reason
+        require(state.supervisor is SupervisorState.ACTIVE, f"the robot is in {state.supervisor.name}: {reason}")
+        error = np.abs(state.position - self.controller.telemetry[: len(state.position)]).max()
         require(error < POSE, f"a joint is {error:.2f} rad off the gait, more than {POSE}")
 
 
 @contextmanager
-def _stack() -> Iterator[_Stack]:
+def _stack(apart: EmbeddedRobot | None) -> Iterator[_Stack]:
+    """With the robot in a process of its own, or in this one."""
     walking = walk()
     controller = HangController(walking.robot, walking.gait, CONSTANT)
-    pose = walking.tables.q[0].tolist()
-    ours, theirs = lockstep_pair()
-    with open_body(walking.robot, pose) as engine:
-        from atalante_emulator.emulator import Emulator
-        from atalante_emulator.pendant import Operator
-
-        body = _Tap(engine)
-        emulator = Emulator(walking.network, walking.robot, body, theirs, operator=Operator(ASSISTANCE))
-        ours.step = emulator.poll
-        fields = controller.telemetry_fields
-        hal = Hal(walking.network, walking.robot, ours, controller_fields=fields, gait_hash=walking.gait.hash32)
-        with RingWriter(hal.record.nbytes) as ring:
-            yield _Stack(hal, controller, ours, emulator, body, pose, ring)
-
-
-class _Tap:
-    """A body that remembers the torques it was given."""
-
-    def __init__(self, body: PyBulletBody) -> None:
-        self.engine = body
-        self.position: Vector = body.position
-        self.velocity: Vector = body.velocity
-        self.imu: Sequence[LinkState] = body.imu
-        self.foot_rotation: Sequence[tuple[float, ...]] = body.foot_rotation
-        self.torque: Sequence[float] = ()
-
-    @property
-    def contact(self) -> Sequence[tuple[int, int, Vector3]]:
-        return self.engine.contact
-
-    def reset(self, position: Sequence[float]) -> None:
-        self.engine.reset(position)
-
-    def step(self, torque: Sequence[float]) -> None:
-        self.torque = torque
-        self.engine.step(torque)
-
-    def close(self) -> None:
-        self.engine.close()
+    with (
+        open_hal(
+            Target(EMBEDDED, "", lockstep=True),
+            network=walking.network,
+            robot=walking.robot,
+            pose=walking.tables.q[0].tolist(),
+            assistance_factor=ASSISTANCE,
+            controller_fields=controller.telemetry_fields,
+            gait_hash=walking.gait.hash32,
+            apart=apart,
+        ) as rig,
+        RingWriter(rig.hal.record.nbytes) as ring,
+    ):
+        yield _Stack(rig, controller, ring)

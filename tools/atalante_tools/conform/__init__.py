@@ -106,7 +106,7 @@ def _bench(name: str, target: Target, torque: float, patience: float) -> Iterato
     node = nodes[find(name, [node.name for node in nodes], "node")]
     if target.embedded:
         from atalante_hal.bus.pair import lockstep_pair
-        from atalante_tools.rig import open_body
+        from atalante_tools.body import open_body
 
         with open_body(robot) as body:
             from atalante_emulator.emulator import Emulator

@@ -1,0 +1,128 @@
+"""The embedded robot in a process of its own: it is there, it dies with its HAL, and its death is one sentence."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from atalante_dbc import Network
+from atalante_emulator.faults import Fault
+from atalante_emulator.pendant import Operator
+from atalante_hal.robot import Robot
+from atalante_hal.types import SupervisorState
+from atalante_tools.embedded import EmbeddedRobot
+from atalante_tools.options import Target
+from atalante_tools.outcome import Failed
+from atalante_tools.pose_hold import PoseHold
+from atalante_tools.rig import Watch, open_hal
+from atalante_tools.signals import StopRequest
+
+EMBEDDED = Target("embedded", "", lockstep=True)
+LONG = 60.0
+
+
+def gone(pid: int) -> bool:
+    """Whether a process has ended, and been seen off or is nobody's any more."""
+    give_up = time.monotonic() + LONG
+    while time.monotonic() < give_up:
+        stat = Path(f"/proc/{pid}/stat")
+        if not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] == "Z":
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def gone_now(pid: int) -> bool:
+    return not Path(f"/proc/{pid}").exists()
+
+
+def test_a_robot_apart_becomes_active_and_is_gone_afterwards(network: Network, robot: Robot) -> None:
+    apart = EmbeddedRobot()
+    fields = PoseHold.telemetry_fields
+    with open_hal(EMBEDDED, network=network, robot=robot, controller_fields=fields, apart=apart) as rig:
+        assert rig.emulator is None
+        assert rig.operator is None
+        assert not gone_now(apart.pid)
+        controller = PoseHold(robot)
+        watch = Watch(rig, StopRequest(), lambda state: controller.elapsed >= 0.02, lambda state: "")
+        rig.run(controller, until=watch)
+        watch.conclude()
+        assert rig.hal.state.supervisor is SupervisorState.HOLD
+    assert gone_now(apart.pid)
+
+
+def test_a_killed_robot_ends_the_run_in_one_sentence(network: Network, robot: Robot) -> None:
+    apart = EmbeddedRobot()
+    fields = PoseHold.telemetry_fields
+    with open_hal(EMBEDDED, network=network, robot=robot, controller_fields=fields, apart=apart) as rig:
+        controller = PoseHold(robot)
+
+        def kill(state: object) -> bool:
+            if rig.hal.state.cycle == 400:
+                os.kill(apart.pid, signal.SIGKILL)
+            return False
+
+        watch = Watch(rig, StopRequest(), kill, lambda state: "")
+        rig.run(controller, until=watch)
+        with pytest.raises(Failed, match="embedded: the other end is gone"):
+            watch.conclude()
+
+
+def test_a_robot_that_cannot_be_made_says_why(network: Network, robot: Robot) -> None:
+    wrong = [0.0] * 11
+    with (
+        pytest.raises(Failed, match=r"^embedded: the robot's process failed with ValueError: "),
+        open_hal(EMBEDDED, network=network, robot=robot, pose=wrong, apart=EmbeddedRobot()),
+    ):
+        raise AssertionError("made")
+
+
+def test_an_operator_of_this_process_is_refused(network: Network, robot: Robot) -> None:
+    apart = EmbeddedRobot()
+    with (
+        pytest.raises(ValueError, match="the operator of a robot in a process of its own is there, too"),
+        open_hal(EMBEDDED, network=network, robot=robot, operator=Operator(), apart=apart),
+    ):
+        raise AssertionError("made")
+    assert gone_now(apart.pid)
+
+
+def test_faults_reach_it(network: Network, robot: Robot) -> None:
+    lost = Fault("drop", "LEFT_SK_STATE", start=150, cycles=3)
+    with open_hal(EMBEDDED, network=network, robot=robot, faults=[lost], apart=EmbeddedRobot()) as rig:
+        row = rig.hal.messages.index("LEFT_SK_STATE")
+        ages = []
+        for _ in range(160):
+            rig.hal.read()
+            rig.hal.hold()
+            ages.append(int(rig.hal.state.age[row]))
+    assert ages[149:156] == [0, 1, 2, 3, 0, 0, 0]
+
+
+@pytest.mark.parametrize("begun", [True, False])
+def test_it_ends_when_its_hal_is_killed(begun: bool) -> None:
+    program = (
+        "from atalante_tools.embedded import EmbeddedRobot\n"
+        "from atalante_tools.options import Target\n"
+        "from atalante_tools.rig import open_hal\n"
+        "apart = EmbeddedRobot()\n"
+        "print(apart.pid, flush=True)\n"
+        f"if not {begun}: import time; time.sleep(3600)\n"
+        "with open_hal(Target('embedded', '', lockstep=True), apart=apart) as rig:\n"
+        "    rig.hal.read()\n"
+        "    print('walking', flush=True)\n"
+        "    while True: rig.hal.read(); rig.hal.hold()\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as hal:
+        assert hal.stdout is not None
+        pid = int(hal.stdout.readline())
+        if begun:
+            assert hal.stdout.readline() == "walking\n"
+        hal.kill()
+    assert gone(pid)

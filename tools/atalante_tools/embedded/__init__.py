@@ -1,0 +1,114 @@
+"""The embedded robot in a process of its own, so that its body moves while the HAL and the controller work.
+
+    HAL <- SharedBus -> python -m atalante_tools.embedded: emulator -> body
+
+The child is a fresh interpreter, in a process group of its own: the terminal's Ctrl-C goes to the loop, which ends in HOLD and
+then closes the bus. Whichever side dies, the other notices by the bus, and nothing is left behind.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+from atalante_dbc import Network
+from atalante_hal.bus import BusDown
+from atalante_hal.bus.shared import SharedBus, descriptors
+from atalante_hal.robot import Robot
+from atalante_tools.body import require_engine
+from atalante_tools.outcome import Failed
+
+if TYPE_CHECKING:
+    from atalante_emulator.faults import Fault
+
+#: Longest wait for an answer to a SYNC, until the robot is there, and until it has gone [s].
+_PATIENCE, _START, _END = 2.0, 60.0, 5.0
+
+
+@dataclass(frozen=True)
+class Order:
+    """The robot that is wanted."""
+
+    network: Network
+    robot: Robot
+    urdf: str
+    pose: Sequence[float] | None  # rad, shape (12,)
+    seed: int
+    faults: Sequence[Fault]
+
+
+class EmbeddedRobot:
+    """The child, and `bus`, the HAL's end of the bus to it; as a context manager it is there for the block.
+
+    Starting it early is worth while: until `begin` it loads what it needs.
+    """
+
+    def __init__(self) -> None:
+        """Start the child.
+
+        Raises:
+            Failed: PyBullet is not installed.
+        """
+        require_engine()
+        memory, ours, theirs = descriptors()
+        self._child = subprocess.Popen(
+            [sys.executable, "-P", "-m", "atalante_tools.embedded", str(memory), str(theirs)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            pass_fds=(memory, theirs),
+            process_group=0,
+        )
+        self._begun = False
+        os.close(theirs)  # or its end would stay open when it dies
+        self.bus = SharedBus("embedded", memory, ours, 0)
+        self.bus.patience = _PATIENCE
+
+    @property
+    def pid(self) -> int:
+        """Of the child."""
+        return self._child.pid
+
+    def begin(self, order: Order) -> None:
+        """Make the robot.
+
+        Raises:
+            Failed: it cannot be made; the message says why.
+        """
+        pipe = self._child.stdin
+        assert pipe is not None
+        self._begun = True
+        # Should the child have died, the bus says so.
+        with suppress(BrokenPipeError), pipe:
+            pickle.dump(order, pipe)
+        try:
+            self.bus.meet(_START)
+        except BusDown as error:
+            raise Failed(str(error)) from error
+
+    def close(self) -> None:
+        """Close the bus and see the child off; a second call does nothing."""
+        self.bus.close()
+        if not self._begun:
+            self._child.kill()  # it is of no use, and nobody waits until it has loaded everything
+        try:
+            self._child.wait(_END)
+        except subprocess.TimeoutExpired:
+            self._child.kill()
+            self._child.wait()
+        if self._child.stdin is not None:
+            self._child.stdin.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
