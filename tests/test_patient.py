@@ -128,6 +128,11 @@ def test_the_text_has_every_digit() -> None:
     np.testing.assert_allclose(root.lever, pelvis.centre, rtol=1e-15, atol=1e-15)
 
 
+def test_a_number_of_numpy_is_written_as_a_number() -> None:
+    numpy = Patient(np.float64(71.3), np.float64(1.777))
+    assert urdf(EMPTY, ROBOT, numpy) == urdf(EMPTY, ROBOT, Patient(71.3, 1.777))
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [

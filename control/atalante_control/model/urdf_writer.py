@@ -33,17 +33,21 @@ def urdf_text(bodies: Sequence[Link], robot: Robot) -> str:
 
 
 def _numbers(values: Sequence[float]) -> str:
-    return " ".join(repr(value + 0.0) for value in values)  # + 0.0: no negative zero in the text
+    return " ".join(map(_number, values))
+
+
+def _number(value: float) -> str:
+    return repr(float(value) + 0.0)  # every digit; + 0.0: no negative zero; float: a scalar of numpy prints its type
 
 
 def _link_xml(link: Link) -> list[str]:
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    tensor = " ".join(f'{name}="{value + 0.0!r}"' for name, value in zip(names, link.inertia.tensor, strict=True))
+    tensor = " ".join(f'{name}="{_number(value)}"' for name, value in zip(names, link.inertia.tensor, strict=True))
     lines = [
         f'  <link name="{link.name}">',
         "    <inertial>",
         f'      <origin xyz="{_numbers(link.inertia.centre)}"/>',
-        f'      <mass value="{link.inertia.mass!r}"/>',
+        f'      <mass value="{_number(link.inertia.mass)}"/>',
         f"      <inertia {tensor}/>",
         "    </inertial>",
     ]
@@ -55,7 +59,7 @@ def _link_xml(link: Link) -> list[str]:
             "    </visual>",
         ]
     if link.pad:
-        lines.append(f'    <collision><geometry><sphere radius="{link.pad!r}"/></geometry></collision>')
+        lines.append(f'    <collision><geometry><sphere radius="{_number(link.pad)}"/></geometry></collision>')
     return [*lines, "  </link>"]
 
 
@@ -65,14 +69,14 @@ def _joint_xml(link: Link, robot: Robot) -> list[str]:
         f'  <joint name="{link.joint or link.name + "_mount"}" type="{kind}">',
         f'    <parent link="{link.parent}"/>',
         f'    <child link="{link.name}"/>',
-        f'    <origin xyz="{_numbers(link.origin)}" rpy="0.0 0.0 {link.yaw + 0.0!r}"/>',
+        f'    <origin xyz="{_numbers(link.origin)}" rpy="0.0 0.0 {_number(link.yaw)}"/>',
     ]
     if link.joint:
         row = JOINTS.index(link.joint)
-        low, high = float(robot.position_min[row]), float(robot.position_max[row])
-        effort, speed = float(robot.torque_max[row]), float(robot.velocity_max[row])
+        low, high = _number(robot.position_min[row]), _number(robot.position_max[row])
+        effort, speed = _number(robot.torque_max[row]), _number(robot.velocity_max[row])
         lines += [
             f'    <axis xyz="{_numbers(link.axis)}"/>',
-            f'    <limit lower="{low!r}" upper="{high!r}" effort="{effort!r}" velocity="{speed!r}"/>',
+            f'    <limit lower="{low}" upper="{high}" effort="{effort}" velocity="{speed}"/>',
         ]
     return [*lines, "  </joint>"]
