@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import builtins
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from atalante_hal.frame import Frames
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Command, Controller, State, Vector
 from atalante_tools.faults.scenario import Host
+
+#: The joint that is shaken: heavy enough to stay where it is.
+_HIP: Final = np.array([joint == "left_SH" for joint in JOINTS], np.float64)
 
 
 class Moment:
@@ -37,7 +40,7 @@ class Moment:
 
 
 class DisturbedController:
-    """A controller whose faults are `raise`, `raise_in_reset`, `ask` and `shape`."""
+    """A controller whose faults are `raise`, `raise_in_reset`, `ask`, `shake` and `shape`."""
 
     def __init__(self, controller: Controller, now: Moment) -> None:
         self._controller, self._now = controller, now
@@ -57,9 +60,11 @@ class DisturbedController:
         """As the controller, or raise, or ask for something else."""
         command = self._controller.update(state)
         self._raise(self._now.of("raise"))
-        wrong = self._now.of("ask", "shape")
+        wrong = self._now.of("ask", "shake", "shape")
         if wrong is None:
             return command
+        if wrong.kind == "shake":
+            return Command(command.torque + _HIP * float(wrong.value) * (-1.0) ** state.cycle, command.vibration)
         if wrong.kind == "shape":
             return Command(np.zeros(int(wrong.value)), command.vibration)
         return Command(np.full(len(JOINTS), float(wrong.value)), command.vibration)

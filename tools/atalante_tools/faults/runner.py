@@ -106,7 +106,7 @@ class _Run:
         for one in case.happens:
             if isinstance(one, Press):
                 self.presses[moment + one.start].append(one.kind)
-        self._faults = [starting(one, moment - 1 + one.start) for one in case.happens if isinstance(one, Fault)]
+        self._faults = [one.starting(moment - 1 + one.start) for one in case.happens if isinstance(one, Fault)]
         self._moment = Moment([one for one in case.happens if isinstance(one, Host)], moment)
         self._witness = Witness()
         self._seen: list[_Seen] = []
@@ -203,8 +203,3 @@ class _Seen(NamedTuple):
             hal.state.age.copy(),
             max(abs(hip) - hip_bound, abs(knee) - knee_bound),
         )
-
-
-def starting(fault: Fault, cycle: int) -> Fault:
-    """The same fault from another cycle on."""
-    return Fault(fault.kind, fault.target, cycle, fault.cycles, **dict(fault.parameters))

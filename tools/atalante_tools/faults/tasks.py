@@ -16,7 +16,7 @@ from typing import Final
 from atalante_emulator.faults import Fault
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.matrix import load_matrix
-from atalante_tools.faults.runner import observe, starting
+from atalante_tools.faults.runner import observe
 from atalante_tools.faults.scenario import Case, Happening
 from atalante_tools.faults.verdict import WALKING, Expectation, Verdict, improved, judge, uncontrolled
 
@@ -168,7 +168,7 @@ def _lasting(one: Happening, cycles: int) -> Happening:
 
 def _shifted(one: Happening, cycles: int) -> Happening:
     """The same, later."""
-    return starting(one, one.start + cycles) if isinstance(one, Fault) else replace(one, start=one.start + cycles)
+    return one.starting(one.start + cycles) if isinstance(one, Fault) else replace(one, start=one.start + cycles)
 
 
 def _crash(error: Exception) -> str:
