@@ -28,8 +28,8 @@ from atalante_hal.robot import SIDES, Robot
 
 Vector = npt.NDArray[np.float64]
 
-#: The foot that stands in the step a `Gait` describes.
-STANCE_FOOT = f"{SIDES[1]}_{LEG_LINKS['HA']}"
+#: The foot that stands in the step a `Gait` describes, and the one that swings.
+STANCE_FOOT, SWING_FOOT = (f"{side}_{LEG_LINKS['HA']}" for side in reversed(SIDES))
 #: Phases a feedforward is fitted at; its control points are eight.
 _SAMPLES = 33
 
@@ -59,7 +59,7 @@ class StanceDynamics:
         self._gravity = Gravity(pinocchio_model(empty))
         self._floating, self._fixed = pinocchio_model(urdf_text, fixed_base=False), pinocchio_model(urdf_text)
         self._data: tuple[Any, Any] = (self._floating.model.createData(), self._fixed.model.createData())
-        self._foot = self._fixed.model.getFrameId(STANCE_FOOT)
+        self._foot, self._swing_foot = (self._fixed.model.getFrameId(name) for name in (STANCE_FOOT, SWING_FOOT))
         pinocchio.forwardKinematics(self._fixed.model, self._data[1], pinocchio.neutral(self._fixed.model))
         pinocchio.updateFramePlacement(self._fixed.model, self._data[1], self._foot)
         #: The feet toe out and stand flat: the pelvis at the zero pose looks along the walking direction.
@@ -91,6 +91,17 @@ class StanceDynamics:
         torque = demanded[floating.v] - (jacobian.T @ demanded[:6])[fixed.v]
         x, y, z, w = full_q[3:7].tolist()
         return GroundForces(torque, on_foot.linear.copy(), on_foot.angular.copy(), (w, x, y, z))
+
+    def swing_foot(self, position: Vector) -> Any:
+        """Pose of the left foot in the frame of the right one, a `pinocchio.SE3` [m]. Shape (12,) [rad]."""
+        fixed, data = self._fixed, self._data[1]
+        q = np.zeros(fixed.model.nq)
+        q[fixed.q] = position
+        pinocchio.forwardKinematics(fixed.model, data, q)
+        stance, swing = (
+            pinocchio.updateFramePlacement(fixed.model, data, foot) for foot in (self._foot, self._swing_foot)
+        )
+        return stance.actInv(swing)
 
     def torques(self, q: Vector, qd: Vector, qdd: Vector) -> Vector:
         """Joint torques along a motion. Shapes (n, 12) [rad, rad/s, rad/s2] to (n, 12) [Nm]."""

@@ -1,8 +1,8 @@
 """A library of gaits over a grid of subjects: resumable, fanned out over processes or a cluster, nothing silently missing.
 
-`Grid, solve -> rings around the centre -> one file a gait -> fit`. Every gait but the centre's is warm-started from its
-neighbour one step nearer to the centre, so the whole library follows one local minimum, and what a gait is started from
-depends on the grid alone: not on how many processes there are, nor on how often the work was interrupted.
+`Grid, solve -> one file a gait -> fit`. Every gait is solved cold, so it depends on nothing but its own parameters: not on
+its neighbours, the number of processes or how often the work was interrupted. That the neighbours follow one local minimum
+all the same is what the fit shows.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields
 from itertools import pairwise, product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import joblib
 
 from atalante_control.gait import Gait, load_gait, write_gait
+from atalante_control.generation.solve import solve
 from atalante_control.generation.solved import SolvedGait
 from atalante_control.model import Patient
 from atalante_control.subject import Subject
@@ -27,8 +28,8 @@ FORMAT = "atalante-library/1"
 LEVELS_MIN = 3  # an axis: with two, a fit is off by 10 degrees between them
 
 Index = tuple[int, ...]
-#: A solver, warm-started from a gait or cold; it has to be a function of a module, for other processes to find it.
-Solve = Callable[[Subject, Gait | None], SolvedGait]
+#: What solves one gait; a function of a module, for other processes to find it.
+Solve = Callable[[Subject], SolvedGait]
 
 
 class LibraryError(ValueError):
@@ -74,32 +75,9 @@ class Grid:
         mass, height, length, duration = (levels[i] for levels, i in zip(self.axes(), index, strict=True))
         return Subject(Patient(mass, height), length, duration)
 
-    def rings(self) -> Iterator[list[Index]]:
-        """All points by their distance from the centre; what a point is started from lies in the ring before."""
-        points = sorted(product(*map(range, self.shape)), key=self._distance)
-        while points:
-            ring = [point for point in points if self._distance(point) == self._distance(points[0])]
-            yield ring
-            points = points[len(ring) :]
-
-    def nearer(self, index: Index) -> Index | None:
-        """The neighbour one step nearer to the centre, along the axis it is farthest on; None for the centre."""
-        offsets = [i - n // 2 for i, n in zip(index, self.shape, strict=True)]
-        farthest = max(range(len(offsets)), key=lambda axis: abs(offsets[axis]))
-        if not offsets[farthest]:
-            return None
-        step = 1 if offsets[farthest] < 0 else -1
-        return tuple(i + step * (axis == farthest) for axis, i in enumerate(index))
-
-    def _distance(self, index: Index) -> int:
-        return sum(abs(i - n // 2) for i, n in zip(index, self.shape, strict=True))
-
-
-class Failure(NamedTuple):
-    """A point of the grid that has no gait."""
-
-    subject: Subject
-    status: str
+    def points(self) -> list[Index]:
+        """Every point of the grid."""
+        return list(product(*map(range, self.shape)))
 
 
 class Library:
@@ -137,33 +115,30 @@ class Library:
 
     def gaits(self, robot: Robot) -> dict[Index, Gait]:
         """Every gait there is. Raises `GaitError`."""
-        found = ((index, self.gait(index, robot)) for index in self._points())
+        found = ((index, self.gait(index, robot)) for index in self.grid.points())
         return {index: gait for index, gait in found if gait is not None}
 
-    def failures(self) -> list[Failure]:
-        """Every point whose last attempt failed."""
-        failed = ((index, self._path("failed", index)) for index in self._points())
-        return [
-            Failure(self.grid.subject(index), json.loads(path.read_text(encoding="utf-8"))["status"])
+    def failures(self) -> dict[Index, str]:
+        """Why the last attempt failed, of every point where it did."""
+        failed = ((index, self._path("failed", index)) for index in self.grid.points())
+        return {
+            index: str(json.loads(path.read_text(encoding="utf-8"))["status"])
             for index, path in failed
             if path.exists()
-        ]
+        }
 
     def missing(self) -> list[Index]:
-        """Points without a gait, failed or not yet tried, from the centre outwards."""
-        return [index for index in self._points() if not self._path("gaits", index).exists()]
+        """Points without a gait, failed or not yet tried."""
+        return [index for index in self.grid.points() if not self._path("gaits", index).exists()]
 
     def generate(
-        self, solve: Solve, robot: Robot, *, jobs: int = 1, cluster: str | None = None
+        self, solve: Solve, *, jobs: int = 1, cluster: str | None = None
     ) -> Iterator[tuple[Subject, SolvedGait]]:
-        """Solve what is missing, and hand out each result once it is on the disk.
+        """Solve what is missing, and tell of each point once it is on the disk.
 
         Args:
             jobs: processes on this machine.
             cluster: address of a dask scheduler whose workers solve instead.
-
-        Raises:
-            GaitError: a gait on the disk that a neighbour is to be started from is not a gait.
         """
         with ExitStack() as stack:
             if cluster is not None:
@@ -171,17 +146,11 @@ class Library:
 
                 stack.enter_context(Client(cluster))  # type: ignore[no-untyped-call]
                 stack.enter_context(joblib.parallel_config(backend="dask"))
-            parallel = stack.enter_context(joblib.Parallel(n_jobs=jobs, return_as="generator_unordered"))
-            missing = set(self.missing())
-            for ring in self.grid.rings():
-                tasks = [(index, self._start(index, robot)) for index in ring if index in missing]
-                results = parallel(joblib.delayed(_solve)(solve, self.grid.subject(i), i, warm) for i, warm in tasks)
-                for index, solved in results:
-                    self._keep(index, solved)
-                    yield self.grid.subject(index), solved
-
-    def _points(self) -> list[Index]:
-        return [index for ring in self.grid.rings() for index in ring]
+            parallel = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
+            tasks = (joblib.delayed(_solve)(solve, index, self.grid.subject(index)) for index in self.missing())
+            for index, solved in parallel(tasks):
+                self._keep(index, solved)
+                yield self.grid.subject(index), solved
 
     def _path(self, kind: str, index: Index) -> Path:
         levels = (axis[i] for axis, i in zip(self.grid.axes(), index, strict=True))
@@ -191,29 +160,23 @@ class Library:
             / ("_".join(f"{letter}{v:g}" for letter, v in zip("mhld", levels, strict=True)) + ".json")
         )
 
-    def _start(self, index: Index, robot: Robot) -> Gait | None:
-        """Gait of the nearest solved point on the way to the centre."""
-        toward = self.grid.nearer(index)
-        while toward is not None:
-            gait = self.gait(toward, robot)
-            if gait is not None:
-                return gait
-            toward = self.grid.nearer(toward)
-        return None
-
     def _keep(self, index: Index, solved: SolvedGait) -> None:
         failed = self._path("failed", index)
         if solved.solved:
             write_gait(solved.gait, self._path("gaits", index))
             failed.unlink(missing_ok=True)
         else:
-            record: dict[str, Any] = {"status": solved.status, "parameters": dict(solved.gait.parameters)}
-            record["solver"] = dict(solved.gait.solver)
-            failed.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+            record = {"parameters": dict(solved.gait.parameters), "solver": dict(solved.gait.solver)}
+            failed.write_text(json.dumps({"status": solved.status, **record}, indent=1) + "\n", encoding="utf-8")
 
 
-def _solve(solve: Solve, subject: Subject, index: Index, warm: Gait | None) -> tuple[Index, SolvedGait]:
-    return index, solve(subject, warm)
+def solve_subject(subject: Subject) -> SolvedGait:
+    """The gait of a subject, by compiled functions, cold."""
+    return solve(subject, machine_code=True)
+
+
+def _solve(solve: Solve, index: Index, subject: Subject) -> tuple[Index, SolvedGait]:
+    return index, solve(subject)
 
 
 def _read_grid(path: Path) -> Grid:
