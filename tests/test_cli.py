@@ -20,6 +20,7 @@ from atalante_hal.bus import BusAbsent, BusDown, BusError, BusFull
 from atalante_hal.bus.channel_map import ChannelMapError
 from atalante_hal.bus.replay import LogUnreadable
 from atalante_hal.robot import RobotError
+from atalante_hal.telemetry.access import AccessError
 from atalante_hal.telemetry.process import TelemetryError
 from atalante_hal.telemetry.ring import RingError
 from atalante_hal.telemetry.sink import SinkError
@@ -122,6 +123,7 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Any:
         (DbcError("atalante.dbc:14: no unit"), 1),
         (RobotError("robot.toml: joints.FH is missing"), 1),
         (GaitError("hang.json: duration is missing"), 1),
+        (AccessError("telemetry.toml: listne is unknown"), 1),
         (TelemetryError("the recorder is gone"), 1),
         (RingError("no such ring"), 1),
         (SinkError("RECORD_STOPPED", "the disk is full"), 1),

@@ -123,7 +123,7 @@ def _open_publisher(config: TelemetryConfig, streams: list[tuple[str, str]]) -> 
         from atalante_hal.telemetry.publisher import Publisher
     except ImportError as error:
         raise SinkError("TELEMETRY_DOWN", f"{error.name} is missing: {_INSTALL}") from error
-    return Publisher(config.robot, streams, config.listen)
+    return Publisher(config.robot, streams, config.listen, config.access)
 
 
 def _say(line: dict[str, Any]) -> None:

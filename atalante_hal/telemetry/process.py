@@ -23,6 +23,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from atalante_hal.telemetry.access import Access, AccessError
 from atalante_hal.telemetry.events import EVENT_BYTES, EVENT_SLOTS, Event, pack
 from atalante_hal.telemetry.frames import FRAME_RECORD, RingTap, Stamps
 from atalante_hal.telemetry.layout import Layout
@@ -36,6 +37,10 @@ RUN_GAP_NS = 1_000_000_000
 
 #: For the child to leave its Zenoh session after it has said what became of its files [s].
 _LAST_WORDS = 2.0
+
+
+#: Fields of the configuration that are files.
+_PATHS = ("recording", "can_log", "certificate", "private_key", "client_ca", "users")
 
 
 class TelemetryError(RuntimeError):
@@ -57,6 +62,10 @@ class TelemetryConfig:
     lock_step: bool = False  # virtual time; the loop waits for a recorder that asked for everything
     slots: int = 1024  # records a ring holds: cycles that telemetry may be late
     patience: float = 5.0  # s, longest wait of the loop for a recorder in lock-step, once
+    certificate: Path | None = None  # these four: see `access.Access`
+    private_key: Path | None = None
+    client_ca: Path | None = None
+    users: Path | None = None
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9_-]+", self.robot):
@@ -68,6 +77,17 @@ class TelemetryConfig:
                     f"{name.replace('_', ' ')} {rate} Hz is not valid; it must divide {CYCLES_PER_SECOND}, "
                     "as 1, 10, 50, 100, 200, 250, 500 and 1000 do"
                 )
+        try:
+            access = self.access
+            if self.listen is not None:
+                access.check_endpoint(self.listen)
+        except AccessError as error:
+            raise TelemetryError(str(error)) from error
+
+    @property
+    def access(self) -> Access:
+        """Who may subscribe."""
+        return Access(self.certificate, self.private_key, self.client_ca, self.users)
 
     @property
     def every_cycle(self) -> bool:
@@ -81,7 +101,7 @@ class TelemetryConfig:
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> TelemetryConfig:
         """The inverse of `to_json`."""
-        paths = {name: Path(values[name]) for name in ("recording", "can_log") if values[name] is not None}
+        paths = {name: Path(values[name]) for name in _PATHS if values[name] is not None}
         return cls(**{**values, **paths})
 
 

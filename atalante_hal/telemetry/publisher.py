@@ -20,6 +20,7 @@ from typing import Any, Self
 import zenoh
 import zenoh.ext
 
+from atalante_hal.telemetry.access import Access
 from atalante_hal.telemetry.schema import encoding
 from atalante_hal.telemetry.sink import EVENTS, SinkError
 
@@ -28,7 +29,8 @@ DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 7447
 PORTS_TRIED = 16
 #: Events that a late subscriber can still ask for.
 EVENTS_KEPT = 256
-
+#: Everybody who reaches the endpoint may listen.
+OPEN = Access()
 
 _log = logging.getLogger(__name__)
 
@@ -40,15 +42,18 @@ class Publisher:
         robot: name of the robot, one chunk of the keys.
         streams: (key, message type) of each stream; the events come by themselves.
         listen: Zenoh endpoint such as tcp/127.0.0.1:7447; None takes the first free port from 7447 on the loopback.
+        access: TLS and users.
 
     Raises:
         SinkError: the endpoint cannot be listened on.
     """
 
-    def __init__(self, robot: str, streams: Iterable[tuple[str, str]], listen: str | None = None) -> None:
+    def __init__(
+        self, robot: str, streams: Iterable[tuple[str, str]], listen: str | None = None, access: Access = OPEN
+    ) -> None:
         self.messages = 0
         self._stack = ExitStack()
-        self._session, self.endpoint = _open(robot, listen)
+        self._session, self.endpoint = _open(robot, listen, access)
         self._stack.enter_context(self._session)
         self._publishers: dict[str, zenoh.Publisher | zenoh.ext.AdvancedPublisher] = {
             key: self._session.declare_publisher(
@@ -153,11 +158,11 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
     }
 
 
-def _open(robot: str, listen: str | None) -> tuple[zenoh.Session, str]:
+def _open(robot: str, listen: str | None, access: Access) -> tuple[zenoh.Session, str]:
     """A session and the endpoint it listens on."""
     if listen is not None:
         try:
-            return zenoh.open(_parsed(robot, listen)), listen
+            return zenoh.open(_parsed(robot, listen, access)), listen
         except zenoh.ZError as error:
             raise SinkError(
                 "TELEMETRY_DOWN",
@@ -165,9 +170,9 @@ def _open(robot: str, listen: str | None) -> tuple[zenoh.Session, str]:
             ) from error
     refused = ""
     for port in range(DEFAULT_PORT, DEFAULT_PORT + PORTS_TRIED):
-        endpoint = f"tcp/{DEFAULT_HOST}:{port}"
+        endpoint = f"{access.protocol}/{DEFAULT_HOST}:{port}"
         try:
-            return zenoh.open(_parsed(robot, endpoint)), endpoint
+            return zenoh.open(_parsed(robot, endpoint, access)), endpoint
         except zenoh.ZError as error:
             refused = _reason(error)
             _log.info("port %d is not free, trying the next", port)
@@ -177,8 +182,11 @@ def _open(robot: str, listen: str | None) -> tuple[zenoh.Session, str]:
     )
 
 
-def _parsed(robot: str, listen: str) -> zenoh.Config:
-    return zenoh.Config.from_json5(json.dumps(configuration(robot, listen)))
+def _parsed(robot: str, listen: str, access: Access) -> zenoh.Config:
+    config = configuration(robot, listen)
+    asked = access.transport()
+    config["transport"] |= asked | {"link": {**config["transport"]["link"], **asked["link"]}}
+    return zenoh.Config.from_json5(json.dumps(config))
 
 
 def _reason(error: zenoh.ZError) -> str:

@@ -55,6 +55,7 @@ KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_hal.bus.channel_map", "ChannelMapError", Misused),
     ("atalante_dbc", "DbcError", Failed),
     ("atalante_hal.robot", "RobotError", Failed),
+    ("atalante_hal.telemetry.access", "AccessError", Failed),
     ("atalante_hal.telemetry.process", "TelemetryError", Failed),
     ("atalante_hal.telemetry.ring", "RingError", Failed),
     ("atalante_hal.telemetry.sink", "SinkError", Failed),

@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
@@ -46,6 +46,7 @@ class Options:
     out: Path  # run folder
     record_rate: int  # Hz
     can_log: Path | None
+    telemetry: Path | None  # telemetry file: endpoint, TLS, users
 
 
 @dataclass(frozen=True)
@@ -78,14 +79,23 @@ def trial_options(steps: int, out: str) -> Callable[[_Command], _Command]:
                      help="Recorded cycles a second; 1000 is every cycle."),
         click.option("--can-log", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
                      help="Log every frame; format by suffix (.log, .asc, .blf)."),
+        click.option("--telemetry", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+                     help="Telemetry file (TOML): Zenoh endpoint, TLS certificate, users."),
     ]  # fmt: skip
 
     def decorate(command: _Command) -> _Command:
         @functools.wraps(command)
         def with_options(
-            steps: int, xi: float, seed: int, out: Path, record_rate: int, can_log: Path | None, **others: Any
+            steps: int,
+            xi: float,
+            seed: int,
+            out: Path,
+            record_rate: int,
+            can_log: Path | None,
+            telemetry: Path | None,
+            **others: Any,
         ) -> Any:
-            return command(options=Options(steps, xi, seed, out, record_rate, can_log), **others)
+            return command(options=Options(steps, xi, seed, out, record_rate, can_log, telemetry), **others)
 
         wrapped: Any = with_options
         for option in reversed([*options, json_option]):
@@ -108,8 +118,10 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
     from atalante_control.gait import HANG_GAIT, load_gait
     from atalante_control.guide_shapes import SHAPES
     from atalante_hal.robot import load_robot
+    from atalante_hal.telemetry.access import load_telemetry_file
 
     shapes = [tuple(SHAPES)[find(name, tuple(SHAPES), "guide shape")] for name in shapes]
+    outlet = load_telemetry_file(options.telemetry) if options.telemetry else {}
     results: list[Result] = []
     try:
         with ExitStack() as stack:
@@ -126,7 +138,7 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
                 with _open(target, options, network, robot, controller, gait.hash32, apart) as rig:
                     apart = _start_robot(target, stack) if name != last else None
                     if telemetry is None:
-                        telemetry = _telemetry(target, options, rig.hal, network, gait.hash32)
+                        telemetry = _telemetry(target, options, outlet, rig.hal, network, gait.hash32)
                         stack.enter_context(telemetry)
                         _tell_where(telemetry)
                     telemetry.begin_run(name, {"shape": name, "xi": options.xi, "certified": certified[name]})
@@ -233,7 +245,9 @@ def _open(
     )
 
 
-def _telemetry(target: Target, options: Options, hal: Hal, network: Network, gait_hash: int) -> TelemetryProcess:
+def _telemetry(
+    target: Target, options: Options, outlet: Mapping[str, Any], hal: Hal, network: Network, gait_hash: int
+) -> TelemetryProcess:
     from atalante_hal.supervisor import Condition
     from atalante_hal.telemetry.process import TelemetryConfig, TelemetryProcess
 
@@ -243,6 +257,7 @@ def _telemetry(target: Target, options: Options, hal: Hal, network: Network, gai
         can_log=options.can_log,
         lock_step=target.lockstep,
         slots=8192,  # 8 s: a demo runs many times faster than real time, and a recorder may pause
+        **outlet,
     )
     return TelemetryProcess(
         config,

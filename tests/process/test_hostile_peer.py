@@ -1,0 +1,90 @@
+"""F50: nothing from the network reaches control. 100,000 forged puts on every key while the robot walks change no byte."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from atalante_hal.frame import Frames
+from atalante_hal.telemetry.process import TelemetryConfig, TelemetryProcess
+from atalante_hal.types import SupervisorState
+
+PUTS = 100_000
+CYCLES = 3000  # at least; more while the stranger is still at it
+
+#: Connects, says so, and puts, deletes and asks on every key there is and on some that are not, whatever comes into its mind.
+STRANGER = """
+import json, random, sys, zenoh
+rng = random.Random(1)
+keys = [f"atalante/exo/{name}" for name in json.loads(sys.argv[2])]
+keys += ["atalante/exo/command", "atalante/command", "atalante/**/command", "atalante/**", "**", "exo/command", "hal/state"]
+payloads = [b"", b"\\0", b"x" * 1000, json.dumps({"torque": [400.0] * 12}).encode(), bytes(range(256))]
+with zenoh.open(zenoh.Config.from_json5(sys.argv[1])) as session:
+    with session.declare_subscriber("atalante/**") as subscriber:
+        subscriber.recv()
+    print("in", flush=True)
+    for number in range(int(sys.argv[3])):
+        key = rng.choice(keys)
+        kind = number % 50
+        if kind == 0:
+            session.delete(key)
+        elif kind == 1:
+            session.liveliness().declare_token("atalante/exo/command")
+        elif kind == 2:
+            session.get(key.replace("**", "x"), payload=rng.choice(payloads), timeout=0.1)
+        else:
+            session.put(key, rng.choice(payloads), encoding="application/protobuf;atalante.v1.Command")
+    print("done", flush=True)
+"""
+
+
+class Line:
+    """Every byte that passes between HAL and nodes, both ways."""
+
+    def __init__(self) -> None:
+        self.bytes: list[bytes] = []
+
+    def sent(self, frames: Frames) -> None:
+        self.bytes.append(frames.tobytes())
+
+    def received(self, frames: Frames, count: int) -> None:
+        # Behind the payload lies whatever the memory held before.
+        for frame in frames[:count]:
+            self.bytes.append(frame["can_id"].tobytes() + frame["data"][: frame["len"]].tobytes())
+
+
+def test_f50_forged_puts_on_every_key_change_no_byte_on_the_bus(make_rig: Callable[..., Any]) -> None:
+    rig = make_rig(seed=4)
+    rig.hal.tap = attacked = Line()
+    rig.until(SupervisorState.ACTIVE)
+    streams = ["joint_states", "imu", "foot_forces", "haptics", "guide", "controller", "system", "loop", "events"]
+    with TelemetryProcess(TelemetryConfig(slots=64), rig.hal.layout) as telemetry:
+        config = {
+            "mode": "client",
+            "connect": {"endpoints": [telemetry.endpoint]},
+            "scouting": {"multicast": {"enabled": False}},
+            "transport": {"shared_memory": {"enabled": False}},
+        }
+        command = [sys.executable, "-c", STRANGER, json.dumps(config), json.dumps(streams), str(PUTS)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as stranger:
+            assert stranger.stdout is not None
+            begun = rig.hal.state.cycle
+            # It has to be let in first: it waits for telemetry.
+            while stranger.poll() is None or rig.hal.state.cycle - begun < CYCLES:
+                rig.cycle()
+                telemetry.write(rig.hal.record)
+            assert stranger.stdout.read() == "in\ndone\n"
+        assert telemetry.alive
+        assert telemetry.close().published > 0
+    cycles = rig.hal.state.cycle
+    assert rig.hal.state.supervisor is SupervisorState.ACTIVE
+
+    golden = make_rig(seed=4)
+    golden.hal.tap = left_alone = Line()
+    golden.run(cycles)
+    assert golden.hal.state.supervisor is SupervisorState.ACTIVE
+    assert attacked.bytes == left_alone.bytes
+    assert rig.hal.record.tobytes() == golden.hal.record.tobytes()

@@ -1,0 +1,232 @@
+"""Who may subscribe: TLS and users on the loopback, and a telemetry file that is read strictly."""
+
+from __future__ import annotations
+
+import datetime
+import ipaddress
+import json
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from click.testing import CliRunner
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+
+from atalante_hal.telemetry.access import Access, AccessError, load_telemetry_file
+from atalante_hal.telemetry.process import TelemetryConfig, TelemetryError
+from atalante_hal.telemetry.publisher import Publisher
+from atalante_tools.cli import cli
+
+TRIES = 100  # of 50 ms
+STREAMS = [("imu", "ImuStates")]
+
+
+class Authority:
+    """Signs certificates for 127.0.0.1."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self._folder, self._name = folder, name
+        self._key = ec.generate_private_key(ec.SECP256R1())
+        self.certificate = self._write(name, self._key, self._sign(name, self._key, of_authority=True))[0]
+
+    def issue(self, name: str) -> tuple[Path, Path]:
+        """Certificate and private key, for server or client."""
+        key = ec.generate_private_key(ec.SECP256R1())
+        return self._write(name, key, self._sign(name, key, of_authority=False))
+
+    def _sign(self, name: str, key: Any, *, of_authority: bool) -> x509.Certificate:
+        now, day = datetime.datetime.now(datetime.UTC), datetime.timedelta(days=1)
+        subject, issuer = (x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, n)]) for n in (name, self._name))
+        addresses = [x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]
+        builder = x509.CertificateBuilder(
+            issuer, subject, key.public_key(), x509.random_serial_number(), now - day, now + day
+        )
+        builder = builder.add_extension(x509.BasicConstraints(ca=of_authority, path_length=None), critical=True)
+        builder = builder.add_extension(x509.SubjectAlternativeName(addresses), critical=False)
+        return builder.sign(self._key, hashes.SHA256())
+
+    def _write(self, name: str, key: Any, certificate: x509.Certificate) -> tuple[Path, Path]:
+        pem = serialization.Encoding.PEM
+        paths = self._folder / f"{name}.pem", self._folder / f"{name}.key"
+        paths[0].write_bytes(certificate.public_bytes(pem))
+        paths[1].touch(0o600)
+        paths[1].write_bytes(key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()))
+        return paths
+
+
+@pytest.fixture
+def authority(tmp_path: Path) -> Authority:
+    return Authority(tmp_path, "lab")
+
+
+@pytest.fixture
+def users(tmp_path: Path) -> Path:
+    path = tmp_path / "users.txt"
+    path.touch(0o600)
+    path.write_text("lab:secret\n")
+    return path
+
+
+def endpoint(protocol: str) -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@contextmanager
+def client(where: str, transport: dict[str, Any]) -> Iterator[zenoh.Session]:
+    config = {
+        "mode": "client",
+        "connect": {"endpoints": [where], "timeout_ms": 1500},
+        "scouting": {"multicast": {"enabled": False}},
+        "transport": {"shared_memory": {"enabled": False}, **transport},
+    }
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+        yield session
+
+
+def hears(publisher: Publisher, transport: dict[str, Any], where: str | None = None) -> bool:
+    """Whether a client with that configuration gets telemetry; it may not even be let in."""
+    try:
+        with client(where or publisher.endpoint, transport) as session, session.declare_subscriber("**") as subscriber:
+            for _ in range(TRIES):
+                publisher.put("imu", b"data", 0, 0)
+                if subscriber.try_recv() is not None:
+                    return True
+                time.sleep(0.05)
+    except zenoh.ZError:
+        pass
+    return False
+
+
+def user(name: str, password: str) -> dict[str, Any]:
+    return {"auth": {"usrpwd": {"user": name, "password": password}}}
+
+
+def trusting(authority: Authority, certificate: tuple[Path, Path] | None = None) -> dict[str, Any]:
+    tls: dict[str, Any] = {"root_ca_certificate": str(authority.certificate)}
+    if certificate:
+        files = {"connect_certificate": str(certificate[0]), "connect_private_key": str(certificate[1])}
+        tls |= {**files, "enable_mtls": True}
+    return {"link": {"tls": tls}}
+
+
+class TestLoopback:
+    def test_tls_and_a_user_let_in_who_has_both_and_nobody_else(self, authority: Authority, users: Path) -> None:
+        access = Access(*authority.issue("robot"), users=users)
+        stranger = Authority(users.parent, "stranger")
+        with Publisher("exo", STREAMS, endpoint("tls"), access) as publisher:
+            assert hears(publisher, trusting(authority) | user("lab", "secret"))
+            assert not hears(publisher, trusting(authority) | user("lab", "guess"))
+            assert not hears(publisher, trusting(authority))
+            assert not hears(publisher, trusting(stranger) | user("lab", "secret"))  # it is not the robot he knows
+            plain = publisher.endpoint.replace("tls/", "tcp/")
+            assert not hears(publisher, user("lab", "secret"), plain)
+
+    def test_with_a_client_authority_a_subscriber_needs_its_certificate(self, authority: Authority) -> None:
+        stranger = Authority(authority.certificate.parent, "stranger")
+        access = Access(*authority.issue("robot"), client_ca=authority.certificate)
+        with Publisher("exo", STREAMS, endpoint("tls"), access) as publisher:
+            assert hears(publisher, trusting(authority, authority.issue("desk")))
+            assert not hears(publisher, trusting(authority, stranger.issue("spy")))
+            assert not hears(publisher, trusting(authority))
+
+    def test_users_without_tls(self, users: Path) -> None:
+        with Publisher("exo", STREAMS, endpoint("tcp"), Access(users=users)) as publisher:
+            assert hears(publisher, user("lab", "secret"))
+            assert not hears(publisher, {})
+
+    def test_who_is_let_in_still_cannot_put(self, authority: Authority, users: Path) -> None:
+        with (
+            Publisher("exo", STREAMS, endpoint("tls"), Access(*authority.issue("robot"), users=users)) as publisher,
+            publisher._session.declare_subscriber("**", zenoh.handlers.FifoChannel(1000)) as inside,
+            client(publisher.endpoint, trusting(authority) | user("lab", "secret")) as session,
+        ):
+            for _ in range(100):
+                session.put("atalante/exo/command", b"forged")
+            list(session.get("atalante/exo/none", timeout=1.0))  # answered after what came before it
+            publisher.put("imu", b"ours", 0, 0)
+            assert {sample.payload.to_bytes() for sample in iter(inside.try_recv, None)} == {b"ours"}
+
+    def test_the_default_endpoint_speaks_tls_when_there_is_a_certificate(self, authority: Authority) -> None:
+        with Publisher("exo", STREAMS, None, Access(*authority.issue("robot"))) as publisher:
+            assert publisher.endpoint.startswith("tls/127.0.0.1:")
+
+
+class TestTelemetryFile:
+    @pytest.fixture
+    def folder(self, authority: Authority, users: Path) -> Path:
+        authority.issue("robot")
+        return users.parent
+
+    def read(self, folder: Path, text: str) -> dict[str, Any]:
+        (folder / "telemetry.toml").write_text(text)
+        return load_telemetry_file(folder / "telemetry.toml")
+
+    def test_says_what_the_configuration_needs(self, folder: Path) -> None:
+        read = self.read(
+            folder,
+            'robot = "blue"\nlisten = "tls/127.0.0.1:7448"\ncertificate = "robot.pem"\nprivate_key = "robot.key"\n'
+            'client_ca = "lab.pem"\nusers = "users.txt"\n',
+        )
+        config = TelemetryConfig(**read)
+        assert config.listen == "tls/127.0.0.1:7448"
+        assert config.access == Access(*(folder / n for n in ("robot.pem", "robot.key", "lab.pem", "users.txt")))
+        assert TelemetryConfig.from_json(json.loads(json.dumps(config.to_json()))) == config
+        assert self.read(folder, "") == {}
+
+    @pytest.mark.parametrize(
+        ("text", "said"),
+        [
+            ('lisen = "tcp/127.0.0.1:1"', "lisen is unknown; valid keys are robot, listen, certificate"),
+            ("listen = 7447", "listen is a text that is not empty, not 7447"),
+            ('users = ""', "users is a text"),
+            ('users = "nobody.txt"', "users is a file that can be read, not"),
+            ('certificate = "robot.pem"', "certificate and private_key belong together"),
+            ('private_key = "robot.key"', "certificate and private_key belong together"),
+            ('client_ca = "lab.pem"', "client_ca asks subscribers for certificates"),
+            ('listen = "tls/127.0.0.1:7447"', "listen is tcp/127.0.0.1:7447, not tls/127.0.0.1:7447"),
+            (
+                'listen = "tcp/127.0.0.1:7447"\ncertificate = "robot.pem"\nprivate_key = "robot.key"',
+                "listen is tls/127.0.0.1:7447, not tcp/127.0.0.1:7447",
+            ),
+            ('certificate = "robot.pem"\nprivate_key = "open.key"', "open.key can be read by others; type: chmod 600"),
+            ('users = "open.key"', "open.key can be read by others"),
+            ('users = "empty"', "has a line name:password for each user"),
+            ("listen", "telemetry.toml: "),
+        ],
+    )
+    def test_refuses_what_is_wrong_and_names_the_key(self, folder: Path, text: str, said: str) -> None:
+        (folder / "open.key").touch(0o644)
+        (folder / "empty").touch(0o600)
+        with pytest.raises(AccessError) as refused:
+            self.read(folder, text)
+        assert said in str(refused.value)
+        assert "\n" not in str(refused.value)
+
+    @pytest.mark.parametrize("content", ["lab", "lab:", ":secret", "lab:secret\n\nother:x"])
+    def test_refuses_users_that_are_none(self, users: Path, content: str) -> None:
+        users.write_text(content)
+        with pytest.raises(AccessError, match="name:password"):
+            Access(users=users)
+
+    def test_f54_the_command_line_refuses_it_before_anything_moves(self, folder: Path) -> None:
+        (folder / "telemetry.toml").write_text("lisen = 1")
+        arguments = ["demo", "--telemetry", str(folder / "telemetry.toml"), "--out", str(folder / "run")]
+        result = CliRunner().invoke(cli, arguments)
+        assert result.exit_code == 1
+        assert result.stderr.startswith(f"atalante: CONFIG_INVALID: {folder / 'telemetry.toml'}: lisen is unknown")
+        assert not (folder / "run").exists()
+
+
+def test_a_configuration_made_in_code_is_checked_as_well() -> None:
+    with pytest.raises(TelemetryError, match="it needs certificate and private_key"):
+        TelemetryConfig(listen="tls/127.0.0.1:7447")
