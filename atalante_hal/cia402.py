@@ -54,6 +54,12 @@ TRANSITIONS: dict[tuple[DriveState, Controlword], DriveState] = {
     (_S.FAULT, _C.FAULT_RESET): _S.SWITCH_ON_DISABLED,
 }
 
+#: Transitions a drive makes by itself: 1 when it has started, 14 when its fault reaction is complete.
+AUTOMATIC: dict[DriveState, DriveState] = {
+    _S.NOT_READY_TO_SWITCH_ON: _S.SWITCH_ON_DISABLED,
+    _S.FAULT_REACTION_ACTIVE: _S.FAULT,
+}
+
 
 def next_state(state: DriveState, controlword: int, *, latched: bool = False) -> DriveState:
     """State after one controlword; an unknown or not applicable command leaves the state as it is.

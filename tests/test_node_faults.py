@@ -41,7 +41,7 @@ class Walker:
         self.word, self.target = values[codec.slice("Controlword")], values[codec.slice("TargetTorque")]
         values[codec.slice("MaxTorque")] = robot.torque_max
         self._sync_cycle = codec.slice("Cycle")
-        self._names = {m.frame_id: m.name for m in network.messages}
+        self._names = {m.frame_id: m.name for m in network.messages} | {0: "flood"}
         self._buffer = new_frames(128)
         self.said: list[list[str]] = []
         self.frames: list[Frames] = []
@@ -124,6 +124,23 @@ class TestDrives:
         walker, _ = world(Fault("leave_operation", "LEFT_SK", BEGIN, 3, state=state), cycles=BEGIN + 3)
         assert [row[KNEE] for row in walker.states[BEGIN - 1 :]] == [ENABLED] + [DriveState[state]] * 3
         assert {s for row in walker.states[BEGIN:] for d, s in enumerate(row) if d != KNEE} == {ENABLED}
+
+    @pytest.mark.parametrize(
+        ("state", "after"), [("FAULT_REACTION_ACTIVE", "FAULT"), ("NOT_READY_TO_SWITCH_ON", "SWITCH_ON_DISABLED")]
+    )
+    def test_states_that_a_drive_leaves_by_itself(self, world: Make, state: str, after: str) -> None:
+        walker, _ = world(Fault("leave_operation", "LEFT_SK", BEGIN, 2, state=state), cycles=BEGIN + 3)
+        assert [row[KNEE] for row in walker.states[BEGIN:]] == [DriveState[state]] * 2 + [DriveState[after]]
+
+    def test_push(self, world: Make) -> None:
+        walker, emulator = world(Fault("push", "LEFT_SK", BEGIN, 100, torque=60.0), cycles=BEGIN + 60)
+        _, quiet = world(cycles=BEGIN + 60)
+        moved = emulator.body.position - quiet.body.position
+        assert 0.5 < moved[KNEE] * walker.robot.hold_kp[KNEE] / 60.0 < 1.0
+        assert np.abs(moved[6:]).max() < 1e-3
+        walker.run(300)
+        quiet_end = world(cycles=BEGIN + 360)[1].body.position
+        assert emulator.body.position[KNEE] == pytest.approx(quiet_end[KNEE], abs=2e-3)
 
     def test_emergency_of_a_drive(self, world: Make) -> None:
         walker, emulator = world(Fault("emergency", "LEFT_HA", BEGIN, 50, code=0x7305), cycles=BEGIN + 1)
@@ -359,6 +376,26 @@ class TestWire:
         walker.run(2)
         assert set(emulator.drives.state) == {state}
         assert lost != 5 or walker.value("RIGHT_SK_EMCY", "ErrorCode") == 0x8130
+
+    def test_a_flood_starves_one_leg(self, world: Make) -> None:
+        walker, emulator = world(Fault("flood", "left_leg", BEGIN, 20), cycles=BEGIN + 20)
+        assert emulator.cycle == BEGIN + 20
+        assert set(emulator.drives.state[:6]) == {HOLDING}
+        assert set(emulator.drives.state[6:]) == {ENABLED}
+        for names, frames in zip(walker.said[BEGIN:], walker.frames[BEGIN:], strict=True):
+            assert frames["can_id"].tolist()[:17] == [0] * 17
+            assert not any(name.startswith("LEFT_SK") for name in names)
+            assert "RIGHT_SK_STATE" in names
+        walker.run(10)
+        assert "LEFT_SK_STATE" in walker.said[-1]
+        assert walker.value("LEFT_SK_EMCY", "ErrorCode") == 0x8130
+        assert 0 not in walker.frames[-1]["can_id"].tolist()
+
+    def test_a_flood_of_every_bus_stops_the_robot_and_not_the_clock(self, world: Make, network: Network) -> None:
+        walker, emulator = world(*(Fault("flood", bus, BEGIN) for bus in network.buses), cycles=BEGIN + 20)
+        assert emulator.cycle == BEGIN + 20
+        assert set(emulator.drives.state) == {HOLDING}
+        assert {int(i) for frames in walker.frames[BEGIN:] for i in frames["can_id"]} == {0}
 
     def test_second_sender(self, world: Make) -> None:
         walker, emulator = world(Fault("inject", "COMMAND_LEFT_LEG", BEGIN, 1, SK_TargetTorque=100.0), cycles=BEGIN + 2)

@@ -22,7 +22,7 @@ from atalante_emulator.body import PERIOD
 from atalante_emulator.emergency import Emergency, Errors, Reaction, reaction_to
 from atalante_emulator.encoder import Encoders
 from atalante_emulator.motor import MotorParameters, Motors
-from atalante_hal.cia402 import Controlword, DriveState, next_state
+from atalante_hal.cia402 import AUTOMATIC, Controlword, DriveState, next_state
 from atalante_hal.robot import JOINTS, LEG_JOINTS, SIDES, Robot
 
 Vector = npt.NDArray[np.float64]
@@ -307,5 +307,5 @@ class Drives:
         speed = np.abs(self.encoders.speed)
         for drive in np.flatnonzero(speed < self.parameters.rest_speed).tolist():
             if self.state[drive] is DriveState.FAULT_REACTION_ACTIVE:
-                self._enter(drive, DriveState.FAULT)
+                self._enter(drive, AUTOMATIC[self.state[drive]])
         self._states_changed()

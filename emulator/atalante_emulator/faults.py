@@ -110,6 +110,15 @@ LINK_KINDS: Final[Mapping[str, Kind]] = {
     "silence": Kind("a node says nothing", "node"),
     "heartbeat_lost": Kind("a node sends its state, but no status", "node"),
     "reset": Kind("a node is off, then begins anew with a boot-up heartbeat; a drive brakes meanwhile", "node"),
+    "flood": Kind(
+        "somebody babbles: frames of one identifier take a share of the bus's time from all that are less urgent",
+        "bus",
+        {
+            "can_id": _whole(0, 0x7FF, default=0),
+            "bytes": _fd_length(default=8),
+            "load": _number(0.0, 1.0, default=1.0),
+        },
+    ),
     "error_frame": Kind(
         "the HAL's controller reports errors (class bits of linux/can/error.h)", "bus", {"error": _whole(1, 0x1FF)}
     ),
@@ -129,6 +138,7 @@ NODE_KINDS: Final[Mapping[str, Kind]] = {
         "drive",
         {"state": _choice([state.name for state in DriveState])},
     ),
+    "push": Kind("somebody pushes: an external torque on a joint", "drive", {"torque": _number(-500.0, 500.0, "Nm")}),
     "torque_weak": Kind("a motor makes a share of the torque it measures", "drive", {"share": _number(0.0, 1.0)}),
     "over_temperature": Kind("a drive is this hot", "drive", {"degrees": _number(-40.0, 214.0, "degC")}),
     "heat_ramp": Kind(

@@ -15,6 +15,7 @@ import numpy as np
 
 from atalante_dbc import Message, Network
 from atalante_emulator.faults import LINK_KINDS, Fault, messages_of
+from atalante_emulator.wire import Babble, Wire
 from atalante_hal.bus import Bus, Stamps
 from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
 from atalante_hal.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, ID_EXTENDED, Frames, new_frames
@@ -47,6 +48,9 @@ class _Disturbance:
         self._held: dict[int, Frames] = {}  # waits for the next frame of its message
         self._last: Frames | None = None  # frame of the message that is injected
         self._effect = _EFFECTS[fault.kind]
+        self.babble: Babble | None = None
+        if fault.kind == "flood":
+            self.babble = Babble(fault.target, fault["can_id"], fault["bytes"], fault["load"])
         self._chance = float(dict(fault.parameters).get("p", 1.0))
 
     def frames(self, frame: Frames, cycle: int) -> Sequence[Frames]:
@@ -84,6 +88,9 @@ class _Disturbance:
 
     def _lose(self, frame: Frames, message: Message, cycle: int) -> Sequence[Frames]:
         return ()
+
+    def _pass(self, frame: Frames, message: Message, cycle: int) -> Sequence[Frames]:
+        return (frame,)
 
     def _duplicate(self, frame: Frames, message: Message, cycle: int) -> Sequence[Frames]:
         return (frame,) * (1 + int(self.fault["copies"]))
@@ -174,8 +181,9 @@ _EFFECTS: Final[dict[str, Callable[[_Disturbance, Frames, Message, int], Sequenc
     "value": _Disturbance._change,
     "raw": _Disturbance._change,
     "inject": _Disturbance._remember,
-    "foreign": lambda _, frame, message, cycle: (frame,),
-    "error_frame": lambda _, frame, message, cycle: (frame,),
+    "foreign": _Disturbance._pass,
+    "error_frame": _Disturbance._pass,
+    "flood": _Disturbance._pass,
 }
 
 
@@ -213,6 +221,8 @@ class FaultyBus:
         self._syncs = {m.frame_id for m in network.messages if m.name.startswith("SYNC_")}
         self._from_hal = {m.frame_id for m in network.sent_by("HAL")}
         self._for_nodes: list[Frames] = []  # what they have not taken yet
+        #: The time the frames take on the buses, while there is a flood.
+        self.wire = Wire(network)
 
     @property
     def name(self) -> str:
@@ -235,8 +245,8 @@ class FaultyBus:
 
     def send(self, frames: Frames) -> None:
         """What the nodes say, on its way to the HAL. Raises as the bus does."""
-        if self._now():
-            frames = _together(self._passed(frames))
+        if self._now() or not self.wire.idle:
+            frames = _together(self._passed(frames, from_hal=False))
         if len(frames):
             self.bus.send(frames)
 
@@ -246,8 +256,8 @@ class FaultyBus:
         self.synced = not self._syncs.isdisjoint(frames["can_id"][:count].tolist())
         if self.synced:
             self._begin_cycle()
-        if self._active:
-            self._for_nodes += self._passed(frames[:count])
+        if self._active or not self.wire.idle:
+            self._for_nodes += self._passed(frames[:count], from_hal=True)
         elif self._for_nodes:
             self._for_nodes.append(frames[:count].copy())
         else:
@@ -266,12 +276,12 @@ class FaultyBus:
             self._active = [one for one in self._all if one.from_cycle <= cycle < one.fault.end]
         return self._active
 
-    def _passed(self, frames: Frames) -> list[Frames]:
-        """Frames one by one through every fault in turn. Shape (1,) each."""
+    def _passed(self, frames: Frames, *, from_hal: bool) -> list[Frames]:
+        """Frames one by one through every fault in turn, as far as they find time on the wire. Shape (1,) each."""
         passing = [frames[place : place + 1].copy() for place in range(len(frames))]
         for one in self._active:
             passing = [after for frame in passing for after in one.frames(frame, self._cycle)]
-        return passing
+        return passing if self.wire.idle else self.wire.carry(passing, from_hal=from_hal)
 
     def _begin_cycle(self) -> None:
         """Frames that are due, and those of nobody, once a cycle."""
@@ -281,6 +291,7 @@ class FaultyBus:
         self._begun = self._cycle
         due = [frame for one in self._all if one.late for frame in one.due(self._cycle)]
         added = [frame for one in self._active for frame in one.added(self._cycle)]
+        added += self.wire.begin([one.babble for one in self._active if one.babble is not None])
         self._for_nodes += [frame for frame in due if _id(frame) in self._from_hal]
         self._for_nodes += [frame for frame in added if not _id(frame) & ID_ERROR]  # which are no frames of the wire
         if for_hal := [frame for frame in due if _id(frame) not in self._from_hal] + added:

@@ -47,6 +47,7 @@ class Motors:
         self._per_friction_speed = np.full(_COUNT, 1.0 / parameters.friction_speed)
         self._powered: npt.NDArray[np.bool_] = np.zeros(_COUNT, np.bool_)
         self._strength = np.ones(_COUNT)
+        self._external: Vector | None = None
         self._build()
         self._heat = parameters.heating / (0.5 * robot.torque_max) ** 2
         temperature.fill(parameters.ambient)
@@ -71,17 +72,28 @@ class Motors:
         self._strength[motor] = strength
         self._build()
 
+    def push(self, joint: int, torque: float) -> None:
+        """Somebody pushes a joint from now on, on top of what the motor does [Nm]; 0: no longer."""
+        external = np.zeros(_COUNT) if self._external is None else self._external
+        external[joint] = torque
+        self._external = external if external.any() else None
+
     def turn(self, velocity: Vector) -> list[float]:
-        """Joint torques for the next `PERIOD`: what the motors make of `wanted`, less friction and brake. Shape (12,) [Nm].
+        """Joint torques for the next `PERIOD`: what the motors make of `wanted`, less friction and brake, and pushes.
 
         Args:
             velocity: true joint velocity [rad/s], shape (12,): what friction acts on.
+
+        Returns:
+            Shape (12,) [Nm].
         """
         direction = self._direction
         np.multiply(velocity, self._per_friction_speed, out=direction)
         np.tanh(direction, out=direction)
         self._velocity[:] = velocity
         self._matrix.dot(self._inputs, self._outputs)
+        if self._external is not None:
+            self._joint_torque += self._external
         self._torque[:] = self._next_torque
         self._torque_signal[:] = self._next_torque
         torque: list[float] = self._joint_torque.tolist()

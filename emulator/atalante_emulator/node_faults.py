@@ -18,7 +18,7 @@ from atalante_emulator.emergency import ERROR_RESET, Emergency, register_of
 from atalante_emulator.faults import NODE_KINDS, SENSOR_KINDS, Fault, nodes_of
 from atalante_emulator.heartbeat import Heartbeats
 from atalante_emulator.supply import HoldUp
-from atalante_hal.cia402 import DriveState
+from atalante_hal.cia402 import AUTOMATIC, DriveState
 from atalante_hal.codec import Codec
 from atalante_hal.robot import Robot
 
@@ -98,8 +98,11 @@ class NodeFaults:
             self._outbox.append(Emergency(node, register_of([]), ERROR_RESET))
 
     def _leave_operation(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
+        drive = _drive(nodes)
         if cycle < fault.end:
-            self._drives.leave(_drive(nodes), DriveState[fault["state"]])
+            self._drives.leave(drive, DriveState[fault["state"]])
+        elif self._drives.state[drive] in AUTOMATIC:
+            self._drives.leave(drive, AUTOMATIC[self._drives.state[drive]])
 
     def _reset(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
         """Nothing is heard of the node meanwhile: `link` sees to that."""
@@ -108,6 +111,10 @@ class NodeFaults:
             self._heartbeats.boot(node, cycle)
         elif node in NODES:
             self._drives.reset(NODES.index(node))
+
+    def _push(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
+        if cycle in (fault.start, fault.end):
+            self._drives.motors.push(_drive(nodes), fault["torque"] if cycle < fault.end else 0.0)
 
     def _torque_weak(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
         if cycle in (fault.start, fault.end):
@@ -196,6 +203,7 @@ _EFFECTS: Final[dict[str, Callable[[NodeFaults, Fault, Nodes, int], None]]] = {
     "emergency": NodeFaults._emergency,
     "leave_operation": NodeFaults._leave_operation,
     "reset": NodeFaults._reset,
+    "push": NodeFaults._push,
     "torque_weak": NodeFaults._torque_weak,
     "over_temperature": NodeFaults._over_temperature,
     "heat_ramp": NodeFaults._heat_ramp,
