@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 OUT ?= runs
 
-.PHONY: demo test test-vcan fuzz lint bench messages clean
+.PHONY: demo test test-vcan fuzz lint bench messages supervisor-table clean
 
 demo: .venv/installed-all ## everything in one process tree: 30 steps in the air with each guide shape
 	$(BIN)/atalante demo --out $(OUT)/demo
@@ -29,6 +29,9 @@ bench: .venv/installed-dev ## every benchmark beside its baseline
 messages: .venv/installed-dev ## the descriptor set of the telemetry messages, after a change of messages.proto
 	$(BIN)/python -m grpc_tools.protoc --proto_path=atalante_hal/telemetry --include_imports \
 	  --descriptor_set_out=atalante_hal/telemetry/messages.binpb messages.proto
+
+supervisor-table: .venv/installed-dev ## SUPERVISOR.md, after a change of the supervisor or of the diagnostics
+	$(BIN)/python -m atalante_tools.supervisor_table SUPERVISOR.md
 
 clean:
 	rm -rf .venv $(OUT)

@@ -109,6 +109,10 @@ class Codec:
         for i, (row, s, (low, high)) in enumerate(zip(self.row_of.tolist(), signals, limits, strict=True)):
             plan = (i, s.start, (1 << s.length) - 1, largest[i], low, high, s.factor, s.offset)
             self._one_by_one[row].append(plan)
+        self._invalid_codes = [
+            [(s.start, (1 << s.length) - 1, s.invalid_raw) for s in m.signals if s.invalid_raw is not None]
+            for m in self.messages
+        ]
         self._invalid = np.array([s.invalid_raw or 0 for s in signals], np.uint64)
         self._no_invalid = [s.invalid_raw is None for s in signals]
 
@@ -209,6 +213,11 @@ class Codec:
         for place, value in values:
             out[place] = value
         return True
+
+    def says_invalid(self, row: int, payload: bytes) -> bool:
+        """Whether a signal of one message carries its invalid code. `payload`: of the message's length."""
+        bits = int.from_bytes(payload, "little")
+        return any(bits >> start & mask == code for start, mask, code in self._invalid_codes[row])
 
     def encode(self, values: Vector, frames: Frames) -> None:
         """Write physical values into the payloads; reserved bits become 0. Shape (size,), DBC units.

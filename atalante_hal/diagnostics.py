@@ -117,6 +117,18 @@ class Dtc(StrEnum):
     GAIT_INVALID = "GAIT_INVALID", _R.NOT_READY, _S.ERROR, "the gait was refused"
 
 
+def number_of(bits: int) -> int:
+    """Number of the worst of a set of codes, for one signal on the wire: its place in `Dtc`, counted from 1; 0: none."""
+    found = dtcs_of(bits)
+    return max(found, key=lambda dtc: (dtc.reaction, dtc.bit)).bit.bit_length() if found else 0
+
+
+def by_number(number: int) -> str | None:
+    """Code and meaning of `number_of`, for people; None for 0 and for what only another version knows."""
+    codes = list(Dtc)
+    return f"{codes[number - 1]}: {codes[number - 1].meaning}" if 0 < number <= len(codes) else None
+
+
 def worst(diagnostics: Iterable[Dtc]) -> Reaction:
     """The reaction to all of them together: the worst."""
     return max((dtc.reaction for dtc in diagnostics), default=Reaction.INFO)
@@ -132,9 +144,10 @@ _EMERGENCIES = {
     0x3120: Dtc.UNDER_VOLTAGE,  # mains too low
     0x3220: Dtc.UNDER_VOLTAGE,  # DC link too low
     0x8110: Dtc.CMD_SOME_LOST,  # CAN overrun: objects lost
-    0x8130: Dtc.SYNC_LOST,  # life guard or heartbeat error
+    0x8150: Dtc.HAL_DUPLICATE,  # transmit identifier collision: a second source of commands
     0x8200: Dtc.CMD_E2E,  # protocol error
     0x8250: Dtc.CMD_TIMEOUT,  # RPDO timeout
+    0x8700: Dtc.SYNC_LOST,  # SYNC controller
 }
 #: The others by their class, the highest digit.
 _EMERGENCY_CLASSES = {

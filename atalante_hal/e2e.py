@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from binascii import crc_hqx
 from enum import IntEnum
+from typing import NamedTuple
 
 CRC_START = 0xFFFF
 #: Offsets in the payload.
@@ -28,7 +29,9 @@ class Check(IntEnum):
     WRONG_SEQUENCE = 4  # counter jumped: replayed, or more than 4 lost
     CRC = 5  # damaged, or another message's data
     LENGTH = 6  # length or frame format is not the DBC's
-    RANGE = 7  # a signal is outside its range or carries its invalid code
+    RANGE = 7  # a signal is outside its range
+    INVALID = 8  # a signal carries its invalid code: the node says that it has no value
+    IMPLAUSIBLE = 9  # the frame is right and what it says cannot be true
 
     @property
     def fresh(self) -> bool:
@@ -61,3 +64,38 @@ def check_counter(last: int | None, received: int) -> Check:
     if delta == 0:
         return Check.REPEATED
     return Check.SOME_LOST if delta <= MAX_DELTA else Check.WRONG_SEQUENCE
+
+
+#: The leaky bucket of a message: a bad cycle fills it, a good one empties it, and full it trips. Steady loss above a fifth trips.
+BAD_CYCLE, GOOD_CYCLE, FULL = 4, 1, 64
+#: Good cycles in a row after which a message is trusted (again): no flapping.
+REQUALIFY = 16
+
+
+class Qualification(NamedTuple):
+    """How far the sender of a message is trusted."""
+
+    bucket: int = 0
+    good: int = 0  # cycles in a row, counted up to `REQUALIFY`
+    trusted: bool = False
+
+
+#: Further good cycles change nothing.
+SETTLED = Qualification(0, REQUALIFY, True)
+
+
+def qualify(before: Qualification, *, good: bool, timed_out: bool = False) -> Qualification:
+    """Qualification after one more cycle.
+
+    Args:
+        good: new and intact data came.
+        timed_out: the data is as old as its timeout: trust is lost at once.
+    """
+    if timed_out:
+        return Qualification(before.bucket, 0, False)
+    if not good:
+        bucket = min(before.bucket + BAD_CYCLE, FULL)
+        return Qualification(bucket, 0, before.trusted and bucket < FULL)
+    in_row = min(before.good + 1, REQUALIFY)
+    now = Qualification(max(before.bucket - GOOD_CYCLE, 0), in_row, before.trusted or in_row == REQUALIFY)
+    return SETTLED if now == SETTLED else now

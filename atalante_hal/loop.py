@@ -12,9 +12,9 @@ from typing import Protocol
 
 import numpy as np
 
+from atalante_hal.diagnostics import Dtc
 from atalante_hal.hal import PERIOD, Hal
-from atalante_hal.supervisor import Condition
-from atalante_hal.types import Controller, State, SupervisorState
+from atalante_hal.types import Controller, State
 
 #: Late cycles in a row, and longest gap between two cycles [s], that end in HOLD: the drives' own watchdog is as long.
 OVERRUNS_TO_HOLD = 3
@@ -113,16 +113,14 @@ def run(
             if late:
                 late_in_row = _judge_lateness(hal, statistics, late, late_in_row)
             state = hal.read()
-            if state.supervisor is SupervisorState.ACTIVE:
+            if hal.moving:
                 try:
                     if not active:
                         controller.reset(state)
-                    command = controller.update(state)
-                except Exception as error:  # noqa: BLE001 - whatever a controller raises, the robot holds
-                    hal.fail(error)
-                else:
-                    hal.write(command)
+                    hal.write(controller.update(state))
                     controller_record[:] = telemetry
+                except Exception as error:  # noqa: BLE001 - whatever a controller raises or asks for, the robot holds
+                    hal.fail(error)
                 active = True
             else:
                 hal.hold()
@@ -143,14 +141,15 @@ def run(
 
 def _judge_lateness(hal: Hal, statistics: Statistics, late: float, in_row: int) -> int:
     statistics.lateness_max = max(statistics.lateness_max, late)
-    if late > GAP_TO_HOLD:
-        hal.report(Condition.CYCLE_GAP, f"{late * 1e3:.1f} ms went by without a cycle")
     if late <= PERIOD:
         return 0
+    in_row += 1
     statistics.overruns += 1
-    if in_row + 1 >= OVERRUNS_TO_HOLD:
-        hal.report(Condition.OVERRUN, f"{in_row + 1} cycles in a row were more than {PERIOD * 1e3:.0f} ms late")
-    return in_row + 1
+    gap = f"{late * 1e3:.1f} ms went by without a cycle"
+    hal.report(Dtc.CYCLE_GAP, gap, confirmed=late > GAP_TO_HOLD, value=late)
+    many = f"{in_row} cycles in a row were more than {PERIOD * 1e3:.0f} ms late"
+    hal.report(Dtc.OVERRUN, many, confirmed=in_row >= OVERRUNS_TO_HOLD, value=in_row)
+    return in_row
 
 
 def realtime(priority: int = 50) -> list[str]:

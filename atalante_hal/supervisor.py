@@ -1,70 +1,84 @@
 """The supervisor: which state the robot is in, as a pure function of the last state and what holds this cycle.
 
 Moves to a worse state are automatic, recovery is the operator's. A standing patient cannot be dropped: the safe state is
-HOLD, where every drive holds its position by itself.
+HOLD, where every drive holds its position by itself. `SUPERVISOR.md` is the table of this function.
 """
 
 from __future__ import annotations
 
-from enum import IntFlag
+from dataclasses import dataclass
 
+from atalante_hal.diagnostics import Dtc, Reaction, worst
 from atalante_hal.types import SupervisorState
 
 
-class Condition(IntFlag):
-    """What holds in a cycle. Conditions that demand a reaction are named after the fault, the others after the fact."""
+@dataclass(frozen=True)
+class Conditions:
+    """What holds in a cycle: the confirmed diagnostics, and the facts a start or a stop hangs on."""
 
-    NODES_WELL = 1 << 0  # every node is heard in time and reports this network's DBC
-    DRIVES_ENABLED = 1 << 1  # all twelve drives are in OPERATION ENABLED
-    DEAD_MAN = 1 << 2  # the pendant is heard and its dead-man is pressed
-    START_WANTED = 1 << 3  # the operator pressed START and the drives are being enabled for it
-    STOP_REQUESTED = 1 << 4  # the operator asks for STOP or HOLD
-    NODE_TIMEOUT = 1 << 5  # a drive, IMU or foot was not heard in time
-    DRIVE_STATE = 1 << 6  # a drive left OPERATION ENABLED unasked
-    DRIVE_FAULT = 1 << 7  # a drive reports a fault
-    CONTROLLER_ERROR = 1 << 8  # the controller raised
-    COMMAND_NOT_FINITE = 1 << 9  # the controller asked for NaN or infinity
-    CYCLE_GAP = 1 << 10  # more than 5 ms went by between two cycles
-    OVERRUN = 1 << 11  # three cycles in a row were late
-    BUS_DOWN = 1 << 12  # the bus refuses frames
+    diagnostics: frozenset[Dtc] = frozenset()
+    nodes_well: bool = False  # every node was heard, speaks this DBC and is trusted
+    drives_enabled: bool = False  # all twelve drives are in OPERATION ENABLED
+    dead_man: bool = False  # the pendant is heard and its dead-man is pressed
+    stop_requested: bool = False  # the operator, or the program's end, asks for STOP or HOLD
+    start_wanted: bool = False  # the operator pressed START and the drives are being enabled for it
+    step_finished: bool = False  # since FINISH_STEP began the controller has changed feet, or may not go on any longer
 
-
-#: Any of these ends ACTIVE in HOLD.
-HOLD_ON = (
-    Condition.STOP_REQUESTED
-    | Condition.NODE_TIMEOUT
-    | Condition.DRIVE_STATE
-    | Condition.CONTROLLER_ERROR
-    | Condition.COMMAND_NOT_FINITE
-    | Condition.CYCLE_GAP
-    | Condition.OVERRUN
-    | Condition.BUS_DOWN
-)
-_MAY_START = Condition.NODES_WELL | Condition.DEAD_MAN | Condition.START_WANTED | Condition.DRIVES_ENABLED
 
 _OFF, _READY, _ACTIVE = SupervisorState.OFF, SupervisorState.READY, SupervisorState.ACTIVE
-_HOLD, _FAULT = SupervisorState.HOLD, SupervisorState.FAULT
+_FULL_ASSIST, _FINISH_STEP = SupervisorState.FULL_ASSIST, SupervisorState.FINISH_STEP
+_HOLD, _LOWER, _FAULT = SupervisorState.HOLD, SupervisorState.LOWER, SupervisorState.FAULT
+
+#: States in which the controller's torques are used.
+MOVING = frozenset({_ACTIVE, _FULL_ASSIST, _FINISH_STEP})
+#: What a reaction makes of a robot that moves; a better state than the present one is never taken.
+_STATE_OF = {
+    Reaction.INFO: _ACTIVE,
+    Reaction.NOT_READY: _ACTIVE,
+    Reaction.FULL_ASSIST: _FULL_ASSIST,
+    Reaction.FINISH_STEP: _FINISH_STEP,
+    Reaction.HOLD: _HOLD,
+    Reaction.LOWER: _LOWER,
+    Reaction.FAULT: _FAULT,
+}
 
 
-def next_state(state: SupervisorState, conditions: Condition) -> SupervisorState:
-    """State of this cycle.
+def next_state(state: SupervisorState, conditions: Conditions) -> tuple[SupervisorState, frozenset[Dtc]]:
+    """State of this cycle, and the diagnostics that demand the worst: why it is not a better one.
 
-    - any -> FAULT when a drive reports a fault; FAULT -> HOLD when it is gone and the operator starts again
-    - OFF <-> READY as the nodes are well or not
-    - READY, HOLD -> ACTIVE when the operator started, holds the dead-man, and every drive is enabled
-    - ACTIVE -> HOLD on `HOLD_ON`, or when the dead-man is released or lost
+    - any -> FAULT, LOWER when a diagnostic demands it (LOWER: of a robot that is not OFF or READY)
+    - ACTIVE, FULL_ASSIST, FINISH_STEP -> what the worst diagnostic demands, if that is worse; a robot that moves without
+      dead-man, or against the operator's STOP, has `OPERATOR_STOP`
+    - FINISH_STEP -> HOLD when the step is finished
+    - OFF <-> READY as the nodes are well, and nothing keeps the robot from being ready, or not
+    - by START alone: READY, HOLD, FULL_ASSIST -> ACTIVE; LOWER -> HOLD; FAULT -> LOWER or HOLD; each when its cause is gone
     """
-    if conditions & Condition.DRIVE_FAULT:
+    diagnostics = conditions.diagnostics
+    if state in MOVING and (conditions.stop_requested or not conditions.dead_man):
+        diagnostics |= {Dtc.OPERATOR_STOP}
+    reaction = worst(diagnostics)
+    reasons = frozenset(dtc for dtc in diagnostics if dtc.reaction is reaction and reaction is not Reaction.INFO)
+    return _move(state, reaction, conditions), reasons
+
+
+def _move(state: SupervisorState, reaction: Reaction, facts: Conditions) -> SupervisorState:
+    if reaction is Reaction.FAULT:
         return _FAULT
-    may_start = (conditions & _MAY_START) == _MAY_START and not conditions & HOLD_ON
-    if state is _ACTIVE:
-        return _HOLD if conditions & HOLD_ON or not conditions & Condition.DEAD_MAN else _ACTIVE
+    acknowledged = facts.start_wanted and facts.dead_man and not facts.stop_requested
+    may_start = acknowledged and facts.nodes_well and facts.drives_enabled and reaction is Reaction.INFO
+    if state in MOVING:
+        demanded = _STATE_OF[reaction]
+        if state is _FULL_ASSIST and demanded is _ACTIVE and may_start:
+            return _ACTIVE
+        if state is _FINISH_STEP and facts.step_finished:
+            return max(demanded, _HOLD)
+        return max(state, demanded)
     if state in (_OFF, _READY):
-        if not conditions & Condition.NODES_WELL:
+        if not facts.nodes_well or reaction is not Reaction.INFO:
             return _OFF
         return _ACTIVE if may_start and state is _READY else _READY
+    if reaction is Reaction.LOWER:
+        return _LOWER if state is not _FAULT or acknowledged else _FAULT
     if state is _HOLD:
         return _ACTIVE if may_start else _HOLD
-    if conditions & Condition.START_WANTED:  # FAULT, and nothing reports one any more
-        return _HOLD
-    return state
+    return _HOLD if acknowledged else state  # LOWER and FAULT, whose cause is gone

@@ -37,7 +37,7 @@ class State:
     cycle: int  # SYNC counter
     time: float  # s, cycle * period
     supervisor: SupervisorState
-    assistance_factor: float  # Xi in [0, 1], set by the operator
+    assistance_factor: float  # Xi in [0, 1], set by the operator; led to 1 in FULL_ASSIST
     position: Vector  # (12,) rad
     velocity: Vector  # (12,) rad/s
     torque: Vector  # (12,) Nm, measured by the drive
@@ -48,8 +48,8 @@ class State:
     imu_accel: Vector  # (4, 3) m/s2, specific force
     foot_force: Vector  # (2, 4, 3) N, on the foot, in the foot frame
     vibration: Vector  # (8,) measured level, 0 to 1
-    valid: npt.NDArray[np.bool_]  # (messages,) fresh and intact this cycle
-    age: npt.NDArray[np.int64]  # (messages,) cycles since the data was measured
+    valid: npt.NDArray[np.bool_]  # (messages,) fresh, intact, plausible, and its sender is trusted
+    age: npt.NDArray[np.int64]  # (messages,) cycles between the SYNC the data answers and the last one
     joints_valid: bool  # all twelve joint states are fresh
 
 
@@ -62,6 +62,7 @@ class Command:
 
     torque: Vector  # (12,) Nm at the joint
     vibration: Vector  # (8,) level, 0 to 1
+    step: int | None = None  # number of the step under way; None: this controller does not walk
 
 
 class Controller(Protocol):

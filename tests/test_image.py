@@ -83,24 +83,34 @@ def test_an_invalid_code_leaves_the_last_good_values():
     tx.values[tx.codec.index("IMU_PELVIS_STATE", "GyroX")] = np.nan
     deliver(tx, rx, buffer)
     row = rx.codec.rows["IMU_PELVIS_STATE"]
-    assert rx.check[row] == Check.RANGE
+    assert rx.check[row] == Check.INVALID
     assert rx.age[row] == 1
     mine = rx.codec.row_of == row
     assert np.array_equal(rx.values[mine], before[mine])
     assert (np.delete(rx.check, row) == Check.OK).all()
 
 
-def test_frames_that_were_not_sent_are_sealed_again_under_their_counters():
+def test_frames_can_be_sealed_under_a_counter_of_ones_own():
     tx, rx, buffer = pair()
     deliver(tx, rx, buffer)
-    for _ in range(300):
-        tx.values[:] = 1.0
-        tx.seal()
-        tx.values[:] = 0.0
-        buffer[:ROWS] = tx.seal(again=True)
-        rx.accept(buffer, ROWS)
-        assert (rx.check == Check.OK).all()
-    assert abs(rx.values[rx.codec.index("LEFT_FH_STATE", "Torque")]) < 0.1
+    tx.seal_row(2)
+    for counter in (1, 1, 2, 255, 255):
+        frames = tx.seal(counter)
+        assert (frames["data"][:, 2] == counter).all()
+        assert tx.counter == counter
+    assert (tx.seal()["data"][:, 2] == 0).all()
+
+
+def test_prepared_payloads_are_sealed_with_the_next_counter_whatever_the_values_are():
+    tx, rx, buffer = pair()
+    tx.values[:] = 1.0
+    prepared = tx.prepare()
+    deliver(tx, rx, buffer)
+    tx.values.fill(np.nan)
+    buffer[:ROWS] = tx.seal_prepared(prepared)
+    rx.accept(buffer, ROWS)
+    assert rx.all_fresh
+    assert np.allclose(rx.values[rx.codec.slice("Force")], 1.0)
 
 
 def test_foreign_frames_are_named_wherever_they_stand():

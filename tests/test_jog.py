@@ -154,7 +154,7 @@ def test_a_drive_fault_ends_it_with_code_4(prepared: Callable[[Callable[[Rig], N
     prepared(fail)
     result = jog("left_SK", "--to", "60", "--json")
     assert result.exit_code == 4
-    assert "the robot is in FAULT: the drive of right_HA reports a fault" in result.stderr
+    assert "the robot is in FAULT: RIGHT_HA: a drive is in FAULT" in result.stderr
     assert result.stdout == ""
 
 

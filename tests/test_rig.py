@@ -188,7 +188,7 @@ def test_a_drive_fault_is_code_4(network: Network, robot: Robot, cycle: int) -> 
 
         rig.emulator.before_send.append(break_drive)
         watch = watched(rig, seconds=1.0)
-    with pytest.raises(FaultLatched, match="FAULT: the drive of left_SK reports a fault") as end:
+    with pytest.raises(FaultLatched, match="FAULT: LEFT_SK: a drive is in FAULT") as end:
         watch.conclude()
     assert end.value.exit_code == 4
 

@@ -1,65 +1,165 @@
-"""The supervisor, exhaustively: every state with every combination of conditions."""
+"""The supervisor, exhaustively: every state with every reaction and every combination of facts; laws over sets of codes."""
 
 from __future__ import annotations
 
-import pytest
+from itertools import product
 
-from atalante_hal.supervisor import HOLD_ON, Condition, next_state
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from atalante_hal.diagnostics import Dtc, Reaction, worst
+from atalante_hal.supervisor import MOVING, Conditions, next_state
 from atalante_hal.types import SupervisorState
 
-C, S = Condition, SupervisorState
-#: States this supervisor reaches.
-REACHED = (S.OFF, S.READY, S.ACTIVE, S.HOLD, S.FAULT)
-ALL = [Condition(bits) for bits in range(1 << len(Condition))]
-GO = C.NODES_WELL | C.DRIVES_ENABLED | C.DEAD_MAN | C.START_WANTED
-RUN = C.NODES_WELL | C.DRIVES_ENABLED | C.DEAD_MAN
-
-TABLE = [
-    (S.OFF, C(0), S.OFF),
-    (S.OFF, C.NODES_WELL, S.READY),
-    (S.OFF, GO, S.READY),
-    (S.READY, C(0), S.OFF),
-    (S.READY, C.NODES_WELL, S.READY),
-    (S.READY, C.NODES_WELL | C.START_WANTED | C.DEAD_MAN, S.READY),
-    (S.READY, GO, S.ACTIVE),
-    (S.READY, GO & ~C.DEAD_MAN, S.READY),
-    (S.ACTIVE, RUN, S.ACTIVE),
-    (S.ACTIVE, RUN & ~C.DEAD_MAN, S.HOLD),
-    (S.HOLD, RUN, S.HOLD),
-    (S.HOLD, GO, S.ACTIVE),
-    (S.HOLD, C(0), S.HOLD),
-    (S.FAULT, RUN, S.FAULT),
-    (S.FAULT, GO, S.HOLD),
-    (S.FAULT, GO | C.DRIVE_FAULT, S.FAULT),
+S, R = SupervisorState, Reaction
+FACTS = ("nodes_well", "drives_enabled", "dead_man", "stop_requested", "start_wanted", "step_finished")
+#: One code for each reaction: conditions fold into reactions first, so that these stand for all.
+ONE_OF = {reaction: next(d for d in Dtc if d.reaction is reaction) for reaction in Reaction}
+RUN = {"nodes_well": True, "drives_enabled": True, "dead_man": True}
+GO = RUN | {"start_wanted": True}
+EVERYTHING = [
+    (state, reaction, Conditions(frozenset({ONE_OF[reaction]}), *facts))
+    for state, reaction, facts in product(S, R, product((False, True), repeat=len(FACTS)))
 ]
 
 
-@pytest.mark.parametrize(("before", "conditions", "after"), TABLE)
-def test_table(before: S, conditions: C, after: S):
-    assert next_state(before, conditions) is after
+def after(state: S, *dtcs: Dtc, **facts: bool) -> S:
+    return next_state(state, Conditions(frozenset(dtcs), **facts))[0]
 
 
-@pytest.mark.parametrize("condition", [c for c in Condition if c & HOLD_ON], ids=lambda c: c.name)
-def test_each_fault_ends_active_in_hold_at_once(condition: Condition):
-    assert next_state(S.ACTIVE, RUN | condition) is S.HOLD
-    assert next_state(S.READY, GO | condition) is S.READY
-    assert next_state(S.HOLD, GO | condition) is S.HOLD
+TABLE = [
+    (S.OFF, {}, S.OFF),
+    (S.OFF, {"nodes_well": True}, S.READY),
+    (S.OFF, GO, S.READY),
+    (S.READY, {}, S.OFF),
+    (S.READY, {"nodes_well": True}, S.READY),
+    (S.READY, GO | {"drives_enabled": False}, S.READY),
+    (S.READY, GO | {"dead_man": False}, S.READY),
+    (S.READY, GO | {"stop_requested": True}, S.READY),
+    (S.READY, GO, S.ACTIVE),
+    (S.ACTIVE, RUN, S.ACTIVE),
+    (S.ACTIVE, RUN | {"dead_man": False}, S.HOLD),
+    (S.ACTIVE, RUN | {"stop_requested": True}, S.HOLD),
+    (S.FULL_ASSIST, RUN, S.FULL_ASSIST),
+    (S.FULL_ASSIST, GO, S.ACTIVE),
+    (S.FULL_ASSIST, RUN | {"dead_man": False}, S.HOLD),
+    (S.FINISH_STEP, RUN, S.FINISH_STEP),
+    (S.FINISH_STEP, GO, S.FINISH_STEP),
+    (S.FINISH_STEP, RUN | {"step_finished": True}, S.HOLD),
+    (S.FINISH_STEP, RUN | {"stop_requested": True}, S.HOLD),
+    (S.HOLD, RUN, S.HOLD),
+    (S.HOLD, GO, S.ACTIVE),
+    (S.HOLD, GO | {"nodes_well": False}, S.HOLD),
+    (S.HOLD, {}, S.HOLD),
+    (S.LOWER, RUN, S.LOWER),
+    (S.LOWER, GO, S.HOLD),
+    (S.LOWER, GO | {"dead_man": False}, S.LOWER),
+    (S.FAULT, RUN, S.FAULT),
+    (S.FAULT, GO, S.HOLD),
+    (S.FAULT, {"start_wanted": True, "dead_man": True}, S.HOLD),
+    (S.FAULT, GO | {"stop_requested": True}, S.FAULT),
+]
 
 
-def test_laws_over_all_states_and_conditions():
-    for state in REACHED:
-        for conditions in ALL:
-            after = next_state(state, conditions)
-            assert after in REACHED
-            if conditions & C.DRIVE_FAULT:
-                assert after is S.FAULT
-            if after is S.ACTIVE:
-                assert conditions & C.DEAD_MAN
-                assert not conditions & HOLD_ON
-                assert state is S.ACTIVE or conditions & GO == GO
-            # Recovery is the operator's: without START nothing gets better, but OFF to READY, which moves nothing.
-            if not conditions & C.START_WANTED and (state, after) != (S.OFF, S.READY):
-                assert after >= state or (state, after) == (S.READY, S.OFF)
-            # A robot that held does not go limp.
-            if state in (S.ACTIVE, S.HOLD, S.FAULT):
-                assert after not in (S.OFF, S.READY)
+@pytest.mark.parametrize(("before", "facts", "then"), TABLE)
+def test_without_a_diagnostic(before: S, facts: dict[str, bool], then: S):
+    assert after(before, **facts) is then
+
+
+WORSE = {
+    R.INFO: (S.ACTIVE, S.FULL_ASSIST, S.FINISH_STEP),
+    R.NOT_READY: (S.ACTIVE, S.FULL_ASSIST, S.FINISH_STEP),
+    R.FULL_ASSIST: (S.FULL_ASSIST, S.FULL_ASSIST, S.FINISH_STEP),
+    R.FINISH_STEP: (S.FINISH_STEP, S.FINISH_STEP, S.FINISH_STEP),
+    R.HOLD: (S.HOLD, S.HOLD, S.HOLD),
+    R.LOWER: (S.LOWER, S.LOWER, S.LOWER),
+    R.FAULT: (S.FAULT, S.FAULT, S.FAULT),
+}
+
+
+@pytest.mark.parametrize("dtc", Dtc)
+def test_each_code_does_to_a_moving_robot_what_its_reaction_says(dtc: Dtc):
+    assert tuple(after(s, dtc, **RUN) for s in (S.ACTIVE, S.FULL_ASSIST, S.FINISH_STEP)) == WORSE[dtc.reaction]
+
+
+@pytest.mark.parametrize("dtc", [d for d in Dtc if d.reaction is not R.INFO])
+def test_no_code_but_information_lets_the_robot_start(dtc: Dtc):
+    assert after(S.OFF, dtc, **GO) is (S.FAULT if dtc.reaction is R.FAULT else S.OFF)
+    assert after(S.READY, dtc, **GO) is (S.FAULT if dtc.reaction is R.FAULT else S.OFF)
+    assert after(S.HOLD, dtc, **GO) is {R.LOWER: S.LOWER, R.FAULT: S.FAULT}.get(dtc.reaction, S.HOLD)
+    assert after(S.FULL_ASSIST, dtc, **GO) is not S.ACTIVE
+
+
+@pytest.mark.parametrize(
+    ("before", "facts", "then"), [(S.FAULT, RUN, S.FAULT), (S.FAULT, GO, S.LOWER), (S.LOWER, GO, S.LOWER)]
+)
+def test_a_joint_that_cannot_hold_keeps_being_lowered(before: S, facts: dict[str, bool], then: S):
+    assert after(before, Dtc.OVER_TEMP, **facts) is then
+
+
+def test_a_fault_lasts_as_long_as_its_cause():
+    assert after(S.FAULT, Dtc.DRIVE_FAULT, **GO) is S.FAULT
+
+
+def test_a_finished_step_ends_in_hold_or_worse():
+    assert after(S.FINISH_STEP, Dtc.SUPPLY_LOW, **RUN, step_finished=True) is S.HOLD
+    assert after(S.FINISH_STEP, Dtc.OVER_TEMP, **RUN, step_finished=True) is S.LOWER
+
+
+def test_laws_over_all_states_reactions_and_facts():
+    for before, reaction, conditions in EVERYTHING:
+        check_laws(before, reaction, conditions)
+
+
+def check_laws(before: S, reaction: R, c: Conditions):
+    then, _ = next_state(before, c)
+    if reaction is R.FAULT:
+        assert then is S.FAULT
+    if then in MOVING:
+        assert c.dead_man
+        assert not c.stop_requested
+        assert reaction < R.HOLD
+    if then in MOVING and before not in MOVING:
+        assert then is S.ACTIVE
+        assert c.start_wanted
+        assert c.nodes_well
+        assert c.drives_enabled
+        assert reaction is R.INFO
+    # Recovery is the operator's: without START nothing gets better, but OFF to READY, which moves nothing.
+    if not (c.start_wanted and c.dead_man and not c.stop_requested) and (before, then) != (S.OFF, S.READY):
+        assert then >= before or (before, then) == (S.READY, S.OFF)
+    # A robot that has moved does not go limp.
+    if before not in (S.OFF, S.READY):
+        assert then not in (S.OFF, S.READY)
+    # Whatever is demanded is the least that happens to a robot that moves.
+    if before in MOVING and reaction > R.NOT_READY:
+        assert then >= S[reaction.name]
+
+
+@given(st.sampled_from(S), st.frozensets(st.sampled_from(Dtc), max_size=6), st.tuples(*[st.booleans()] * len(FACTS)))
+def test_a_set_of_codes_acts_like_its_worst_and_the_reasons_are_the_worst(before, dtcs, facts):
+    then, reasons = next_state(before, Conditions(dtcs, *facts))
+    alone, _ = next_state(before, Conditions(frozenset({ONE_OF[worst(dtcs)]}), *facts))
+    assert then is alone
+    stopped = before in MOVING and (not facts[2] or facts[3])
+    expected = worst([*dtcs, *([Dtc.OPERATOR_STOP] if stopped else [])])
+    assert {d.reaction for d in reasons} == ({expected} if expected is not R.INFO else set())
+    assert reasons == {d for d in dtcs | ({Dtc.OPERATOR_STOP} if stopped else set()) if d.reaction is expected} or not (
+        reasons or expected is not R.INFO
+    )
+
+
+@given(st.sampled_from(S), st.frozensets(st.sampled_from(Dtc), max_size=5), st.sampled_from(Dtc))
+def test_one_code_more_never_makes_a_moving_robot_better(before, dtcs, more):
+    fewer, _ = next_state(before, Conditions(dtcs, **GO))
+    then, _ = next_state(before, Conditions(dtcs | {more}, **GO))
+    assert before not in MOVING or then >= fewer
+
+
+def test_while_nothing_changes_the_state_settles():
+    for before, _, conditions in EVERYTHING:
+        then = before
+        for _ in range(3):
+            then, _ = next_state(then, conditions)
+        assert next_state(then, conditions)[0] is then

@@ -315,6 +315,7 @@ class HangController:
 
     def _change_step(self, state: State, stance: int) -> None:
         self._changed_at, self._stance = state.cycle, stance
+        self._command.step = (self._command.step or 0) + 1
         config, n = self.config, len(JOINTS)
         self._xi = xi = min(1.0, max(0.0, state.assistance_factor))
         self._w, self._intensity = baseline_share(xi, config.fade), intensity(xi)

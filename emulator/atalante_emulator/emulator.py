@@ -127,7 +127,8 @@ class Emulator:
         sent = [m for m in network.messages if m.sender in ours]
         cyclic = [m for bus in network.buses for m in sent if m.bus == bus and m.cycle_ms == 1]
         self._tx = TransmitImage(cyclic)
-        self._unsent = False  # the frames have been sealed and not sent since
+        self._sealed = False  # the frames wait for their SYNC
+        self._tag = 0  # low byte of the number of the cycle they are for: their alive counter
         self._haptics_tx = TransmitImage([network.message("HAPTICS_STATE")])
         self._heartbeats = Heartbeats(network, [m for m in sent if m.name.endswith("_STATUS")])
         self._emergencies: list[Emergency] = []  # to be told in this cycle
@@ -239,7 +240,7 @@ class Emulator:
         self._rx.accept(self._scratch, count)
         if self._rx.all_fresh:
             self._commanded = [False] * len(SIDES)
-            self._complete_answer()
+            self._complete_answer(int(self._sync_cycles[0]))
             self._cycle((True, True), self._whole)
             return True
         return self._imperfect_cycle(count)
@@ -280,7 +281,7 @@ class Emulator:
         self._last_sync = number
         fresh = self._commanded[0], self._commanded[1]
         self._commanded = [False] * len(SIDES)
-        self._complete_answer()
+        self._complete_answer(number)
         self._answered = [share.copy() for share in self._shares]
         for leg, place in enumerate(self._leg_syncs):
             if place not in synced:
@@ -344,15 +345,17 @@ class Emulator:
         np.add(self._truth, self._noise_rows[self.cycle % _NOISE_CYCLES], out=self._tx.values)
         for rewrite in self.before_send:
             rewrite(self.cycle, self._tx.values)
-        self._tx.seal(again=self._unsent)
-        self._unsent = True
+        self._tx.seal(self._tag)
+        self._sealed = True
 
-    def _complete_answer(self) -> None:
-        """SYNC is there: what could not be said ahead of it."""
+    def _complete_answer(self, number: int) -> None:
+        """SYNC of this cycle is there: what could not be said ahead of it."""
         changed = self.operator is not None and self._ask_operator(self.operator)
-        if changed or self.before_send or not self._unsent:
+        if changed or self.before_send or not self._sealed or number & 0xFF != self._tag:
+            self._tag = number & 0xFF
             self._seal()
-        self._unsent = False
+        self._tag = self._tag + 1 & 0xFF
+        self._sealed = False
 
     def _cycle(self, fresh: tuple[bool, bool], answer: list[Frames]) -> None:
         """Latch, send, move, look ahead: [k, k+1] is driven by the command of cycle k-1."""

@@ -13,36 +13,38 @@ import os
 import sys
 from typing import Any
 
-MODULE = "atalante_hal.hal"
+MODULE = "atalante_hal.transceiver"
 FOLDER = "ATALANTE_WITNESS"
 #: HALs of this process so far.
 _numbers = itertools.count()
 
 
-def watch(hal_type: type[Any]) -> None:
-    """Let every HAL of this class write what it sends. Raises AttributeError when the HAL sends in another way."""
-    make, send = hal_type.__init__, hal_type._send
+def watch(transceiver_type: type[Any]) -> None:
+    """Let every transceiver of this class write what it sends. Raises AttributeError when it sends in another way."""
+    make, send = transceiver_type.__init__, transceiver_type.send
 
-    def init(hal: Any, *arguments: Any, **options: Any) -> None:
-        hal.witness = None
-        make(hal, *arguments, **options)
+    def init(transceiver: Any, *arguments: Any, **options: Any) -> None:
+        transceiver.witness = None
+        make(transceiver, *arguments, **options)
 
-    def send_and_write(hal: Any, frames: Any) -> Any:
-        if hal.witness is None:
+    def send_and_write(transceiver: Any, batch: Any) -> Any:
+        if transceiver.witness is None:
             folder = os.environ[FOLDER]
             path = os.path.join(folder, f"{os.getpid()}-{next(_numbers)}.frames")
-            hal.witness = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_EXCL | os.O_CLOEXEC, 0o600)
-            _close_with(hal)
-        os.write(hal.witness, frames.tobytes())
-        return send(hal, frames)
+            transceiver.witness = os.open(
+                path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_EXCL | os.O_CLOEXEC, 0o600
+            )
+            _close_with(transceiver)
+        os.write(transceiver.witness, batch.frames.tobytes())
+        return send(transceiver, batch)
 
-    hal_type.__init__, hal_type._send = init, send_and_write
+    transceiver_type.__init__, transceiver_type.send = init, send_and_write
 
 
-def _close_with(hal: Any) -> None:
+def _close_with(transceiver: Any) -> None:
     import weakref
 
-    weakref.finalize(hal, os.close, hal.witness)
+    weakref.finalize(transceiver, os.close, transceiver.witness)
 
 
 class _Finder(importlib.abc.MetaPathFinder):
@@ -59,7 +61,7 @@ class _Finder(importlib.abc.MetaPathFinder):
 
         def execute_and_watch(module: Any) -> None:
             execute(module)
-            watch(module.Hal)
+            watch(module.Transceiver)
 
         spec.loader.exec_module = execute_and_watch  # type: ignore[method-assign]
         return spec
@@ -71,7 +73,7 @@ def install() -> None:
         return
     sys._atalante_witness = True  # type: ignore[attr-defined]
     if MODULE in sys.modules:
-        watch(sys.modules[MODULE].Hal)
+        watch(sys.modules[MODULE].Transceiver)
     else:
         sys.meta_path.insert(0, _Finder())
 

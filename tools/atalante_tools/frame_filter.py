@@ -18,7 +18,7 @@ import numpy as np
 from atalante_dbc import Network
 from atalante_hal.bus import Bus, Stamps
 from atalante_hal.frame import Frames, as_words
-from atalante_hal.hal import FrameTap
+from atalante_hal.transceiver import FrameTap
 
 #: Frames of one batch that can be held back and come later together.
 _ROOM: Final = 128

@@ -106,7 +106,7 @@ class Stepper:
         """One cycle."""
         self._clock.wait()
         state = self.hal.read()
-        if state.supervisor is SupervisorState.ACTIVE:
+        if self.hal.moving:
             if not self._active:
                 self.controller.reset(state)
             command: Command = self.controller.update(state)

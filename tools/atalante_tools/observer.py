@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 from atalante_dbc import Message, Network, Node, wire_time
+from atalante_hal.diagnostics import by_number
 from atalante_hal.frame import Frames
 from atalante_hal.image import NEVER, ReceiveImage
 from atalante_hal.robot import JOINTS, Robot
-from atalante_hal.supervisor import Condition
 
 #: Signals that hold a node's own state, in the order in which they tell more.
 _STATES: Final = ("HalState", "DriveState", "ImuState", "FootState", "NodeState")
@@ -55,7 +55,7 @@ class Report:
     cycle: int | None
     assistance_factor: float | None
     overruns: int | None
-    conditions: tuple[str, ...]
+    diagnostic: str | None  # the worst that is active; None: none is
     dead_man: bool | None
     nodes: tuple[NodeReport, ...]
     joints: tuple[JointReport, ...]
@@ -106,7 +106,7 @@ class Observer:
         hal = next(node for node in self._network.nodes if node.kind == "master")
         sync = max(self._fast(hal), key=lambda m: -self._age(m))
         pendant = self._network.message("PENDANT_STATE")
-        conditions = self._value("HAL_STATUS", "DiagnosticCode")
+        diagnostic = self._value("HAL_STATUS", "DiagnosticCode")
         cycle, overruns = self._value(sync.name, "Cycle"), self._value("HAL_STATUS", "Overruns")
         dead_man = self._value(pendant.name, "DeadMan")
         seconds = max(now - self._since, 1e-9)
@@ -116,7 +116,7 @@ class Observer:
             cycle=None if cycle is None else int(cycle),
             assistance_factor=self._value("HAL_STATUS", "AssistanceFactor"),
             overruns=None if overruns is None else int(overruns),
-            conditions=tuple(str(c.name) for c in Condition(int(conditions or 0))),
+            diagnostic=by_number(int(diagnostic or 0)),
             dead_man=None if dead_man is None or self._age(pendant) > GONE else bool(dead_man),
             nodes=tuple(self._node(node) for node in self._network.nodes),
             joints=tuple(self._joint(index) for index in range(len(JOINTS))),

@@ -1,8 +1,8 @@
 """The PENDANT node of the network: `SYNC -> PENDANT_STATE` every cycle, `PENDANT_STATUS` now and then.
 
-One pendant speaks at a time. A new one listens first and goes on where the other is: alive counter, number of presses,
-dead-man, assistance factor. The older one hears its own identifier from somebody else and falls silent. In between, both
-answer the same SYNC for a cycle or two, with the same counter; the HAL takes the first.
+One pendant speaks at a time. A new one listens first and goes on where the other is: number of presses, dead-man, assistance
+factor. The older one hears its own identifier from somebody else and falls silent. In between, both answer the same SYNC for a
+cycle or two, with the same counter, the low byte of its Cycle; the HAL takes the first and notes that the second is a repetition.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Final
 
 from atalante_dbc import Network
 from atalante_hal.bus import Bus, BusFull
-from atalante_hal.e2e import COUNTER_BYTE, Check
+from atalante_hal.e2e import Check
 from atalante_hal.frame import Frames, new_frames
 from atalante_hal.hal import PERIOD
 from atalante_hal.image import ReceiveImage, TransmitImage
@@ -63,6 +63,7 @@ class PendantNode:
         self._at = {s.name: self._tx.codec.index(state.name, s.name) for s in state.signals}
         self._heard_at = {s.name: self._heard.codec.index(state.name, s.name) for s in state.signals}
         self._hal_at = self._heard.codec.index(sync.name, "HalState")
+        self._cycle_at = self._heard.codec.index(sync.name, "Cycle")
         for name, value in (
             ("NodeState", OPERATIONAL),
             ("DbcHash", network.hash32),
@@ -145,14 +146,13 @@ class PendantNode:
         """Go on where the other pendant is."""
         for name, place in self._at.items():
             self._tx.values[place] = self._heard.values[self._heard_at[name]]
-        self._tx.resume(0, int(self._heard.frames["data"][self._state_row, COUNTER_BYTE]))
 
     def _answer(self) -> None:
         if self.spoken == GRACE and self._other_at > GRACE - SILENT:
             self._speaking = False
             self.refused = True
             return
-        self._send(self._tx.seal())
+        self._send(self._tx.seal(int(self._heard.values[self._cycle_at]) & 0xFF))
         if self.spoken % self._status_cycles == 0:
             self._status.values[self._uptime_at] = self.spoken * PERIOD
             self._send(self._status.seal())

@@ -17,9 +17,10 @@ from atalante_hal.bus import Bus
 from atalante_hal.bus.channel_map import open_channels, parse_channel_map
 from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.pair import lockstep_pair
-from atalante_hal.hal import FrameTap, Hal
+from atalante_hal.hal import Hal
 from atalante_hal.loop import LockStep, Statistics, WallClock, realtime, run
 from atalante_hal.robot import Robot, load_robot
+from atalante_hal.transceiver import FrameTap
 from atalante_hal.types import Controller, State, SupervisorState
 from atalante_tools.body import describe, open_body
 from atalante_tools.embedded import EmbeddedRobot, Order
@@ -157,7 +158,7 @@ class Watch:
 
     def __call__(self, state: State) -> bool:
         """Whether the run is over."""
-        active = state.supervisor is SupervisorState.ACTIVE
+        active = self._rig.hal.moving
         if self._stop.wanted:
             over = True
         elif active:
@@ -196,7 +197,7 @@ def waiting_for(rig: Rig) -> str:
     hal, target = rig.hal, rig.target
     if hal.state.supervisor is SupervisorState.OFF:
         missing = hal.missing()
-        if len(missing) == len(hal.network.nodes) - 2:  # all but the HAL and the pendant
+        if hal.silent:
             return f"no node answers on {target}; an emulated robot is `atalante emulator {target.arguments}`"
         return f"waiting for {', '.join(missing)}" if missing else "the nodes are there"
     state = hal.state.supervisor.name

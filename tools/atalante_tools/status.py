@@ -148,7 +148,7 @@ def _headline(report: Report, target: Target) -> str:
         said.append(f"{report.overruns} overruns")
     if report.dead_man is not None:
         said.append(f"dead-man {'pressed' if report.dead_man else 'released'}")
-    return ", ".join(said) + (f"\nconditions: {', '.join(report.conditions)}" if report.conditions else "")
+    return ", ".join(said) + (f"\ndiagnostic: {report.diagnostic}" if report.diagnostic else "")
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -248,7 +248,7 @@ def _open(
 def _telemetry(
     target: Target, options: Options, outlet: Mapping[str, Any], hal: Hal, network: Network, gait_hash: int
 ) -> TelemetryProcess:
-    from atalante_hal.supervisor import Condition
+    from atalante_hal.diagnostics import Dtc
     from atalante_hal.telemetry.process import TelemetryConfig, TelemetryProcess
 
     config = TelemetryConfig(
@@ -264,7 +264,7 @@ def _telemetry(
         hal.layout,
         bus_of={message.frame_id: message.bus for message in network.messages},
         buses=network.buses,
-        diagnostics=[str(condition.name) for condition in Condition],
+        diagnostics=[dtc.value for dtc in Dtc],
         about={
             "version": version("atalante-hal"),
             "dbc_hash": f"{network.hash32:08x}",

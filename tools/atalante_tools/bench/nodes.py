@@ -102,6 +102,7 @@ class Recording:
         image = TransmitImage(slow)
         image.values[image.codec.slice("DbcHash")] = network.hash32
         image.values[image.codec.slice("NodeState")] = 5  # operational
+        image.values[image.codec.slice("SupplyVoltage")] = 48.0
         gap = max(m.cycle_ms for m in slow) // len(slow)
         #: Spread so that all blocks of ten cycles are alike.
         self.slow = tuple((m, m.cycle_ms, gap * row % m.cycle_ms) for row, m in enumerate(slow))
@@ -126,8 +127,9 @@ class Recording:
         self.pose = cycle % POSES
         sealed = self._before if cycle < TURN else self._steady
         self._cyclic_memory[:] = sealed.payloads[self.pose]
-        self._cyclic_counters.fill(cycle % TURN)
-        self._cyclic_checksums[:] = sealed.checksums[cycle % TURN]
+        tag = self.cycles % TURN  # of the SYNC: a HAL's first is 1
+        self._cyclic_counters.fill(tag)
+        self._cyclic_checksums[:] = sealed.checksums[tag]
         due = self._due[cycle % len(self._due)]
         for place, row in zip(self._places, due, strict=False):
             turn = self._slow_turn[row]

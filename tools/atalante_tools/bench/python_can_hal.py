@@ -85,7 +85,9 @@ class PythonCanHal:
         self._counter: dict[int, int] = {}
         self._cycle = 0
         self.refused = 0
-        self.position, self.velocity, self.torque, self.temperature, self.drive_state = np.zeros((5, len(JOINTS)))
+        joints = np.zeros((5, len(JOINTS)))
+        self._motion = joints[:2]
+        self.position, self.velocity, self.torque, self.temperature, self.drive_state = joints
         self.imu_quaternion, self.imu_gyro, self.imu_accel = (np.zeros((len(IMUS), n)) for n in (4, 3, 3))
         self.foot_force = np.zeros((len(FEET), len(CELLS), 3))
         self.slow: dict[int, dict[str, Any]] = {}
@@ -103,7 +105,7 @@ class PythonCanHal:
                 missing.discard(message.arbitration_id)
         self.refused += len(missing)
         self._controller.filter(self._torque, *self.position[2:4].tolist(), *self.velocity[2:4].tolist())
-        self._limiter.apply(self._torque)
+        self._limiter.apply(self._torque, self._motion)
         torque = self._limiter.last.tolist()
         for side, frame_id in enumerate(self._legs):
             values: dict[str, float] = {}

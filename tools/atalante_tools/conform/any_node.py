@@ -113,7 +113,11 @@ def requirements(bench: Bench) -> tuple[list[Requirement], list[Requirement]]:
     everything = "every frame heard in this examination"
     after = [
         Requirement(
-            "NODE-11", "Counts every frame of each message on by one.", everything, e2e, _all(_counter_defects)
+            "NODE-11",
+            "Counts every frame of each message on by one; an answer to SYNC carries the low byte of its Cycle as counter.",
+            everything,
+            e2e,
+            _all(_counter_defects),
         ),
         Requirement(
             "NODE-12",
@@ -280,8 +284,13 @@ def _all(defects_of: Callable[[list[Heard]], list[str]]) -> Callable[[Bench], Ou
 def _counter_defects(heard: list[Heard]) -> list[str]:
     by_message: dict[str, list[Heard]] = {}
     for h in heard:
-        by_message.setdefault(h.message.name, []).append(h)
+        if h.message.cycle_ms != 1:
+            by_message.setdefault(h.message.name, []).append(h)
     return [
+        f"{h.message.name} {h.counter} in cycle {h.cycle}, which ends in {h.cycle & 0xFF}"
+        for h in heard
+        if h.message.cycle_ms == 1 and h.counter != h.cycle & 0xFF
+    ] + [
         f"{name} {after.counter} after {before.counter} in cycle {after.cycle}"
         for name, frames in by_message.items()
         for before, after in pairwise(frames)

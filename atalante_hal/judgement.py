@@ -1,0 +1,116 @@
+"""Whether what the nodes say every cycle may be used: E2E, age and trust of each message.
+
+`process image -> judgement -> validity of each message, diagnostics -> supervisor`
+
+A message that was not committed is pending trouble; it is confirmed when its data is as old as the DBC's timeout. A message
+that loses more than a fifth of its frames trips its leaky bucket. What tripped is trusted again after 16 good cycles in a row.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_dbc import Network
+from atalante_hal.diagnostics import Dtc
+from atalante_hal.e2e import FULL, SETTLED, Check, Qualification, qualify
+from atalante_hal.fault_memory import FaultMemory
+from atalante_hal.image import ReceiveImage
+
+#: Why a message was not committed -> what is noted at once.
+PENDING = {
+    Check.REPEATED: Dtc.E2E_REPEATED,
+    Check.WRONG_SEQUENCE: Dtc.E2E_SEQUENCE,
+    Check.CRC: Dtc.E2E_CRC,
+    Check.LENGTH: Dtc.FRAME_LENGTH,
+    Check.RANGE: Dtc.SIGNAL_RANGE,
+    Check.INVALID: Dtc.SIGNAL_RANGE,
+}
+#: What is confirmed when the data has become too old.
+CONFIRMED = {
+    **PENDING,
+    Check.OK: Dtc.NODE_LATE,
+    Check.SOME_LOST: Dtc.NODE_LATE,
+    Check.NO_DATA: Dtc.NODE_TIMEOUT,
+    Check.REPEATED: Dtc.E2E_FROZEN,
+}
+_FRESH = int(Check.SOME_LOST)
+
+
+class Judgement:
+    """Judges the rows of the fast image; the pendant's is judged alike, what follows from its loss is the operator's stop."""
+
+    def __init__(self, network: Network, image: ReceiveImage) -> None:
+        self._image = image
+        messages = image.codec.messages
+        self._senders = [m.sender for m in messages]
+        self._timeouts = [m.timeout_ms for m in messages]
+        kinds = [network.node(m.sender).kind for m in messages]
+        self._invalid = [Dtc.IMU_INVALID if kind == "imu" else Dtc.SIGNAL_RANGE for kind in kinds]
+        self._joint_rows = [row for row, kind in enumerate(kinds) if kind == "drive"]
+        self._confirms = [kind != "pendant" for kind in kinds]
+        self._needed = [row for row, kind in enumerate(kinds) if kind != "pendant"]
+        self.qualification = [Qualification()] * len(messages)
+        #: Rows that were trusted once: of the others nobody knows whether they should speak.
+        self._known = [False] * len(messages)
+        #: Why a plausibility check refused a row in this cycle.
+        self._implausible: dict[int, tuple[Dtc, float]] = {}
+        #: New, intact, trusted and plausible data came in this cycle, shape (rows,).
+        self.valid: npt.NDArray[np.bool_] = np.zeros(len(messages), np.bool_)
+        self.joints_valid = False
+        #: Everything is trusted and nothing is on its way to trip: a perfect cycle changes nothing here.
+        self.settled = False
+
+    @property
+    def nodes_well(self) -> bool:
+        """Every message but the pendant's is trusted and not too old."""
+        return all(self.qualification[row].trusted for row in self._needed)
+
+    def trusts(self, row: int) -> bool:
+        """Whether a row's sender is trusted."""
+        return self.qualification[row].trusted
+
+    def refuse(self, row: int, dtc: Dtc, value: float) -> None:
+        """A row of this cycle cannot be true: its last values stay and age. Before `judge`."""
+        self._image.refuse(row)
+        self._implausible[row] = dtc, value
+
+    def judge(self, cycle: int, memory: FaultMemory) -> None:
+        """Judge a cycle that is not perfect, or follows one that was not."""
+        image = self._image
+        checks, ages = image.check.tolist(), image.age.tolist()
+        for row, why in image.refused:
+            dtc = self._invalid[row] if why is Check.INVALID else PENDING[why]
+            memory.raise_dtc(cycle, dtc, self._senders[row], value=ages[row], confirmed=False)
+        for row, (check, age) in enumerate(zip(checks, ages, strict=True)):
+            if check or age or self.qualification[row] is not SETTLED:
+                self._judge_row(cycle, memory, row, Check(check), age)
+        self._implausible.clear()
+        trusted = [q.trusted for q in self.qualification]
+        self.valid[:] = [check <= _FRESH and good for check, good in zip(checks, trusted, strict=True)]
+        self.joints_valid = bool(self.valid[self._joint_rows].all())
+        self.settled = image.all_fresh and all(q is SETTLED for q in self.qualification)
+
+    def _judge_row(self, cycle: int, memory: FaultMemory, row: int, check: Check, age: int) -> None:
+        sender = self._senders[row]
+        fresh, late = check <= Check.SOME_LOST, age >= self._timeouts[row]
+        now = self.qualification[row] = qualify(self.qualification[row], good=fresh, timed_out=late)
+        self._known[row] |= now.trusted
+        confirmed = late and self._known[row] and self._confirms[row]
+        if check is Check.IMPLAUSIBLE:
+            dtc, value = self._implausible[row]
+            memory.raise_dtc(cycle, dtc, sender, value=value, confirmed=confirmed)
+        elif confirmed:
+            dtc = self._invalid[row] if check is Check.INVALID else CONFIRMED[check]
+            text = f"{sender}: {dtc.meaning}; its data is {age} cycles old"
+            memory.raise_dtc(cycle, dtc, sender, value=age, text=text)
+        elif fresh and age:
+            memory.raise_dtc(cycle, Dtc.NODE_LATE, sender, value=age, confirmed=False)
+        if check is Check.SOME_LOST:
+            memory.raise_dtc(cycle, Dtc.E2E_SOME_LOST, sender, value=age, confirmed=False)
+        if now.bucket == FULL and not now.trusted and self._known[row] and self._confirms[row]:
+            memory.raise_dtc(cycle, Dtc.E2E_LOSS_RATE, sender, value=now.bucket)
+
+    def missing(self) -> set[str]:
+        """Senders that are not heard in time or not trusted yet."""
+        return {self._senders[row] for row in self._needed if not self.qualification[row].trusted}

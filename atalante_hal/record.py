@@ -1,0 +1,111 @@
+"""The record of a cycle: everything known about it in one contiguous vector, and the controller's `State` as views of it.
+
+The fast process image decodes right into the record; a ring takes it with one copy.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from atalante_dbc import Message
+from atalante_hal.codec import Codec, group_of
+from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, MOTORS
+from atalante_hal.telemetry.layout import Layout
+from atalante_hal.types import State, SupervisorState
+
+#: One number each at the head of the record; "diagnostics" are bits of `diagnostics.Dtc`.
+HEADER_FIELDS = (
+    "cycle", "time", "supervisor", "assistance_factor", "cost_us", "lateness_us",
+    "overruns", "frames", "crc_errors", "dropped", "diagnostics",
+)  # fmt: skip
+
+
+class Record:
+    """The vector and its parts.
+
+    Args:
+        codec: of the fast image, whose values lie inside the record.
+        controller_fields: (name, length) of what the controller wants recorded, see `types.Controller`.
+    """
+
+    def __init__(self, codec: Codec, controller_fields: Sequence[tuple[str, int]]) -> None:
+        self.layout = Layout(_fields(codec, controller_fields))
+        self.values = np.zeros(self.layout.size)
+        # A memoryview: half the price of an array, a number at a time.
+        self.header = memoryview(self.values.data).cast("B").cast("d")[: len(HEADER_FIELDS)]
+        first = self.layout["motor_position"].start
+        self.signals = self.values[first : first + codec.size]
+        self.joint_side = self.values[self.layout["position"].start : self.layout["torque"].stop]
+        self.motor_side = self.values[self.layout["motor_position"].start : self.layout["motor_torque"].stop]
+        #: Position and velocity, shape (2, 12).
+        self.motion = self.joint_side[: 2 * len(JOINTS)].reshape(2, len(JOINTS))
+        #: State and temperature of the drives, which seldom change: one piece to compare.
+        self.drive_side = self.values[self.layout["drive_state"].start : self.layout["temperature"].stop]
+        assert self.drive_side.size == 2 * len(JOINTS)
+        self.torque_command = self.values[self.layout["torque_command"]]
+        self.level_command = self.values[self.layout["vibration_command"]]
+        self.controller = self.values[self.layout["vibration_command"].stop :]
+
+    def state(self, assistance_factor: float, messages: int) -> State:
+        """The state a controller reads; `messages`: how many are judged every cycle."""
+        values, layout = self.values, self.layout
+        return State(
+            cycle=0,
+            time=0.0,
+            supervisor=SupervisorState.OFF,
+            assistance_factor=assistance_factor,
+            position=values[layout["position"]],
+            velocity=values[layout["velocity"]],
+            torque=values[layout["torque"]],
+            temperature=values[layout["temperature"]],
+            drive_state=values[layout["drive_state"]],
+            imu_quaternion=values[layout["imu_quaternion"]].reshape(len(IMUS), 4),
+            imu_gyro=values[layout["imu_gyro"]].reshape(len(IMUS), 3),
+            imu_accel=values[layout["imu_accel"]].reshape(len(IMUS), 3),
+            foot_force=values[layout["foot_force"]].reshape(len(FEET), len(CELLS), 3),
+            vibration=values[layout["vibration"]],
+            valid=np.zeros(messages, np.bool_),
+            age=np.zeros(messages, np.int64),
+            joints_valid=False,
+        )
+
+
+def _fields(codec: Codec, controller_fields: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
+    """Header, joint side, every signal as received, commands, the controller's own."""
+    signals: dict[str, int] = {}
+    for message, signal in codec.signals:
+        name = _field_name(message, group_of(signal.name))
+        signals[name] = signals.get(name, 0) + 1
+    return [
+        *((name, 1) for name in HEADER_FIELDS),
+        *((name, len(JOINTS)) for name in ("position", "velocity", "torque")),
+        ("vibration", len(MOTORS)),
+        *signals.items(),
+        ("torque_command", len(JOINTS)),
+        ("vibration_command", len(MOTORS)),
+        *((f"controller.{name}", length) for name, length in controller_fields),
+    ]
+
+
+#: Quantity of the DBC -> field of the record, where the plain name would be ambiguous.
+_FIELD_NAMES = {
+    "Position": "motor_position",
+    "Velocity": "motor_velocity",
+    "Torque": "motor_torque",
+    "Quaternion": "imu_quaternion",
+    "Gyro": "imu_gyro",
+    "Accel": "imu_accel",
+    "Force": "foot_force",
+}
+
+
+def _field_name(message: Message, group: str) -> str:
+    if group == "Temperature" and not any(s.name == "DriveState" for s in message.signals):
+        return "sensor_temperature"
+    if group in _FIELD_NAMES:
+        return _FIELD_NAMES[group]
+    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", group).lower()
+    return f"pendant_{name}" if message.name == "PENDANT_STATE" and group not in ("Crc", "Counter") else name
