@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from atalante_dbc import Network
 from atalante_emulator.body import PERIOD, Body
-from atalante_emulator.collision import two_senders
+from atalante_emulator.collision import Senders
 from atalante_emulator.drive import WATCHDOG, DriveParameters, Drives, DriveSignals
 from atalante_emulator.emergency import COMMAND_LOST, COMMAND_REFUSED, LIFE_GUARD, TWO_SENDERS, Emergency
 from atalante_emulator.faults import LINK_KINDS, NODE_KINDS, SENSOR_KINDS, Fault
@@ -166,6 +166,7 @@ class Emulator:
         self._pendant_hears = codec.index("SYNC_RIGHT_SENSE", "HalState")
         self._sync_cycles = values[codec.slice("Cycle")]
         self._command_rows = [codec.rows[f"COMMAND_{side.upper()}_LEG"] for side in SIDES]
+        self._senders = [Senders(self._rx.codec.messages[row]) for row in self._command_rows]
         self._level_row = codec.rows["HAPTICS_COMMAND"]
         self._commanded = [False] * len(SIDES)
         self._last_sync: int | None = None
@@ -298,7 +299,7 @@ class Emulator:
                 self.drives.notice(leg, COMMAND_LOST)
             elif check in _REFUSED:
                 self.drives.notice(leg, COMMAND_REFUSED)
-            if two_senders(self._scratch[:count], self._rx.codec.messages[row]):
+            if self._senders[leg].are_two(self._scratch[:count], self.cycle):
                 self.drives.hold(leg, TWO_SENDERS)
 
     def _cycle_without_sync(self) -> bool:
@@ -387,13 +388,13 @@ class Emulator:
 
     def _with_slow(self, parts: list[Frames]) -> list[Frames]:
         """`parts`, and the messages slower than the cycle that are due."""
-        parts = list(parts)
         if self.cycle % self._haptics_cycles == 0:
             self._haptics.advance(self._level, int(self._rx.age[self._level_row]), self._haptics_cycles)
-            parts.append(self._haptics_tx.seal())
-        parts += self._heartbeats.due(self.cycle)
+            parts = [*parts, self._haptics_tx.seal()]
+        if due := self._heartbeats.due(self.cycle):
+            parts = [*parts, *due]
         if self._emergencies:
-            parts += self._seal_emergencies()
+            parts = [*parts, *self._seal_emergencies()]
         return parts
 
     def _seal_emergencies(self) -> list[Frames]:

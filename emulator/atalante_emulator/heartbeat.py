@@ -60,11 +60,11 @@ class Heartbeats:
         self.set(node, "ErrorFlags", 0.0)
         self._booting.append(status)
 
-    def due(self, cycle: int) -> list[Frames]:
+    def due(self, cycle: int) -> Sequence[Frames]:
         """The frames of this cycle, most often none. Shape (1,) each."""
         due = self._due.get(cycle % self._period)
         if due is None and not self._booting:
-            return []
+            return ()
         due_now = [*self._booting, *([due] if due is not None and due not in self._booting else [])]
         self._booting = []
         return [self._sealed(status, cycle) for status in due_now]
