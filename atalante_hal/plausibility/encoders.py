@@ -1,0 +1,126 @@
+"""Encoders against physics: a joint moves no further than it can, and turns as fast as it says.
+
+*Jump.* Between two good values, n cycles apart, a joint moves at most n * velocity_max * period, give or take 3 sigma of the
+encoder. What moved further is not used. *Velocity.* The mean of the reported velocity over eight cycles, by the trapezoidal
+rule, is the way the encoder made in them; the drive's low-pass puts them apart for a few cycles, not for fifty.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from atalante_hal.diagnostics import Dtc
+from atalante_hal.plausibility.finding import JOINT_NODES, Finding, Signals
+from atalante_hal.robot import JOINTS, Robot
+
+#: Jumps on end, without a good value between them, that are no stray any more.
+JUMPS_TO_CONFIRM = 5
+#: Samples on end, `samples` cycles apart, in which the velocity has to be wrong.
+VELOCITY_SAMPLES = 6
+_ALL = b"\1" * len(JOINTS)
+
+
+class Encoders:
+    """The twelve encoders.
+
+    Args:
+        now: what was decoded in this cycle.
+        before: the last good values.
+        period: of the cycle [s].
+        every: cycles between two calls of `judge_velocity`.
+    """
+
+    def __init__(self, robot: Robot, now: Signals, before: Signals, period: float, every: int) -> None:
+        self._now, self._before = now, before
+        self._way = robot.velocity_max * robot.gear * period
+        self._noise = 3.0 * robot.encoder_noise * robot.gear
+        self._reach = self._way + self._noise
+        # Twelve squares under the square of the smallest reach leave none beyond its own: one product for most cycles.
+        self._surely = float(self._reach.min()) ** 2
+        self._moved = np.zeros(len(JOINTS))
+        self.jumps = [0] * len(JOINTS)
+        self._jump_of = [0.0] * len(JOINTS)
+        # Twice the mean velocity of two samples less twice the way between them: the share of the later and of the earlier one.
+        time = every * period
+        self._of_later, self._of_earlier = np.array([[-2.0 / time, 1.0], [2.0 / time, 1.0]])
+        self._error, self._earlier, self._size = np.zeros((3, len(JOINTS)))
+        self._twice_allowed = 2.0 * robot.sensors.velocity_error * robot.gear
+        self._right = np.empty(len(JOINTS), np.bool_)
+        self._sampled = False
+        self._wrong = [0] * len(JOINTS)
+        self._wrong_findings: tuple[Finding, ...] = ()
+        self._gear = robot.gear.tolist()
+
+    def within_reach(self) -> bool:
+        """Whether every joint is where it can have moved to in one cycle."""
+        moved = self._moved
+        np.subtract(self._now.position, self._before.position, moved)
+        if moved.dot(moved) <= self._surely:
+            return True
+        return np.less_equal(np.abs(moved), self._reach).tobytes() == _ALL
+
+    def accept(self, joint: int, cycles: int) -> bool:
+        """Judge the new value of one joint against the last good one.
+
+        Args:
+            cycles: since then.
+
+        Returns:
+            Whether it may be used; if not, the last good position and velocity are put in its place.
+        """
+        moved = abs(float(self._now.position[joint] - self._before.position[joint]))
+        if not moved > cycles * self._way[joint] + self._noise[joint]:  # NaN: there was no value before
+            self.jumps[joint] = 0
+            return True
+        self.jumps[joint] += 1
+        self._jump_of[joint] = moved / self._gear[joint]
+        self._now.position[joint] = self._before.position[joint]
+        self._now.velocity[joint] = self._before.velocity[joint]
+        return False
+
+    def judge_velocity(self, whole: bool) -> bool:
+        """Compare velocity and encoder over the last `every` cycles.
+
+        Args:
+            whole: every joint was heard in this cycle; otherwise the comparison starts anew.
+
+        Returns:
+            Whether a velocity is wrong.
+        """
+        error, motion = self._error, self._now.motion
+        self._of_later.dot(motion, error)
+        np.add(error, self._earlier, error)
+        self._of_earlier.dot(motion, self._earlier)
+        comparable, self._sampled = whole and self._sampled, whole
+        if comparable:
+            np.abs(error, self._size)
+            right = np.less_equal(self._size, self._twice_allowed, self._right).tobytes()
+            if right != _ALL or any(self._wrong):
+                self._count_wrong()
+        return bool(self._wrong_findings)
+
+    def _count_wrong(self) -> None:
+        self._wrong = [
+            0 if right else wrong + 1 for right, wrong in zip(self._right.tolist(), self._wrong, strict=True)
+        ]
+        self._wrong_findings = tuple(
+            self._wrong_velocity(joint, 0.5 * float(self._error[joint]))
+            for joint, wrong in enumerate(self._wrong)
+            if wrong >= VELOCITY_SAMPLES
+        )
+
+    def findings(self) -> tuple[Finding, ...]:
+        """What stands."""
+        if not any(self.jumps):
+            return self._wrong_findings
+        return (*(self._jump(joint) for joint, jumps in enumerate(self.jumps) if jumps), *self._wrong_findings)
+
+    def _jump(self, joint: int) -> Finding:
+        size = self._jump_of[joint]
+        text = f"the encoder of {JOINTS[joint]} jumped by {np.degrees(size):.2f} degrees, which the joint cannot"
+        return Finding(Dtc.ENC_JUMP, JOINT_NODES[joint], size, self.jumps[joint] >= JUMPS_TO_CONFIRM, text)
+
+    def _wrong_velocity(self, joint: int, error: float) -> Finding:
+        at_joint = error / self._gear[joint]
+        text = f"the velocity of {JOINTS[joint]} is {np.degrees(at_joint):+.0f} deg/s off what its encoder does"
+        return Finding(Dtc.ENC_VELOCITY, JOINT_NODES[joint], at_joint, True, text)

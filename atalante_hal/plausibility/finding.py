@@ -1,0 +1,83 @@
+"""What a plausibility check found, and where in the process image the signals it looks at are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.codec import Codec
+from atalante_hal.diagnostics import Dtc
+from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, Vector
+
+#: Messages of the sensors, in the order of JOINTS, IMUS and FEET.
+JOINT_MESSAGES = tuple(f"{joint.upper()}_STATE" for joint in JOINTS)
+IMU_MESSAGES = tuple(f"IMU_{imu.upper()}_STATE" for imu in IMUS)
+FOOT_MESSAGES = tuple(f"FOOT_{foot.upper()}_STATE" for foot in FEET)
+#: Nodes that send them.
+JOINT_NODES, IMU_NODES, FOOT_NODES = (
+    tuple(message.removesuffix("_STATE") for message in messages)
+    for messages in (JOINT_MESSAGES, IMU_MESSAGES, FOOT_MESSAGES)
+)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One implausibility that stands."""
+
+    dtc: Dtc
+    node: str  # DBC name
+    value: float  # what was measured; its meaning depends on the code
+    confirmed: bool  # False: noticed and not used, but short enough to ride through
+    text: str  # one sentence for people
+
+
+class Signals(NamedTuple):
+    """Views of the measured signals in a vector of decoded values; motor side where there is a motor."""
+
+    position: Vector  # (12,) rad
+    velocity: Vector  # (12,) rad/s
+    torque: Vector  # (12,) Nm at the joint
+    quaternion: Vector  # (4, 4) wxyz
+    gyro: Vector  # (4, 3) rad/s
+    accel: Vector  # (4, 3) m/s2
+    force: Vector  # (2, 4, 3) N
+    motion: Vector  # (2, 12) position and velocity
+    quaternions: Vector  # (16,) quaternion
+    inertial: Vector  # (24,) gyro and accel
+    forces: Vector  # (24,) force
+
+
+def measured(codec: Codec) -> slice:
+    """Where the measured signals are in the decoded values: signed quantities come first, one after the other."""
+    return slice(codec.slice("Position").start, codec.slice("Force").stop)
+
+
+def signals_of(codec: Codec, values: Vector) -> Signals:
+    """Views of `values`, shape (codec.size,) or cut to `measured`."""
+    position, velocity, torque, quaternion, gyro, accel, force = (
+        codec.slice(quantity) for quantity in ("Position", "Velocity", "Torque", "Quaternion", "Gyro", "Accel", "Force")
+    )
+    return Signals(
+        values[position],
+        values[velocity],
+        values[torque],
+        values[quaternion].reshape(len(IMUS), 4),
+        values[gyro].reshape(len(IMUS), 3),
+        values[accel].reshape(len(IMUS), 3),
+        values[force].reshape(len(FEET), len(CELLS), 3),
+        values[position.start : velocity.stop].reshape(2, len(JOINTS)),
+        values[quaternion],
+        values[gyro.start : accel.stop],
+        values[force],
+    )
+
+
+def rows_of(codec: Codec, messages: tuple[str, ...]) -> list[int]:
+    """Rows of messages in the image."""
+    return [codec.rows[message] for message in messages]
+
+
+Ages = npt.NDArray[np.int64]

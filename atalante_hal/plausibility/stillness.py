@@ -1,0 +1,134 @@
+"""What stands still although it cannot: an encoder whose joint is pushed, a gyro or a force cell without its noise.
+
+Every signal is sampled every few cycles; one that repeats itself exactly is counted. A sample in which its node was not heard
+does not count, neither way.
+
+An encoder may stand still: it is stuck only if the drive's torque has swung by `breakaway` since it moved last, which is over
+twice the dry friction of its joint, and if the joint is not at its end stop, which holds it against any torque. A stuck encoder
+of a joint that nobody drives is not found until somebody does.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from atalante_hal.codec import Codec
+from atalante_hal.diagnostics import Dtc
+from atalante_hal.plausibility.finding import FOOT_NODES, IMU_NODES, JOINT_NODES, Ages, Finding, Signals, measured
+from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, Robot, Vector
+
+#: Cycles after which a standstill is found at the latest, counted from the first repeated sample.
+STUCK_CYCLES = 50
+FROZEN_CYCLES = 100
+#: A joint this near its limit is at its end stop [rad].
+_AT_STOP = 0.005
+_NEVER = 1 << 30
+
+
+class Stillness:
+    """Encoders, gyros and force cells that repeat themselves.
+
+    Args:
+        values: decoded values of this cycle, shape (codec.size,).
+        age: of the rows, shape (rows,).
+        every: cycles between two calls of `sample`.
+    """
+
+    def __init__(self, robot: Robot, codec: Codec, values: Vector, now: Signals, age: Ages, every: int) -> None:
+        where = measured(codec)
+        self._values, self._now, self._age = values[where], now, age
+        self._row_of = codec.row_of[where]
+        size = len(self._values)
+        self._sampled = np.full(size, np.nan)
+        self._same = np.empty(size, np.bool_)
+        self._repeats = np.zeros(size, np.int64)
+        # So many repetitions fit behind the first sample of a standstill, which comes up to `every` - 1 cycles late.
+        limit = np.full(size, _NEVER)
+        limit[codec.slice("Position")] = self._to_stuck = (STUCK_CYCLES - every + 1) // every
+        limit[codec.slice("Gyro")] = limit[codec.slice("Force")] = to_freeze = (FROZEN_CYCLES - every + 1) // every
+        self._to_freeze = to_freeze
+        self._limit = limit
+        self._over, self._none_over = np.empty(size, np.bool_), bytes(size)
+        self._encoders, self._gyros, self._cells = (
+            self._repeats[codec.slice(quantity)] for quantity in ("Position", "Gyro", "Force")
+        )
+        self._encoders_same, self._no_encoder = self._same[codec.slice("Position")], bytes(len(JOINTS))
+        self._sampled_torque = self._sampled[codec.slice("Torque")]
+        self._torque_low, self._torque_high = np.zeros((2, len(JOINTS)))
+        self._breakaway = robot.breakaway
+        self._to_joint: Vector = robot.polarity / robot.gear
+        self._low_stop, self._high_stop = robot.position_min + _AT_STOP, robot.position_max - _AT_STOP
+        #: Numbers of what stands still: joints, IMUs, cells (foot, cell).
+        self.encoders: list[int] = []
+        self.imus: list[int] = []
+        self.cells: list[tuple[int, int]] = []
+
+    def sample(self, whole: bool) -> bool:
+        """Compare with the last sample.
+
+        Args:
+            whole: every node was heard in this cycle.
+
+        Returns:
+            Whether anything stands still that cannot.
+        """
+        same, repeats = self._same, self._repeats
+        np.equal(self._values, self._sampled, same)
+        heard = None if whole else self._age[self._row_of] == 0
+        if heard is None:
+            repeats += 1
+            repeats *= same
+        else:
+            np.copyto(repeats, (repeats + 1) * same, where=heard)
+        if self._encoders_same.tobytes() != self._no_encoder:
+            self._follow_torque()
+        if heard is None:
+            self._sampled[:] = self._values
+        else:
+            np.copyto(self._sampled, self._values, where=heard)
+        over: bool = np.greater_equal(repeats, self._limit, self._over).tobytes() != self._none_over
+        if over or self.encoders or self.imus or self.cells:
+            self._judge()
+        return over
+
+    def _follow_torque(self) -> None:
+        """Range of the torque since an encoder moved last."""
+        first = self._encoders == 1
+        torque = self._now.torque
+        low = np.where(first, self._sampled_torque, self._torque_low)
+        high = np.where(first, self._sampled_torque, self._torque_high)
+        np.minimum(low, torque, out=self._torque_low)
+        np.maximum(high, torque, out=self._torque_high)
+
+    def _judge(self) -> None:
+        angle = self._now.position * self._to_joint
+        pushed = self._torque_high - self._torque_low >= self._breakaway
+        free = (angle > self._low_stop) & (angle < self._high_stop)
+        self.encoders = np.flatnonzero((self._encoders >= self._to_stuck) & pushed & free).tolist()
+        frozen = (self._gyros.reshape(len(IMUS), -1) >= self._to_freeze).all(axis=1)
+        self.imus = np.flatnonzero(frozen).tolist()
+        dead = (self._cells.reshape(len(FEET), len(CELLS), -1) >= self._to_freeze).any(axis=2)
+        self.cells = [(foot, cell) for foot, cell in np.argwhere(dead).tolist()]
+
+    def findings(self) -> tuple[Finding, ...]:
+        """What stands."""
+        return (
+            *map(self._stuck, self.encoders),
+            *map(_frozen_imu, self.imus),
+            *(_frozen_cell(foot, cell, float(self._now.force[foot, cell, 2])) for foot, cell in self.cells),
+        )
+
+    def _stuck(self, joint: int) -> Finding:
+        swing = float(self._torque_high[joint] - self._torque_low[joint])
+        text = f"the encoder of {JOINTS[joint]} stands still while the torque swings by {swing:.0f} Nm"
+        return Finding(Dtc.ENC_STUCK, JOINT_NODES[joint], swing, True, text)
+
+
+def _frozen_imu(imu: int) -> Finding:
+    text = f"the gyro of the {IMUS[imu]} IMU repeats one value for {FROZEN_CYCLES} cycles"
+    return Finding(Dtc.IMU_STUCK, IMU_NODES[imu], float(FROZEN_CYCLES), True, text)
+
+
+def _frozen_cell(foot: int, cell: int, force: float) -> Finding:
+    text = f"force cell {CELLS[cell]} of the {FEET[foot]} foot repeats {force:.0f} N"
+    return Finding(Dtc.FOOT_CELL, FOOT_NODES[foot], force, True, text)

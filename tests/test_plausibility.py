@@ -1,0 +1,673 @@
+"""Plausibility: what a healthy robot says is never doubted, and each fault is found as fast and as tightly as promised."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pinocchio
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import atalante_dbc
+from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
+from atalante_hal.codec import Codec
+from atalante_hal.diagnostics import Dtc
+from atalante_hal.plausibility import Finding, Plausibility
+from atalante_hal.plausibility.finding import Signals, measured, signals_of
+from atalante_hal.plausibility.imus import hip_angles
+from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, load_robot
+
+NETWORK = atalante_dbc.load()
+ROBOT = load_robot()
+MESSAGES = [m for m in NETWORK.received_by("HAL") if m.cycle_ms == 1]
+CODEC = Codec(MESSAGES)
+PERIOD = 1e-3
+GEAR = ROBOT.gear * ROBOT.polarity
+MIDDLE = (ROBOT.position_min + ROBOT.position_max) / 2.0
+REACH = ROBOT.velocity_max * PERIOD + 3.0 * ROBOT.encoder_noise
+MODEL = pinocchio_model(urdf(ExoskeletonParameters(), ROBOT))
+DATA = MODEL.model.createData()
+IMU_FRAMES = [MODEL.model.getFrameId(f"imu_{imu}") for imu in IMUS]
+NOISE = [signals_of(CODEC, row) for row in np.random.default_rng(1).standard_normal((1021, CODEC.size))]
+
+joints = pytest.mark.parametrize("joint", range(12), ids=JOINTS)
+imus = pytest.mark.parametrize("imu", range(4), ids=IMUS)
+cells = pytest.mark.parametrize(("foot", "cell"), [(f, c) for f in range(2) for c in range(4)])
+signs = pytest.mark.parametrize("sign", [1.0, -1.0])
+
+Change = Callable[[Signals], object]
+
+
+def row(name: str) -> int:
+    return CODEC.rows[f"{name.upper()}_STATE"]
+
+
+def attitudes(position: np.ndarray) -> np.ndarray:
+    """Quaternions wxyz of the four IMUs, by Pinocchio."""
+    q = pinocchio.neutral(MODEL.model)
+    q[MODEL.q] = position
+    pinocchio.framesForwardKinematics(MODEL.model, DATA, q)
+    quaternions = [pinocchio.Quaternion(DATA.oMf[frame].rotation).coeffs() for frame in IMU_FRAMES]
+    return np.array([[w, x, y, z] for x, y, z, w in quaternions])
+
+
+@dataclass
+class Machine:
+    """A robot whose joints swing slowly and whose sensors are well but for what a test changes."""
+
+    cycles: int = 0
+    missing: set[int] = field(default_factory=set)  # rows that are not heard
+    amplitude: float = 0.05  # rad
+    standing: bool = False
+
+    def __post_init__(self) -> None:
+        self.values = np.zeros(CODEC.size)
+        self.age = np.zeros(len(MESSAGES), np.int64)
+        self.now = signals_of(CODEC, self.values)
+        self.checks = Plausibility(ROBOT, CODEC, self.values, self.age, PERIOD)
+        self.attitudes = attitudes(MIDDLE)
+        self.run(1)
+
+    @property
+    def time(self) -> float:
+        return self.cycles * PERIOD
+
+    def position(self) -> np.ndarray:
+        return MIDDLE + self.amplitude * math.sin(3.0 * self.time)
+
+    def cycle(self, change: Change = lambda now: None) -> tuple[Finding, ...]:
+        kept = self.values.copy() if self.missing else self.values
+        now, noise = self.now, NOISE[self.cycles % len(NOISE)]
+        position = self.position()
+        now.position[:] = position * GEAR
+        now.velocity[:] = self.amplitude * 3.0 * math.cos(3.0 * self.time) * GEAR
+        swing = 20.0 * math.sin(50.0 * self.time) if self.amplitude else 0.0  # who is pushed moves
+        now.torque[:] = swing + 0.05 * noise.torque
+        if self.cycles % 16 in (0, 7):  # when they may be looked at
+            self.attitudes = attitudes(position)
+        now.quaternion[:] = self.attitudes
+        now.gyro[:] = 4e-3 * noise.gyro
+        now.accel[:] = [0.0, 0.0, 9.81]
+        now.accel[:] += 0.05 * noise.accel
+        now.force[:] = 3.0 * noise.force
+        if self.standing:
+            now.force[:, :, 2] += 100.0
+        change(now)
+        if self.missing:
+            lost = np.isin(CODEC.row_of, list(self.missing))
+            self.values[lost] = kept[lost]
+            missing = list(self.missing)
+            aged = self.age[missing] + 1
+            self.age.fill(0)
+            self.age[missing] = aged
+        else:
+            self.age.fill(0)
+        found = self.checks.check(not self.missing)
+        assert found is self.checks.findings
+        for refused, age in self.checks.rejected.items():
+            assert self.age[refused] == 0
+            self.age[refused] = age
+        self.cycles += 1
+        return found
+
+    def run(self, cycles: int, change: Change = lambda now: None) -> tuple[Finding, ...]:
+        found: tuple[Finding, ...] = ()
+        for _ in range(cycles):
+            found = self.cycle(change)
+        return found
+
+    def until_found(self, dtc: Dtc, cycles: int, change: Change) -> int:
+        """Cycles until it is found and confirmed, the first with the fault being 1."""
+        for cycle in range(1, cycles + 1):
+            if any(f.dtc is dtc and f.confirmed for f in self.cycle(change)):
+                return cycle
+        raise AssertionError(f"no {dtc} in {cycles} cycles, but {self.checks.findings}")
+
+
+def only(found: tuple[Finding, ...]) -> Finding:
+    assert len(found) == 1, found
+    return found[0]
+
+
+def test_measured_signals_come_first_and_views_are_views():
+    assert measured(CODEC) == slice(0, 100)
+    values = np.arange(CODEC.size, dtype=np.float64)
+    now = signals_of(CODEC, values)
+    assert now.motion.tolist() == [now.position.tolist(), now.velocity.tolist()]
+    assert now.inertial.tolist() == [*now.gyro.ravel(), *now.accel.ravel()]
+    assert now.quaternions.tolist() == now.quaternion.ravel().tolist()
+    assert now.forces.tolist() == now.force.ravel().tolist()
+    for name, view in now._asdict().items():
+        assert np.shares_memory(view, values), name
+    for joint in JOINTS:
+        assert now.position[JOINTS.index(joint)] == CODEC.index(f"{joint.upper()}_STATE", "Position")
+
+
+@pytest.mark.parametrize("standing", [False, True])
+def test_a_healthy_robot_is_never_doubted(standing: bool):
+    machine = Machine(standing=standing)
+    nothing = machine.checks.findings
+    for _ in range(3000):
+        assert machine.cycle() is nothing
+        assert not machine.checks.rejected
+    assert nothing == ()
+
+
+def test_losing_frames_is_not_implausible():
+    machine = Machine(amplitude=0.2)
+    rng = np.random.default_rng(2)
+    for _ in range(3000):
+        machine.missing = set(np.flatnonzero(rng.random(len(MESSAGES)) < 0.3).tolist())
+        assert machine.cycle() == ()
+        assert not machine.checks.rejected
+
+
+class TestEncoderJump:
+    @joints
+    @signs
+    def test_the_threshold_is_tight(self, joint: int, sign: float):
+        for size, refused in ((1.0 - 1e-9, False), (1.0 + 1e-9, True)):
+            machine = Machine(amplitude=0.0)
+            machine.run(5)
+
+            def move(now: Signals, size: float = size) -> None:
+                now.position[joint] = (MIDDLE[joint] + sign * size * REACH[joint]) * GEAR[joint]
+                now.velocity[joint] = 7.0
+
+            found = machine.cycle(move)
+            if not refused:
+                assert found == ()
+                assert not machine.checks.rejected
+                assert machine.now.velocity[joint] == 7.0
+                continue
+            finding = only(found)
+            assert (finding.dtc, finding.node) == (Dtc.ENC_JUMP, JOINTS[joint].upper())
+            assert not finding.confirmed
+            assert finding.value == pytest.approx(REACH[joint])
+            assert f"{JOINTS[joint]} jumped by {math.degrees(REACH[joint]):.2f} degrees" in finding.text
+            assert machine.checks.rejected == {row(JOINTS[joint]): 1}
+            assert machine.now.position[joint] == MIDDLE[joint] * GEAR[joint]
+            assert machine.now.velocity[joint] == 0.0
+            assert machine.cycle() == ()
+
+    @joints
+    @pytest.mark.parametrize("lost", [1, 4])
+    def test_who_was_not_heard_may_have_gone_further(self, joint: int, lost: int):
+        way, noise = ROBOT.velocity_max[joint] * PERIOD, 3.0 * ROBOT.encoder_noise[joint]
+        for size, refused in ((-1e-9, False), (1e-9, True)):
+            machine = Machine(amplitude=0.0)
+            machine.missing = {row(JOINTS[joint])}
+            assert machine.run(lost) == ()
+            machine.missing = set()
+            target = (MIDDLE[joint] + (lost + 1) * way + noise + size) * GEAR[joint]
+            found = machine.cycle(lambda now, target=target: now.position.__setitem__(joint, target))
+            assert bool(found) is refused
+            assert machine.checks.rejected == ({row(JOINTS[joint]): lost + 1} if refused else {})
+
+    def test_five_in_a_row_are_no_stray(self):
+        machine = Machine()
+
+        def away(now: Signals) -> None:
+            now.position[3] += 1.0 * GEAR[3]
+
+        assert [only(machine.cycle(away)).confirmed for _ in range(6)] == [False] * 4 + [True] * 2
+        assert machine.checks.rejected == {row("left_SK"): 6}
+        machine.missing = {row("left_SK")}
+        assert only(machine.cycle()).confirmed
+        assert machine.checks.rejected == {}
+        machine.missing = set()
+        assert machine.cycle() == ()
+        assert not only(machine.cycle(away)).confirmed
+
+    def test_a_value_that_stays_away_is_taken_once_the_joint_can_have_got_there(self):
+        machine = Machine(amplitude=0.0)
+        cycles = math.ceil(0.1 / (ROBOT.velocity_max[3] * PERIOD))
+        away = MIDDLE[3] + 0.1
+        for cycle in range(1, cycles + 3):
+            machine.cycle(lambda now: now.position.__setitem__(3, away * GEAR[3]))
+            assert bool(machine.checks.rejected) == (cycle * ROBOT.velocity_max[3] * PERIOD + 3e-5 < 0.1)
+
+    def test_two_joints_at_once(self):
+        machine = Machine()
+        found = machine.cycle(lambda now: now.position.__setitem__(slice(1, 8, 6), 0.0))
+        assert [f.node for f in found] == ["LEFT_TH", "RIGHT_TH"]
+        assert machine.checks.rejected == {row("left_TH"): 1, row("right_TH"): 1}
+
+    def test_the_first_value_may_be_any(self):
+        values, age = np.full(CODEC.size, np.nan), np.zeros(len(MESSAGES), np.int64)
+        checks = Plausibility(ROBOT, CODEC, values, age, PERIOD)
+        values[:100] = Machine().values[:100]
+        assert checks.check(True) == ()
+        assert not checks.rejected
+
+    def test_many_quick_joints_are_no_jump(self):
+        machine = Machine(amplitude=0.0)
+        machine.cycle(lambda now: now.position.__iadd__(0.9 * REACH * GEAR))
+        assert machine.checks.findings == ()
+        assert not machine.checks.rejected
+
+
+class TestVelocity:
+    @joints
+    @signs
+    def test_the_threshold_is_tight_and_found_in_time(self, joint: int, sign: float):
+        error = ROBOT.sensors.velocity_error
+        for phase in (0, 3, 7):
+            machine = Machine(amplitude=0.0)
+            machine.run(40 + phase)
+
+            def off(now: Signals, size: float) -> None:
+                now.velocity[joint] = sign * size * error * GEAR[joint]
+
+            assert machine.run(100, lambda now: off(now, 1.0 - 1e-9)) == ()
+            machine.run(9)
+            assert machine.until_found(Dtc.ENC_VELOCITY, 56, lambda now: off(now, 1.0 + 1e-6)) >= 40
+            finding = only(machine.checks.findings)
+            assert finding.node == JOINTS[joint].upper()
+            assert finding.value == pytest.approx(sign * error, rel=1e-5)
+            assert f"velocity of {JOINTS[joint]} is {math.degrees(sign * error):+.0f} deg/s" in finding.text
+            assert machine.run(17) == ()
+
+    def test_the_mean_counts_and_not_the_moment(self):
+        machine = Machine()
+        rng = np.random.default_rng(3)
+        jitter = [rng.choice([-0.9, 0.9]) for _ in range(1000)]
+        assert machine.run(400, lambda now: now.velocity.__iadd__(jitter[machine.cycles // 8] * GEAR)) == ()
+
+    def test_a_cycle_with_a_loss_starts_the_comparison_anew(self):
+        machine = Machine()
+        for cycle in range(200):
+            machine.missing = {row("right_HA")} if cycle % 8 < 4 else set()
+            assert machine.cycle(lambda now: now.velocity.__setitem__(5, 1000.0)) == ()
+
+    def test_it_follows_the_way_of_the_encoder(self):
+        machine = Machine(amplitude=0.0)
+
+        def turn(now: Signals) -> None:
+            now.position[5] += 0.3 * machine.time * GEAR[5]
+            now.velocity[5] = 0.3 * GEAR[5]
+
+        machine.checks._before[5] = 0.0
+        assert all(f.dtc is not Dtc.ENC_VELOCITY for f in machine.run(300, turn))
+
+
+class TestImuRange:
+    @imus
+    @pytest.mark.parametrize("quantity", ["gyro", "accel"])
+    @pytest.mark.parametrize("axis", range(3))
+    @signs
+    def test_the_last_step_of_the_range_is_no_measurement(self, imu: int, quantity: str, axis: int, sign: float):
+        index = CODEC.index(f"IMU_{IMUS[imu].upper()}_STATE", f"{quantity.capitalize()}X")
+        signal = CODEC.signals[index][1]
+        machine = Machine()
+        machine.run(5)
+        before = {name: getattr(machine.now, name)[imu].copy() for name in ("quaternion", "gyro", "accel")}
+
+        def say(value: float) -> Change:
+            return lambda now: getattr(now, quantity)[imu].__setitem__(axis, sign * value)
+
+        assert machine.cycle(say(signal.maximum - signal.factor)) == ()
+        before = {name: getattr(machine.now, name)[imu].copy() for name in before}
+        finding = only(machine.cycle(say(signal.maximum)))
+        assert (finding.dtc, finding.node) == (Dtc.IMU_SATURATED, f"IMU_{IMUS[imu].upper()}")
+        assert finding.value == pytest.approx(signal.maximum)
+        assert f"the {IMUS[imu]} IMU is at the end of its range, {signal.maximum:.0f}" in finding.text
+        assert machine.checks.rejected == {row(f"IMU_{IMUS[imu]}"): 1}
+        for name, value in before.items():
+            assert np.array_equal(getattr(machine.now, name)[imu], value)
+        assert machine.cycle() == ()
+
+    @imus
+    def test_ten_cycles_without_a_value_give_an_imu_up(self, imu: int):
+        machine = Machine()
+        found = [only(machine.cycle(lambda now: now.gyro.__setitem__(imu, 40.95875))) for _ in range(11)]
+        assert [f.confirmed for f in found] == [False] * 9 + [True] * 2
+        assert machine.checks.rejected == {row(f"IMU_{IMUS[imu]}"): 11}
+
+    def test_all_shaking_hard_is_no_saturation(self):
+        machine = Machine()
+        assert machine.cycle(lambda now: now.accel.__iadd__(30.0)) == ()
+
+
+class TestQuaternion:
+    @imus
+    @pytest.mark.parametrize("phase", range(8))
+    def test_the_norm_is_tight_and_found_at_once(self, imu: int, phase: int):
+        allowed = ROBOT.sensors.quaternion_error
+        machine = Machine()
+        machine.run(phase)
+        for squared in (1.0 + allowed * (1.0 - 1e-9), 1.0 - allowed * (1.0 - 1e-9)):
+            assert machine.run(9, lambda now, s=squared: now.quaternion[imu].__imul__(math.sqrt(s))) == ()
+            assert not machine.checks.rejected
+            machine.cycle()
+        for squared in (1.0 + allowed * (1.0 + 1e-9), 1.0 - allowed * (1.0 + 1e-9)):
+
+            def stretch(now: Signals, squared: float = squared) -> None:
+                now.quaternion[imu] *= math.sqrt(squared)
+
+            finding = only(machine.cycle(stretch))
+            assert (finding.dtc, finding.node) == (Dtc.IMU_INVALID, f"IMU_{IMUS[imu].upper()}")
+            assert not finding.confirmed
+            assert finding.value == pytest.approx(math.sqrt(squared))
+            assert f"quaternion of the {IMUS[imu]} IMU has the norm {math.sqrt(squared):.3f}" in finding.text
+            assert machine.checks.rejected == {row(f"IMU_{IMUS[imu]}"): 1}
+            assert np.allclose(np.linalg.norm(machine.now.quaternion[imu]), 1.0)
+            assert not only(machine.run(8, stretch)).confirmed
+            assert only(machine.cycle(stretch)).confirmed
+            assert machine.cycle() == ()
+            assert machine.checks.rejected == {}
+
+    @pytest.mark.parametrize("phase", range(8))
+    def test_two_that_err_the_opposite_way_are_found_within_eight_cycles(self, phase: int):
+        machine = Machine()
+        machine.run(phase)
+
+        def stretch(now: Signals) -> None:
+            now.quaternion[1] *= math.sqrt(1.1)
+            now.quaternion[3] *= math.sqrt(0.9)
+
+        assert any(machine.cycle(stretch) for _ in range(8))
+        assert [f.node for f in machine.checks.findings] == ["IMU_PELVIS", "IMU_RIGHT_TIBIA"]
+        assert machine.checks.rejected == {row("IMU_pelvis"): 1, row("IMU_right_tibia"): 1}
+
+
+angles = st.floats(-1.2, 1.2)
+
+
+class TestDrift:
+    @given(st.lists(angles, min_size=12, max_size=12))
+    def test_two_attitudes_tell_the_angles_between_them(self, position: list[float]):
+        q = np.array(position)
+        quaternions = attitudes(q)
+        for hip, tibia in ((0, IMUS.index("left_tibia")), (6, IMUS.index("right_tibia"))):
+            found = hip_angles(quaternions[IMUS.index("pelvis")].tolist(), quaternions[tibia].tolist())
+            expected = (q[hip], q[hip + 1], q[hip + 2] + q[hip + 3])
+            assert found == pytest.approx(expected, abs=1e-9)
+            turned = hip_angles((-quaternions[IMUS.index("pelvis")]).tolist(), quaternions[tibia].tolist())
+            assert turned == pytest.approx(expected, abs=1e-9)
+
+    def test_a_sine_beyond_one_is_a_right_angle(self):
+        half = math.sqrt(0.5) * (1.0 + 1e-5)
+        assert hip_angles([1.0, 0.0, 0.0, 0.0], [half, 0.0, 0.0, half])[1] == math.pi / 2.0
+        assert hip_angles([1.0, 0.0, 0.0, 0.0], [half, 0.0, 0.0, -half])[1] == -math.pi / 2.0
+
+    @joints
+    @signs
+    def test_the_threshold_is_tight_where_an_imu_sees_the_joint(self, joint: int, sign: float):
+        allowed = ROBOT.sensors.attitude_error
+        machine = Machine(amplitude=0.0)
+        offset = 0.0
+
+        def off(now: Signals) -> None:
+            now.position[joint] += offset * GEAR[joint]
+
+        for offset in np.linspace(0.0, sign * allowed * (1.0 - 1e-6), 20):  # noqa: B007 - read by `off`
+            machine.cycle(off)
+        assert machine.run(200, off) == ()
+        offset = sign * allowed * (1.0 + 1e-6)
+        if JOINTS[joint].endswith(("SA", "HA")):  # the promised miss
+            assert machine.run(400, off) == ()
+            return
+        assert 64 < machine.until_found(Dtc.ENC_DRIFT, 128, off) <= 128
+        finding = only(machine.checks.findings)
+        named = JOINTS[joint].replace("SK", "SH")
+        assert finding.node == named.upper()
+        assert finding.value == pytest.approx(offset, rel=1e-5)
+        assert f"{math.degrees(offset):+.1f} degrees off" in finding.text
+        assert JOINTS[joint] in finding.text
+        machine.missing = {row("pendant")}
+        assert only(machine.run(40, off)) is finding
+        machine.missing = set()
+        offset = 0.0
+        assert machine.run(33, off) == ()
+
+    @pytest.mark.parametrize("rate", [0.035, 0.05, 0.2])
+    def test_a_slow_drift_is_found_within_a_thousand_cycles(self, rate: float):
+        machine = Machine()
+        begin = machine.cycles
+
+        def drift(now: Signals) -> None:
+            now.position[8] += rate * PERIOD * (machine.cycles - begin) * GEAR[8]
+
+        machine.until_found(Dtc.ENC_DRIFT, 1000, drift)
+
+
+class TestStuckEncoder:
+    @joints
+    @pytest.mark.parametrize("phase", [0, 1, 4, 7])
+    def test_found_within_fifty_cycles_while_the_torque_swings(self, joint: int, phase: int):
+        machine = Machine()
+        machine.run(20 + phase)
+        stuck = float(machine.now.position[joint])
+
+        def stick(now: Signals) -> None:
+            now.position[joint] = stuck
+            now.velocity[joint] = 0.0
+
+        assert 33 <= machine.until_found(Dtc.ENC_STUCK, 50, stick) <= 50
+        finding = only(machine.checks.findings)
+        assert finding.node == JOINTS[joint].upper()
+        assert finding.value >= ROBOT.breakaway[joint]
+        assert f"{JOINTS[joint]} stands still while the torque swings by {finding.value:.0f} Nm" in finding.text
+        assert machine.checks.rejected == {}
+        assert machine.run(9) == ()
+
+    @joints
+    def test_the_swing_of_the_torque_is_tight_and_counted_from_where_it_stood(self, joint: int):
+        machine = Machine(amplitude=0.0)
+        wobble = 0.0
+
+        def hold(now: Signals) -> None:
+            now.position[:] += np.array([machine.cycles % 7] * 12) * 1e-5
+            now.position[joint] = MIDDLE[joint] * GEAR[joint]
+            now.torque[:] = 3.0 + wobble
+
+        wobble = 30.0
+        machine.run(16, lambda now: (hold(now), now.position.__iadd__(1e-4 * machine.cycles)))
+        wobble = 0.0
+        machine.run(16, hold)
+        wobble = ROBOT.breakaway[joint] * (1.0 - 1e-9)
+        assert machine.run(100, hold) == ()
+        wobble = -1e-6
+        assert machine.until_found(Dtc.ENC_STUCK, 8, hold) <= 8
+        assert only(machine.checks.findings).value == pytest.approx(ROBOT.breakaway[joint], rel=1e-5)
+
+    @joints
+    @pytest.mark.parametrize("limit", ["position_min", "position_max"])
+    def test_a_joint_at_its_stop_may_stand_still(self, joint: int, limit: str):
+        end = getattr(ROBOT, limit)[joint]
+        inwards = 1.0 if limit == "position_min" else -1.0
+        for distance, found in ((0.0049, False), (0.0051, True)):
+            machine = Machine(amplitude=0.0)
+            machine.now.position[joint] = machine.checks._before[joint] = (end + inwards * distance) * GEAR[joint]
+
+            def push(now: Signals, machine: Machine = machine) -> None:
+                now.position[joint] = machine.checks._before[joint]
+                now.torque[joint] = 20.0 * math.sin(50.0 * machine.time)
+
+            machine.run(60, push)
+            stuck = [f.node for f in machine.checks.findings if f.dtc is Dtc.ENC_STUCK]
+            assert stuck == ([JOINTS[joint].upper()] if found else [])
+
+    def test_who_is_not_heard_is_not_stuck(self):
+        machine = Machine()
+        machine.missing = {row("left_SK")}
+        assert machine.run(200) == ()
+
+
+class TestFrozenImu:
+    @imus
+    @pytest.mark.parametrize("phase", range(0, 8, 3))
+    def test_found_within_a_hundred_cycles(self, imu: int, phase: int):
+        machine = Machine()
+        machine.run(20 + phase)
+        frozen = machine.now.gyro[imu].copy()
+
+        def freeze(now: Signals) -> None:
+            now.gyro[imu] = frozen
+
+        assert 88 <= machine.until_found(Dtc.IMU_STUCK, 100, freeze) <= 96
+        finding = only(machine.checks.findings)
+        assert (finding.node, finding.value) == (f"IMU_{IMUS[imu].upper()}", 100.0)
+        assert f"gyro of the {IMUS[imu]} IMU" in finding.text
+        assert machine.checks.rejected == {row(f"IMU_{IMUS[imu]}"): 1}
+        assert only(machine.run(20, freeze)) == finding
+        assert machine.checks.rejected == {row(f"IMU_{IMUS[imu]}"): 21}
+        assert machine.run(9) == ()
+        assert machine.checks.rejected == {}
+
+    def test_an_axis_alone_may_stand_still(self):
+        machine = Machine()
+        assert machine.run(300, lambda now: now.gyro.__setitem__((slice(None), slice(2)), 0.0)) == ()
+
+    def test_a_lost_frame_does_not_count(self):
+        machine = Machine()
+        frozen = machine.now.gyro[0].copy()
+        waited = 0
+        while not machine.checks.findings:
+            machine.missing = {row("IMU_torso")} if waited % 16 < 8 else set()
+            machine.cycle(lambda now: now.gyro.__setitem__(0, frozen))
+            waited += 1
+        assert 150 < waited < 200
+
+
+class TestForceCells:
+    @cells
+    @pytest.mark.parametrize("axis", range(3))
+    @pytest.mark.parametrize("value", [0.0, 400.0])
+    def test_one_that_repeats_itself_is_silenced(self, foot: int, cell: int, axis: int, value: float):
+        machine = Machine()
+        machine.run(21)
+
+        def stick(now: Signals) -> None:
+            now.force[foot, cell, axis] = value
+
+        assert 88 <= machine.until_found(Dtc.FOOT_CELL, 100, stick) <= 96
+        finding = only(machine.checks.findings)
+        assert finding.node == f"FOOT_{FEET[foot].upper()}"
+        assert f"force cell {CELLS[cell]} of the {FEET[foot]} foot repeats" in finding.text
+        if axis == 2:
+            assert finding.value == value
+        assert not machine.now.force[foot, cell].any()
+        assert np.count_nonzero(machine.now.force) == 21
+        assert machine.checks.rejected == {}
+        machine.run(30, stick)
+        assert not machine.now.force[foot, cell].any()
+        machine.missing = {row(f"FOOT_{FEET[foot]}")}
+        machine.run(20, stick)
+        machine.missing = set()
+        assert only(machine.cycle(stick)).dtc is Dtc.FOOT_CELL
+        assert machine.run(9) == ()
+        assert machine.now.force[foot, cell].all()
+
+    def stick_out(self, foot: int, cell: int, force: float) -> Change:
+        return lambda now: now.force[foot, cell].__setitem__(2, force + now.force[foot, cell, 0])
+
+    @cells
+    @signs
+    def test_one_that_carries_alone_contradicts_the_others(self, foot: int, cell: int, sign: float):
+        machine = Machine()
+        change = self.stick_out(foot, cell, sign * 200.0)
+        assert 250 <= machine.until_found(Dtc.FOOT_CELL, 260, change) <= 260
+        finding = only(machine.checks.findings)
+        assert finding.node == f"FOOT_{FEET[foot].upper()}"
+        assert finding.value == pytest.approx(sign * 200.0, abs=20.0)
+        assert f"force cell {CELLS[cell]} of the {FEET[foot]} foot says" in finding.text
+        assert not machine.now.force[foot, cell].any()
+        assert only(machine.run(8, change)) == finding
+        machine.missing = {row(f"FOOT_{FEET[foot]}")}
+        assert only(machine.run(8)) == finding
+        machine.missing = set()
+        assert machine.run(5) == ()
+
+    @cells
+    def test_one_that_is_free_under_a_load_contradicts_the_others(self, foot: int, cell: int):
+        machine = Machine(standing=True)
+        heavy = machine.run(500, lambda now: now.force[foot, :, 2].__iadd__(20.0))
+        assert heavy == ()
+
+        def lift(now: Signals, load: float) -> None:
+            now.force[foot, :, 2] = load / 3.0 + 0.1 * now.force[foot, :, 0]
+            now.force[foot, cell, 2] = now.force[foot, cell, 0]
+
+        assert machine.run(500, lambda now: lift(now, 296.0)) == ()
+        assert machine.until_found(Dtc.FOOT_CELL, 260, lambda now: lift(now, 304.0)) >= 250
+        finding = only(machine.checks.findings)
+        assert finding.node == f"FOOT_{FEET[foot].upper()}"
+        assert CELLS[cell] in finding.text
+
+    def test_thresholds_of_free_and_alone(self):
+        free = ROBOT.sensors.cell_free
+        for force, found in ((free, False), (free * (1.0 + 1e-9), True)):
+            machine = Machine()
+            for cycle in range(300):
+                exact = force * (1.0 - 1e-12 * (cycle % 3))
+                machine.cycle(lambda now, exact=exact: now.force[1, 2].__setitem__(2, exact))
+            assert bool(machine.checks._feet.cells) is found
+
+    def test_two_cells_are_a_foot_that_rocks(self):
+        machine = Machine()
+        assert machine.run(600, lambda now: now.force[0, :2, 2].__iadd__(200.0)) == ()
+
+
+class TestContact:
+    def stand(self, machine: Machine, cycles: int, cells: int = 4, force: float = 200.0) -> tuple[Finding, ...]:
+        return machine.run(cycles, lambda now: now.force[1, :cells, 2].__iadd__(force))
+
+    @pytest.mark.parametrize("phase", range(4))
+    @pytest.mark.parametrize("cells", [2, 4])
+    def test_both_feet_off_the_ground_are_found_within_twenty_cycles(self, phase: int, cells: int):
+        machine = Machine()
+        machine.run(phase)
+        assert self.stand(machine, 40, cells) == ()
+        assert 16 < machine.until_found(Dtc.CONTACT_IMPLAUSIBLE, 24, lambda now: None) <= 20
+        finding = only(machine.checks.findings)
+        assert (finding.node, finding.value, finding.confirmed) == ("FOOT_LEFT", 20.0, True)
+        assert "both feet" in finding.text
+        assert only(machine.run(900)) is finding
+        assert machine.run(100) == ()
+        assert machine.run(1000) == ()
+
+    def test_standing_again_ends_it(self):
+        machine = Machine()
+        self.stand(machine, 8)
+        machine.run(30)
+        assert machine.checks.findings
+        assert self.stand(machine, 4) == ()
+
+    def test_nineteen_cycles_are_a_jolt(self):
+        machine = Machine()
+        for _ in range(5):
+            self.stand(machine, 8)
+            for _ in range(16):
+                assert machine.cycle() == ()
+
+    def test_one_cell_is_no_foot_on_the_ground(self):
+        machine = Machine()
+        self.stand(machine, 100, cells=1)
+        assert machine.run(100) == ()
+
+
+def test_what_was_kept_is_what_was_good_last():
+    """A jump, a lost frame and another jump: the value of before the first is in use all the time."""
+    machine = Machine()
+    good = float(machine.now.position[4])
+    for change, missing in ((1.0, set()), (0.0, {row("left_SA")}), (1.0, set())):
+        machine.missing = missing
+        machine.cycle(lambda now, change=change: now.position.__setitem__(4, change * GEAR[4]))
+        assert machine.now.position[4] == good
+    assert machine.checks.rejected == {row("left_SA"): 3}
+    assert only(machine.checks.findings).dtc is Dtc.ENC_JUMP
+
+
+def test_two_machines_alike_find_alike():
+    def run(machine: Machine) -> list[Any]:
+        machine.run(10)
+        return [machine.cycle(lambda now: now.position.__setitem__(2, 0.0)) for _ in range(40)]
+
+    assert run(Machine()) == run(Machine())
