@@ -11,7 +11,6 @@ from atalante_emulator import emergency
 from atalante_emulator.body import PERIOD
 from atalante_emulator.drive import NODES, SLOW_CYCLES, WATCHDOG, DriveParameters, Drives, DriveSignals
 from atalante_emulator.emergency import Emergency
-from atalante_emulator.encoder import COUNTS
 from atalante_emulator.motor import MotorParameters
 from atalante_hal.cia402 import Controlword, DriveState, controlword_towards_operation
 from atalante_hal.robot import Robot, load_robot
@@ -221,39 +220,6 @@ def test_hold_damps_motion() -> None:
         torque = bench.cycle()
     stretched = torque + ROBOT.hold_kp * bench.position
     np.testing.assert_allclose(stretched, -speed * ROBOT.hold_kd, rtol=0.1)
-
-
-@pytest.mark.parametrize("polarity", [1.0, -1.0])
-def test_encoder_is_quantised_at_the_motor(polarity: float) -> None:
-    robot = dataclasses.replace(ROBOT, polarity=np.full(12, polarity))
-    bench = Bench(robot=robot)
-    rng = np.random.default_rng(2)
-    lsb = 2.0 * math.pi / COUNTS
-    for _ in range(100):
-        bench.position[:] = rng.uniform(robot.position_min, robot.position_max)
-        bench.cycle()
-        counts = bench.signals.position / lsb
-        np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
-        error = bench.signals.position - bench.position * robot.gear * polarity
-        assert np.abs(error).max() <= 0.5001 * lsb
-
-
-def test_velocity_estimate_is_an_80_hz_low_pass_of_the_encoder(bench: Bench) -> None:
-    speed, lsb = 1.0, 2.0 * math.pi / COUNTS
-    bench.cycle()
-    assert not bench.signals.velocity.any()
-    for n in range(1, 40):
-        bench.position += speed * PERIOD
-        bench.cycle()
-        expected = speed * ROBOT.gear * (1.0 - math.exp(-2.0 * math.pi * 80.0 * n * PERIOD))
-        np.testing.assert_allclose(bench.signals.velocity, expected, atol=lsb / PERIOD)
-
-
-def test_a_joint_that_stands_somewhere_at_switch_on_does_not_seem_to_jump() -> None:
-    bench = Bench()
-    bench.position[:] = 0.3
-    bench.cycle()
-    assert not bench.signals.velocity.any()
 
 
 def test_torque_noise_is_seeded_and_of_the_stated_size(bench: Bench) -> None:

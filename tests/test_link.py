@@ -209,7 +209,7 @@ class TestContent:
         assert values[codec.index(KNEE, "Velocity")] == pytest.approx(2.0)
 
     def test_invalid_code(self, line: Make) -> None:
-        assert line(Fault("raw", KNEE, 1, 1, Position=0x800000)).run(2).knee == [OK, Check.RANGE]
+        assert line(Fault("raw", KNEE, 1, 1, Position=0x800000)).run(2).knee == [OK, Check.INVALID]
 
 
 class TestAdded:

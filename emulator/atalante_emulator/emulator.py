@@ -46,7 +46,7 @@ _BATCH = 128
 #: Cycles of noise drawn at once.
 _NOISE_CYCLES = 128
 #: What a command frame is when it came, and is not to be followed.
-_REFUSED = (Check.CRC, Check.LENGTH, Check.RANGE)
+_REFUSED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
 #: Longest wait [s] for the other SYNCs of a cycle once the first is there.
 _SYNC_SKEW = 200e-6
 

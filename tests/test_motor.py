@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from atalante_emulator.body import PERIOD
+from atalante_emulator.motor import MotorParameters, Motors
+from atalante_hal.robot import Robot
+
+SMOOTH = MotorParameters(coulomb=(0.0,) * 6, viscous=(0.0,) * 6)
+ALL, NONE = np.ones(12, np.bool_), np.zeros(12, np.bool_)
+STILL = np.zeros(12)
+
+
+@pytest.fixture
+def motors(robot: Robot) -> Motors:
+    return Motors(robot, SMOOTH, *np.zeros((2, 12)))
+
+
+def settle(motors: Motors, velocity: np.ndarray = STILL) -> np.ndarray:
+    for _ in range(30):
+        torque = motors.turn(velocity)
+    return np.array(torque)
+
+
+def test_torque_follows_as_a_first_order_lag(robot: Robot) -> None:
+    measured = np.zeros(12)
+    motors = Motors(robot, SMOOTH, measured, np.zeros(12))
+    motors.power(ALL)
+    motors.wanted[:] = 20.0
+    for n in range(1, 6):
+        expected = 20.0 * (1.0 - math.exp(-n * PERIOD / SMOOTH.current_loop))
+        np.testing.assert_allclose(motors.turn(STILL), expected, rtol=1e-12)
+        np.testing.assert_allclose(measured, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("speed", [-3.0, -0.01, 0.0, 0.002, 1.5])
+@pytest.mark.parametrize("powered", [ALL, NONE], ids=["powered", "braked"])
+def test_friction_and_brake_take_power_and_never_give_it(robot: Robot, powered: np.ndarray, speed: float) -> None:
+    motors = Motors(robot, MotorParameters(), *np.zeros((2, 12)))
+    motors.power(powered)
+    power = np.array(motors.turn(np.full(12, speed))) * speed
+    assert (power < 0.0).all() if speed else not power.any()
+
+
+def test_only_a_motor_without_power_brakes(motors: Motors) -> None:
+    motors.power(np.arange(12) != 3)
+    torque = np.array(motors.turn(np.full(12, 0.5)))
+    assert torque[3] == pytest.approx(-0.5 * SMOOTH.brake[3])
+    assert not np.delete(torque, 3).any()
+    motors.power(ALL)
+    assert not np.array(motors.turn(np.full(12, 0.5))).any()
+
+
+def test_a_weak_motor_measures_what_it_should_make(robot: Robot) -> None:
+    measured = np.zeros(12)
+    motors = Motors(robot, SMOOTH, measured, np.zeros(12))
+    motors.power(ALL)
+    motors.weaken(2, 0.25)
+    motors.wanted[:] = 40.0
+    np.testing.assert_allclose(settle(motors), [40.0, 40.0, 10.0] + [40.0] * 9, rtol=1e-6)
+    np.testing.assert_allclose(measured, 40.0, rtol=1e-6)
+    motors.weaken(2, 1.0)
+    np.testing.assert_allclose(settle(motors), 40.0, rtol=1e-6)
+
+
+def test_a_push_is_on_the_joint_and_not_measured(robot: Robot) -> None:
+    measured = np.zeros(12)
+    motors = Motors(robot, SMOOTH, measured, np.zeros(12))
+    motors.push(5, 30.0)
+    motors.push(6, -10.0)
+    np.testing.assert_allclose(motors.turn(STILL), [0.0] * 5 + [30.0, -10.0] + [0.0] * 5)
+    motors.push(5, 0.0)
+    np.testing.assert_allclose(motors.turn(STILL), [0.0] * 6 + [-10.0] + [0.0] * 5)
+    motors.push(6, 0.0)
+    assert not any(motors.turn(STILL))
+    assert not measured.any()
+
+
+def test_heat_goes_with_torque_squared_and_time(robot: Robot) -> None:
+    motors = Motors(robot, SMOOTH, *np.zeros((2, 12)))
+    assert set(motors.temperature) == {SMOOTH.ambient}
+    motors.power(ALL)
+    motors.wanted[:] = 0.5 * robot.torque_max
+    motors.wanted[0] *= 0.5
+    settle(motors)
+    motors.warm(3.0)
+    rise = SMOOTH.heating * 3.0 / SMOOTH.thermal_time
+    np.testing.assert_allclose(motors.temperature - SMOOTH.ambient, [0.25 * rise] + [rise] * 11, rtol=1e-6)
+    motors.warm(0.0)
+    np.testing.assert_allclose(motors.temperature - SMOOTH.ambient, [0.25 * rise] + [rise] * 11, rtol=1e-6)
