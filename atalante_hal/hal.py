@@ -79,7 +79,7 @@ class Hal:
     ) -> None:
         if not 0.0 <= assistance_factor <= 1.0:
             raise ValueError(f"the assistance factor is between 0 and 1, not {assistance_factor}")
-        self.network, self.robot, self.bus, self.patience = network, robot, bus, patience
+        self.network, self.robot, self.patience = network, robot, patience
         self.conditions = Conditions()
         #: Why the robot is in the state it is in, one sentence.
         self.reason = "nothing has happened yet"
@@ -96,6 +96,7 @@ class Hal:
         #: What loop and controller did wrong since the last judgement: code, whether confirmed, value, sentence.
         self._reports: list[tuple[Dtc, bool, float, str]] = []
         self._ending = False
+        self._barred = False  # another HAL was heard before this one moved anything
         self._start_wanted = 0  # cycles left to reach ACTIVE, 0: nobody asked
         self._assistance_factor = assistance_factor  # the operator's
         self._leading = False  # the assistance factor is on its way to 1 or back
@@ -198,7 +199,7 @@ class Hal:
         header = self._header
         header[0], header[1] = cycle, state.time
         header[7] += count
-        header[9] = self.bus.dropped
+        header[9] = transceiver.bus.dropped
         return state
 
     def write(self, command: Command) -> Vector:
@@ -259,8 +260,8 @@ class Hal:
         return self._send_hold()
 
     def report(self, dtc: Dtc, text: str, *, confirmed: bool = True, value: float = 0.0) -> None:
-        """The loop noticed a fault of timing; judged in the next `read`."""
-        self._report(dtc, text, confirmed, value)
+        """The loop noticed a fault of timing at the start of a cycle; judged in its `read`."""
+        self._report(dtc, text, confirmed, value, cycle=self.state.cycle + 1)
         if dtc is Dtc.CYCLE_GAP and confirmed:
             self._transceiver.discard()
 
@@ -273,6 +274,15 @@ class Hal:
             self.read()
             self.hold()
         self.patience = patience
+
+    @property
+    def bus(self) -> Bus:
+        """What carries the frames."""
+        return self._transceiver.bus
+
+    @bus.setter
+    def bus(self, bus: Bus) -> None:
+        self._transceiver.bus = bus
 
     @property
     def tap(self) -> FrameTap | None:
@@ -354,9 +364,12 @@ class Hal:
         if not self._heartbeats.quiet:
             self._steady = False
 
-    def _report(self, dtc: Dtc, text: str, confirmed: bool = True, value: float = 0.0) -> None:
+    def _report(
+        self, dtc: Dtc, text: str, confirmed: bool = True, value: float = 0.0, cycle: int | None = None
+    ) -> None:
         """Told at once, judged in the next `read`."""
-        self._memory.raise_dtc(self.state.cycle, dtc, "HAL", value=value, confirmed=confirmed, text=text)
+        cycle = self.state.cycle if cycle is None else cycle
+        self._memory.raise_dtc(cycle, dtc, "HAL", value=value, confirmed=confirmed, text=text)
         self._reports.append((dtc, confirmed, value, text))
         self._steady = False
 
@@ -373,8 +386,11 @@ class Hal:
         self._reports.clear()
         nodes_well = judgement.nodes_well and self._heartbeats.known
         self._judge_drives(nodes_well)
+        if self._barred:
+            memory.raise_dtc(cycle, Dtc.HAL_DUPLICATE, "HAL", text="another HAL was there first: end one, start again")
         pendant.hear(judgement.trusts(pendant.row))
         memory.close_cycle(cycle)
+        self._barred |= Dtc.HAL_DUPLICATE in memory.confirmed and state.supervisor in (_S.OFF, _S.READY)
         self._judge_start()
         self.conditions = Conditions(
             diagnostics=memory.confirmed,

@@ -94,7 +94,9 @@ class Judgement:
     def _judge_row(self, cycle: int, memory: FaultMemory, row: int, check: Check, age: int) -> None:
         sender = self._senders[row]
         fresh, late = check <= Check.SOME_LOST, age >= self._timeouts[row]
-        now = self.qualification[row] = qualify(self.qualification[row], good=fresh, timed_out=late)
+        # What a frame says may be impossible: the way it came is good all the same.
+        intact = fresh or check >= Check.RANGE
+        now = self.qualification[row] = qualify(self.qualification[row], good=intact, timed_out=late)
         self._known[row] |= now.trusted
         confirmed = late and self._known[row] and self._confirms[row]
         if check is Check.IMPLAUSIBLE:

@@ -90,7 +90,7 @@ def open_hal(
     Raises:
         ValueError: an operator of this process for a robot in another.
         FaultError: the network has no such target or signal.
-        BusError, ChannelMapError: the buses cannot be opened.
+        BusError, ChannelMapError: the buses cannot be opened, or another HAL is at work on them.
         Failed: the embedded robot needs PyBullet and it is not installed.
     """
     network = network or atalante_dbc.load()
@@ -126,6 +126,8 @@ def open_hal(
             gait_hash=gait_hash,
             tap=tap,
         )
+        if apart is None and not target.embedded:
+            hal.listen()
         yield Rig(target, hal, emulator, operator if emulator else None)
 
 
