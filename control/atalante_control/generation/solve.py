@@ -47,7 +47,11 @@ _OPTIONS: dict[str, Any] = {
 }
 #: From a neighbour: begin with small barriers, but not at the bounds. 17 to 21 iterations instead of 34 to 36.
 _WARM: dict[str, Any] = {"ipopt.mu_init": 1e-3, "ipopt.bound_mult_init_method": "mu-based"}
-_SOURCES = ("generation/*.py", "model/*.py", "gait.py", "subject.py", "stance_dynamics.py")
+#: Everything that decides a gait.
+_SOURCES = (
+    *(f"generation/{module}.py" for module in ("dynamics", "guess", "problem", "programme", "solve")),
+    *("gait.py", "idealization.py", "stance_dynamics.py", "model/*.py"),
+)
 
 
 def solve(
@@ -113,7 +117,7 @@ def solve(
 
 @cache
 def code_version() -> str:
-    """The package's version and a hash of what decides a gait: generation, model, robot file."""
+    """The package's version and a hash of what decides a gait: programme, model, feedforward, robot file."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256(ROBOT_FILE.read_bytes())
     for pattern in _SOURCES:
