@@ -69,7 +69,7 @@ class Rules:
     landing_speed: tuple[float, float] = (-0.03, -0.003)  # m/s, vertical
     landing_slide: float = 0.035  # m/s, along and across
     landing_turn: float = 0.2  # rad/s, about each axis
-    impact_jump: float = 0.3 * VELOCITY_JUMP  # rad/s, of every joint's speed; the rest is the network's
+    impact_jump: float = 0.6 * VELOCITY_JUMP  # rad/s, of every joint's speed; the rest is the network's
     sinking: float = 0.01  # m/s, downward speed of the foot that leaves, after the impact
     # Weights against (100 Nm)^2. Without the last two the swing leg's motion is nearly free: it changes wildly from subject to
     # subject, and no network fits it.
