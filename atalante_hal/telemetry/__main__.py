@@ -166,6 +166,8 @@ def main(order: str) -> int:
             can_log=outlets.can_log,
         )
         _say({"endpoint": outlets.endpoint, "notices": outlets.notices})
+        while outlets.notices:
+            service.report("TELEMETRY_DOWN", outlets.notices.pop(0), "warning")
         try:
             service.run(stop)
         finally:

@@ -3,7 +3,8 @@
 The child is a fresh interpreter (`python -m atalante_hal.telemetry`, see `service`), never a fork, in a process group of
 its own: the terminal's Ctrl-C goes to the loop, which then closes the rings. It may be killed, stopped or starved at any
 time: `write` never waits for it, except in lock-step with a recording of every cycle or a CAN log, and there not for
-long.
+long. A loop that calls `tend` now and then gets a new child for one that died or hangs: same rings, same endpoint, files
+of its own beside those of the first.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ import re
 import selectors
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -35,8 +37,13 @@ CYCLE_NS = 1_000_000_000 // CYCLES_PER_SECOND
 RUN_GAP_NS = 1_000_000_000
 
 
+#: A child that takes nothing for so long while there is something [s] hangs; so many are replaced in a session.
+HANGS_AFTER = 2.0
+RESTARTS = 3
 #: For the child to leave its Zenoh session after it has said what became of its files [s].
 _LAST_WORDS = 2.0
+#: For a child that replaces another to be ready [s].
+_RESTART = 30.0
 
 
 #: Fields of the configuration that are files.
@@ -107,7 +114,7 @@ class TelemetryConfig:
 
 @dataclass(frozen=True)
 class TelemetrySummary:
-    """What became of a session; `complete` is False when the child died and could not say."""
+    """What became of a session; `complete` is False when a child died and could not say."""
 
     complete: bool = False
     published: int = 0  # messages
@@ -115,6 +122,7 @@ class TelemetrySummary:
     frames_logged: int = 0
     lost: int = 0  # cycles that telemetry did not see
     frames_lost: int = 0  # records of the frame ring, one a cycle
+    restarts: int = 0  # children that died or hung and were replaced
     notices: tuple[str, ...] = field(default=())  # what went wrong, one sentence each
 
 
@@ -150,6 +158,10 @@ class TelemetryProcess:
         self._closed = False
         self._tap: RingTap | None = None
         self._child: subprocess.Popen[bytes] | None = None
+        self._restarts = 0
+        self._mishaps: list[str] = []  # of children, one sentence each
+        self._restarting: threading.Thread | None = None
+        self._progress = (0, 0.0)  # records taken when `tend` looked, and since when [s]
         meta = {
             "layout": layout.to_json(),
             "diagnostics": list(diagnostics),
@@ -180,9 +192,16 @@ class TelemetryProcess:
         Raises:
             TelemetryError: a file or an endpoint that was asked for cannot be had, or the child was not ready in time [s].
         """
+        try:
+            self._launch(self.config, timeout)
+        except BaseException:  # Ctrl-C while it waits, too
+            self.close(0.0)
+            raise
+
+    def _launch(self, config: TelemetryConfig, timeout: float) -> None:
         rings = {"records": self.records, "events": self.events, "frames": self.frames}
         fds = {name: ring.fd for name, ring in rings.items() if ring is not None}
-        order = json.dumps({"config": self.config.to_json(), "rings": fds})
+        order = json.dumps({"config": config.to_json(), "rings": fds})
         self._child = subprocess.Popen(
             [sys.executable, "-P", "-m", "atalante_hal.telemetry", order],
             stdin=subprocess.DEVNULL,
@@ -190,16 +209,58 @@ class TelemetryProcess:
             pass_fds=tuple(fds.values()),
             process_group=0,
         )
-        try:
-            told = self._listen(timeout)
-            if told is None:
-                raise TelemetryError(f"the telemetry process was not ready within {timeout:.0f} s")
-            if "error" in told:
-                raise TelemetryError(told["error"])
-        except BaseException:  # Ctrl-C while it waits, too
-            self.close(0.0)
-            raise
+        told = self._listen(timeout)
+        if told is None:
+            raise TelemetryError(f"the telemetry process was not ready within {timeout:.0f} s")
+        if "error" in told:
+            raise TelemetryError(told["error"])
         self.endpoint, self.notices = told["endpoint"], tuple(told["notices"])
+
+    def tend(self) -> None:
+        """Look after the child; call it a few times a second. A dead one, or one that hangs, is replaced in the background.
+
+        The replacement goes on reading where the other one stopped, under the endpoint it had, into files with a number.
+        """
+        if self._closed or self._child is None or (self._restarting is not None and self._restarting.is_alive()):
+            return
+        what = self._ailment(time.monotonic())
+        if not what or self._restarts > RESTARTS:
+            return
+        self._restarts += 1
+        again = self._restarts <= RESTARTS
+        last = self.records.last()
+        cycle = int(np.frombuffer(last)[self.layout["cycle"]][0]) if last else 0
+        text = f"telemetry {what}; it is {'started again' if again else 'left alone after so many restarts'}"
+        self._mishaps.append(text)
+        self.event(cycle, "TELEMETRY_DOWN", text, "error", "TELEMETRY", self._restarts)
+        if again:
+            # Not in the loop: ending a child and starting another takes longer than a cycle.
+            self._restarting = threading.Thread(target=self._restart, daemon=True)
+            self._restarting.start()
+
+    def _ailment(self, now: float) -> str:
+        """What is wrong with the child, empty if nothing."""
+        if not self.alive:
+            return "has died"
+        taken = self.records.taken
+        if taken != self._progress[0] or taken == self.records.written or not self._progress[1]:
+            self._progress = taken, now
+        return "hangs" if now - self._progress[1] > HANGS_AFTER else ""
+
+    def _restart(self) -> None:
+        assert self._child is not None
+        self._end(self._child, 0.0)
+        self._progress = 0, 0.0
+        config = replace(
+            self.config,
+            listen=self.endpoint,  # subscribers reconnect by themselves
+            recording=_numbered(self.config.recording, self._restarts),
+            can_log=_numbered(self.config.can_log, self._restarts),
+        )
+        try:
+            self._launch(config, _RESTART)
+        except TelemetryError as error:
+            self._mishaps.append(str(error))
 
     def tap(self, now: Callable[[], int] = time.time_ns, stamps: Callable[[], Stamps] | None = None) -> RingTap:
         """What the HAL hands its frames to, for the CAN log; one for the session.
@@ -261,8 +322,10 @@ class TelemetryProcess:
         if self._closed:
             return TelemetrySummary()
         self._closed = True
+        if self._restarting is not None:
+            self._restarting.join()
         rings = [ring for ring in (self.frames, self.events, self.records) if ring is not None]
-        summary = TelemetrySummary(lost=self.records.lost)
+        summary = TelemetrySummary(lost=self.records.lost, restarts=self._restarts, notices=tuple(self._mishaps))
         if self._tap is not None:
             self._tap.flush()
         for ring in rings:
@@ -270,7 +333,8 @@ class TelemetryProcess:
         if self._child is not None:
             told = self._listen(timeout)
             if told is not None and "error" not in told:
-                summary = TelemetrySummary(complete=True, **{**told, "notices": tuple(told["notices"])})
+                facts = {**told, "notices": (*self._mishaps, *told["notices"])}
+                summary = TelemetrySummary(complete=not self._restarts, restarts=self._restarts, **facts)
             self._end(self._child, _LAST_WORDS if told is not None else 0.0)
             self._child = None
         for ring in rings:
@@ -313,3 +377,11 @@ class TelemetryProcess:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _numbered(path: Path | None, number: int) -> Path | None:
+    """The file beside `path` of the child of that number: recording.mcap, recording-1.mcap."""
+    if path is None:
+        return None
+    stem, dot, suffixes = path.name.partition(".")
+    return path.with_name(f"{stem}-{number}{dot}{suffixes}")

@@ -225,6 +225,11 @@ class RingWriter(_Ring):
         self._header[_NOTES_LENGTH] = used + len(packed)
 
     @property
+    def taken(self) -> int:
+        """Records the reader has dealt with so far."""
+        return self._header[_READ]
+
+    @property
     def reader_alive(self) -> bool:
         """Whether a reader has attached and its process is there (a stopped process is)."""
         pid = self._header[_READER_PID]

@@ -149,7 +149,7 @@ class Service:
                 self._can_log.write(frames, stamps, sent)
         except SinkError as error:
             self._can_log = None
-            self._report(error.code, str(error), "error")
+            self.report(error.code, str(error), "error")
         return True
 
     # -- sinks -------------------------------------------------------------------------------------------------------
@@ -165,10 +165,10 @@ class Service:
         """Go on without a sink."""
         if any(sink is failed for sink, _ in self._sinks):
             self._sinks = [(sink, every) for sink, every in self._sinks if sink is not failed]
-            self._report(error.code, str(error), "error")
+            self.report(error.code, str(error), "error")
 
-    def _report(self, code: str, text: str, severity: str, value: float = 0.0) -> None:
-        """An event of the telemetry process itself."""
+    def report(self, code: str, text: str, severity: str, value: float = 0.0) -> None:
+        """An event of the telemetry process itself, which is also a notice at the end."""
         self.notices.append(text)
         self._tell(Event(self._cycle, code, text, severity, "TELEMETRY", value), self._timestamp)
 
@@ -182,4 +182,4 @@ class Service:
         if lost > self._lost and time.monotonic() - self._lost_reported > _DROPPED_EVERY:
             text = f"telemetry did not see {lost - self._lost} cycles, they came faster than it could read"
             self._lost, self._lost_reported = lost, time.monotonic()
-            self._report("TELEMETRY_DROPPED", text, "warning", float(lost))
+            self.report("TELEMETRY_DROPPED", text, "warning", float(lost))

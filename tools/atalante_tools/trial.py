@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from atalante_tools.rig import Rig
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
+#: Cycles between two looks at the telemetry process.
+_TEND_CYCLES = 250
 
 
 @dataclass(frozen=True)
@@ -184,6 +186,8 @@ class _Walk:
     def _record(self) -> None:
         hal = self._rig.hal
         self._telemetry.write(hal.record)
+        if not hal.state.cycle % _TEND_CYCLES:
+            self._telemetry.tend()
         if len(hal.events) != self._told:
             self._tell()
 
