@@ -14,6 +14,7 @@ import hal_witness
 import numpy as np
 import pytest
 from command_limits import RECORD, CommandLimits
+from hypothesis import Phase, settings
 
 import atalante_dbc
 from atalante_control.model import ExoskeletonParameters, urdf
@@ -26,6 +27,9 @@ from atalante_hal.frame import Frames
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot, load_robot
 from atalante_hal.types import Command, State, SupervisorState
+
+# For `make mutation`: one example that fails is enough, and making it small is what takes long.
+settings.register_profile("mutation", phases=(Phase.explicit, Phase.generate), derandomize=True, database=None)
 
 
 class Witness:
