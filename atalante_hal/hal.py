@@ -1,6 +1,6 @@
 """The hardware abstraction layer: `read()` a state, `write()` a command, once a cycle each.
 
-    bus -> process image -> E2E + validity -> state -> supervisor -> [controller] -> limiter -> process image -> bus
+    bus -> process image -> E2E + plausibility -> state -> supervisor -> [controller] -> limiter -> process image -> bus
 
 The emulator and the robot differ in the bus handed to the constructor, in nothing else. A perfect cycle of a robot that goes on
 as it did takes the fast path: nothing is judged that cannot have changed.
@@ -24,6 +24,7 @@ from atalante_hal.image import NEVER, ReceiveImage, TransmitImage
 from atalante_hal.judgement import Judgement
 from atalante_hal.limiter import Limiter
 from atalante_hal.pendant import Pendant
+from atalante_hal.plausibility import Plausibility
 from atalante_hal.record import Record
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.supervisor import MOVING, Conditions, next_state
@@ -121,6 +122,7 @@ class Hal:
         self._header[3] = assistance_factor
         self._image = ReceiveImage(fast, parts.signals)
         self._judgement = Judgement(self.network, self._image)
+        self._plausibility = Plausibility(self.robot, self._image.codec, self._image.values, self._image.age, PERIOD)
         self._heartbeats = Heartbeats(self.network)
         self._pendant = Pendant(self._image)
         self.state = parts.state(assistance_factor, len(fast))
@@ -186,11 +188,16 @@ class Hal:
         foreign = image.accept(transceiver.scratch, count, cycle & 0xFF)
         if foreign:
             self._accept_foreign(foreign)
+        plausibility = self._plausibility
+        findings = plausibility.check(image.all_fresh)
+        if plausibility.rejected:
+            self._judgement.refuse(plausibility.rejected)
         parts, pendant = self._parts, self._pendant
         np.multiply(parts.motor_side, self._to_joint, parts.joint_side)
         if not (
             self._steady
             and image.all_fresh
+            and not findings
             and transceiver.quiet
             and pendant.signals.tobytes() == pendant.heard
             and parts.drive_side.tobytes() == self._drives_judged
@@ -381,6 +388,8 @@ class Hal:
         state.joints_valid = judgement.joints_valid
         self._heartbeats.judge(cycle, memory)
         self._transceiver.judge(cycle, memory)
+        for f in self._plausibility.findings:
+            memory.raise_dtc(cycle, f.dtc, f.node, value=f.value, confirmed=f.confirmed, text=f.text)
         for dtc, confirmed, value, text in self._reports:
             memory.raise_dtc(cycle, dtc, "HAL", value=value, confirmed=confirmed, text=text)
         self._reports.clear()

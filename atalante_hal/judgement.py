@@ -8,6 +8,8 @@ that loses more than a fifth of its frames trips its leaky bucket. What tripped 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import numpy.typing as npt
 
@@ -15,7 +17,7 @@ from atalante_dbc import Network
 from atalante_hal.diagnostics import Dtc
 from atalante_hal.e2e import FULL, SETTLED, Check, Qualification, qualify
 from atalante_hal.fault_memory import FaultMemory
-from atalante_hal.image import ReceiveImage
+from atalante_hal.image import NEVER, ReceiveImage
 
 #: Why a message was not committed -> what is noted at once.
 PENDING = {
@@ -53,8 +55,6 @@ class Judgement:
         self.qualification = [Qualification()] * len(messages)
         #: Rows that were trusted once: of the others nobody knows whether they should speak.
         self._known = [False] * len(messages)
-        #: Why a plausibility check refused a row in this cycle.
-        self._implausible: dict[int, tuple[Dtc, float]] = {}
         #: New, intact, trusted and plausible data came in this cycle, shape (rows,).
         self.valid: npt.NDArray[np.bool_] = np.zeros(len(messages), np.bool_)
         self.joints_valid = False
@@ -70,10 +70,10 @@ class Judgement:
         """Whether a row's sender is trusted."""
         return self.qualification[row].trusted
 
-    def refuse(self, row: int, dtc: Dtc, value: float) -> None:
-        """A row of this cycle cannot be true: its last values stay and age. Before `judge`."""
-        self._image.refuse(row)
-        self._implausible[row] = dtc, value
+    def refuse(self, rejected: Mapping[int, int]) -> None:
+        """What these rows of the cycle say cannot be true and was put back: row -> cycles since its last good value."""
+        for row, age in rejected.items():
+            self._image.refuse(row, age)
 
     def judge(self, cycle: int, memory: FaultMemory) -> None:
         """Judge a cycle that is not perfect, or follows one that was not."""
@@ -81,11 +81,11 @@ class Judgement:
         checks, ages = image.check.tolist(), image.age.tolist()
         for row, why in image.refused:
             dtc = self._invalid[row] if why is Check.INVALID else PENDING[why]
-            memory.raise_dtc(cycle, dtc, self._senders[row], value=ages[row], confirmed=False)
+            value = ages[row] if ages[row] < NEVER else 0
+            memory.raise_dtc(cycle, dtc, self._senders[row], value=value, confirmed=False)
         for row, (check, age) in enumerate(zip(checks, ages, strict=True)):
             if check or age or self.qualification[row] is not SETTLED:
                 self._judge_row(cycle, memory, row, Check(check), age)
-        self._implausible.clear()
         trusted = [q.trusted for q in self.qualification]
         self.valid[:] = [check <= _FRESH and good for check, good in zip(checks, trusted, strict=True)]
         self.joints_valid = bool(self.valid[self._joint_rows].all())
@@ -99,14 +99,11 @@ class Judgement:
         now = self.qualification[row] = qualify(self.qualification[row], good=intact, timed_out=late)
         self._known[row] |= now.trusted
         confirmed = late and self._known[row] and self._confirms[row]
-        if check is Check.IMPLAUSIBLE:
-            dtc, value = self._implausible[row]
-            memory.raise_dtc(cycle, dtc, sender, value=value, confirmed=confirmed)
-        elif confirmed:
+        if confirmed and check is not Check.IMPLAUSIBLE:  # which has its own finding
             dtc = self._invalid[row] if check is Check.INVALID else CONFIRMED[check]
             text = f"{sender}: {dtc.meaning}; its data is {age} cycles old"
             memory.raise_dtc(cycle, dtc, sender, value=age, text=text)
-        elif fresh and age:
+        elif fresh and age and not late:
             memory.raise_dtc(cycle, Dtc.NODE_LATE, sender, value=age, confirmed=False)
         if check is Check.SOME_LOST:
             memory.raise_dtc(cycle, Dtc.E2E_SOME_LOST, sender, value=age, confirmed=False)

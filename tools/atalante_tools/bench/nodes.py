@@ -1,7 +1,8 @@
 """The nodes as a recording: frames sealed beforehand, with right counters and checksums, played to a HAL in lock-step.
 
-What the HAL costs is measured without an emulator: a cycle's answer is one copy of bytes. The recording is a swing of the
-gait with a small tracking error, so that the guide filter has to do with the numbers of a walk.
+What the HAL costs is measured without an emulator: a cycle's answer is one copy of bytes. The recording trembles about the first
+pose of a swing, with a small tracking error: the guide filter has to do with the numbers of a walk, and no plausibility check
+finds anything.
 """
 
 from __future__ import annotations
@@ -35,9 +36,10 @@ Vector = npt.NDArray[np.float64]
 #: Cycles of the recording: one turn of the alive counters, and how many poses it has.
 TURN = 256
 POSES = 16
-#: Tracking error of the recorded walk [rad], [rad/s]: inside the guide, so that nothing saturates.
+#: Tracking error of the recorded walk [rad], and speed of the tremor [rad/s]: inside the guide, so that nothing saturates.
 ERROR = 0.01
-ERROR_RATE = 0.05
+SPEED = 0.05
+PERIOD = 1e-3  # s
 ASSISTANCE = 0.5
 _HEADER = 8  # bytes of a frame record before the payload
 _E2E = Struct("<HB")
@@ -91,8 +93,21 @@ class Recording:
         codec, rng = image.codec, np.random.default_rng(0)
         self.values = np.tile(_walking(walk, image), (POSES, 1))
         motor = walk.robot.gear * walk.robot.polarity
-        for name, table, error in (("Position", walk.tables.q, ERROR), ("Velocity", walk.tables.qd, ERROR_RATE)):
-            self.values[:, codec.slice(name)] = (table[:POSES] + rng.uniform(-error, error, (POSES, 12))) * motor
+        phase = 2.0 * np.pi * np.arange(POSES)[:, None] / POSES
+        swing = SPEED * POSES * PERIOD / (2.0 * np.pi) * np.sin(phase)
+        error = rng.uniform(-ERROR, ERROR, len(JOINTS))
+        self.values[:, codec.slice("Position")] = (walk.tables.q[0] + error + swing) * motor
+        self.values[:, codec.slice("Velocity")] = SPEED * np.cos(phase) * motor
+        turn = np.where(np.arange(POSES) < POSES // 2, 1.0, -1.0)[
+            :, None
+        ]  # no two of a slow look at the sensors are alike
+        for name, noise in (("Torque", 0.05), ("Gyro", 0.01), ("Accel", 0.05), ("Force", 1.0)):
+            places = codec.slice(name)
+            self.values[:, places] += turn * rng.uniform(0.5 * noise, noise, (POSES, places.stop - places.start))
+        for side, leg in (("LEFT", 0), ("RIGHT", len(JOINTS) // 2)):
+            pitch = 0.5 * (walk.tables.q[0] + error)[leg + 2 : leg + 4].sum()  # half of hip and knee
+            for axis, value in (("W", np.cos(pitch)), ("Y", np.sin(pitch))):
+                self.values[:, codec.index(f"IMU_{side}_TIBIA_STATE", f"Quaternion{axis}")] = value
         press = [codec.index("PENDANT_STATE", name) for name in ("Request", "RequestCounter")]
         self._before = _seal(image, self.values)
         self.values[:, press] = 1.0  # START, pressed once
@@ -124,10 +139,10 @@ class Recording:
         """Write the next cycle into `frames`; returns how many there are."""
         cycle = self.cycles
         self.cycles = cycle + 1
-        self.pose = cycle % POSES
+        tag = self.cycles % TURN  # low byte of the SYNC's number: a HAL's first is 1
+        self.pose = tag % POSES
         sealed = self._before if cycle < TURN else self._steady
         self._cyclic_memory[:] = sealed.payloads[self.pose]
-        tag = self.cycles % TURN  # of the SYNC: a HAL's first is 1
         self._cyclic_counters.fill(tag)
         self._cyclic_checksums[:] = sealed.checksums[tag]
         due = self._due[cycle % len(self._due)]
@@ -170,7 +185,7 @@ def _walking(walk: Walk, image: TransmitImage) -> Vector:
     codec, rng = image.codec, np.random.default_rng(1)
     values = np.zeros(codec.size)
     for name, low, high in (
-        ("Torque", -20.0, 20.0), ("Force", -5.0, 5.0), ("Gyro", -1.0, 1.0), ("Accel", -9.0, 9.0), ("Quaternion", -0.5, 0.5),
+        ("Torque", -20.0, 20.0), ("Force", -5.0, 5.0), ("Gyro", -0.1, 0.1), ("Accel", -0.1, 0.1),
     ):  # fmt: skip
         places = codec.slice(name)
         values[places] = rng.uniform(low, high, places.stop - places.start)
@@ -179,6 +194,8 @@ def _walking(walk: Walk, image: TransmitImage) -> Vector:
             values[place] = 30.0
         elif signal.name == "DriveState":
             values[place] = DriveState.OPERATION_ENABLED
+    values[codec.slice("Accel")][2::3] += 9.81
+    values[codec.slice("Quaternion")][::4] = 1.0
     for name, value in (("DeadMan", 1.0), ("AssistanceSet", 1.0), ("AssistanceFactor", ASSISTANCE)):
         values[codec.index("PENDANT_STATE", name)] = value
     return values
@@ -258,7 +275,7 @@ class FilterOnly:
 
     def __init__(self, walk: Walk) -> None:
         self._guide, self._cycle = walk.guide, 0
-        self._desired = np.hstack([walk.tables.q, walk.tables.qd])[:POSES, [2, 3, 14, 15]].tolist()
+        self._desired = walk.tables.q[0, 2:4].tolist()
         self._command = Command(np.zeros(len(JOINTS)), np.full(8, 0.25))
 
     def update(self, state: State) -> Command:
@@ -272,5 +289,5 @@ class FilterOnly:
         if not cycle:
             self._guide.start_step(ASSISTANCE, (0.01, -0.01), (0.05, 0.05))
         self._cycle += 1
-        q_hip, q_knee, qd_hip, qd_knee = self._desired[cycle % POSES]
-        torque[2:4] = self._guide.tick(cycle, hip - q_hip, hip_rate - qd_hip, knee - q_knee, knee_rate - qd_knee)
+        q_hip, q_knee = self._desired
+        torque[2:4] = self._guide.tick(cycle, hip - q_hip, hip_rate, knee - q_knee, knee_rate)
