@@ -144,6 +144,7 @@ _EMERGENCIES = {
     0x3120: Dtc.UNDER_VOLTAGE,  # mains too low
     0x3220: Dtc.UNDER_VOLTAGE,  # DC link too low
     0x8110: Dtc.CMD_SOME_LOST,  # CAN overrun: objects lost
+    0x8130: Dtc.SYNC_LOST,  # life guard: the master is not heard
     0x8150: Dtc.HAL_DUPLICATE,  # transmit identifier collision: a second source of commands
     0x8200: Dtc.CMD_E2E,  # protocol error
     0x8250: Dtc.CMD_TIMEOUT,  # RPDO timeout

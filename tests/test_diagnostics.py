@@ -70,7 +70,7 @@ def test_worst():
         (0x5000, Dtc.EMCY_OTHER),
         (0x7305, Dtc.EMCY_ENCODER),
         (0x8110, Dtc.CMD_SOME_LOST),
-        (0x8130, Dtc.EMCY_COMMUNICATION),
+        (0x8130, Dtc.SYNC_LOST),
         (0x8150, Dtc.HAL_DUPLICATE),
         (0x8700, Dtc.SYNC_LOST),
         (0x8140, Dtc.EMCY_COMMUNICATION),
