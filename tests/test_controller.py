@@ -16,6 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from atalante_control.certificate import certify
 from atalante_control.controller import HangConfig, HangController, baseline_share
 from atalante_control.gait import HANG_GAIT, Gait, load_gait
 from atalante_control.guide_shapes import SHAPES
@@ -118,6 +119,25 @@ def hang(shape: str = "constant", config: HangConfig = CONFIG, gait: Gait = GAIT
 STEP = 800
 TWO_STEPS = STARTUP + 4 * STEP
 CERTIFIED = ["constant", "widening", "narrowing", "pinched", "asymmetric"]
+
+
+@pytest.mark.parametrize("shape", [*CERTIFIED, "snap"])
+def test_a_step_takes_the_gentlest_gains_that_are_certified_with_a_margin(shape: str):
+    controller = hang(shape)
+    box, margin = CONFIG.hand_over, CONFIG.guide_margin
+    kp = [guide.config.policies[0].kp for guide in controller.guides]
+    assert kp == sorted(kp)
+    for xi in (0.0, 0.25, 0.5, 0.75, 0.93):
+        certificates = [certify(guide, xi, box) for guide in controller.guides]
+        enough = [c.certified and c.margin >= margin + 0.05 for c in certificates]  # the bound in Xi is found to 0.01
+        never = [not c.certified or c.margin < margin for c in certificates]
+        taken = controller.guides.index(controller.guide_at(xi))
+        assert not any(enough[:taken])
+        assert taken == len(kp) - 1 or not never[taken]
+        assert controller.certificate(xi) == certificates[taken]
+    # What the stiffest gains keep is never lost to gentler ones.
+    stiffest = [certify(controller.guides[-1], xi, box).certified for xi in (0.5, 0.93)]
+    assert [controller.certificate(xi).certified for xi in (0.5, 0.93)] == stiffest
 
 
 @pytest.mark.parametrize("shape", CERTIFIED)
@@ -373,7 +393,7 @@ def test_feedforward_is_off_in_the_air_and_acts_when_asked_for():
     points = rng.normal(size=(12, 8)) * 5.0
     pushed = replace(GAIT, feedforward=points)
     np.testing.assert_array_equal(replayed(0.5, gait=pushed), replayed(0.5))
-    open_guide = replace(CONFIG, feedforward=True)
+    open_guide = replace(CONFIG, feedforward=True, gentler=())  # the stiffest gains leave it alone longest
     swing = STARTUP + 100
     difference = replayed(0.5, config=open_guide, gait=pushed)[swing] - replayed(0.5, config=open_guide)[swing]
     assert not difference[[j for j in range(12) if j not in (SH, SK)]].any()
@@ -389,6 +409,8 @@ def test_feedforward_is_off_in_the_air_and_acts_when_asked_for():
         {"blend": float("nan")},
         {"fade": 1.0},
         {"guide_rate": (0.0, 1.0)},
+        {"gentler": (0.7, 0.5)},
+        {"gentler": (1.0,)},
         {"alpha": 2.0},
         {"points": 1},
     ],

@@ -111,6 +111,25 @@ def certify(guide: GuideFilter, xi: float, hand_over: HandOver | None = None) ->
     )
 
 
+def largest_assistance(guide: GuideFilter, margin: float, hand_over: HandOver | None = None) -> float:
+    """Up to which assistance factor a guide is certified with a margin; negative: not even at 0.
+
+    Guides close as Xi grows, so it is found by bisection, to 0.01 and never too large.
+    """
+
+    def held(xi: float) -> bool:
+        certificate = certify(guide, xi, hand_over)
+        return certificate.certified and certificate.margin >= margin
+
+    if not held(0.0):
+        return -1.0
+    low, high = 0.0, 1.0
+    while high - low > 0.01:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if held(middle) else (low, middle)
+    return low
+
+
 def _joint(guide: GuideFilter, bounds: Vector, joint: int, hand_over: HandOver) -> JointCertificate:
     policy, (low, high), time = guide.config.policies[joint], guide.config.disturbance[joint], guide.time
     response = _from_rest(policy, guide.forced[joint], time)

@@ -11,6 +11,9 @@ assistive torque, every other joint the baseline torque. What the paper leaves o
   no guide ever moves under a joint inside a step, so the certificate of each step stays true, whatever the operator does.
 - *Xi towards 1.* The assisted joints get w u_t + (1 - w) (u_i + u_f + u_v), with w a smoothstep from 0 at Xi = 0.9 to
   exactly 1 at Xi = 1: there it is the baseline torque to the last bit. Their integrals take the same share w.
+- *Gains.* A stiff backup policy holds a narrow guide, and in a wide one asks for more torque than there is. Each step takes
+  the gentlest of a few gains with which its guide is certified, with a margin, at its Xi; the command is continuous in Xi but
+  where they change.
 - *Hand-over.* At a step change the deadbeat takes the tracking error to zero at once, a leg changes from one law to the
   other, and the horizon jumps back to T. The torque that would jump is carried over and faded out in `blend`: the
   command is continuous. This is part of the baseline, and the same with and without assistance.
@@ -19,6 +22,7 @@ assistive torque, every other joint the baseline torque. What the paper leaves o
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from struct import Struct
 
@@ -26,7 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_control.backup import BackupPolicy
-from atalante_control.certificate import Certificate, HandOver, certify
+from atalante_control.certificate import Certificate, HandOver, certify, largest_assistance
 from atalante_control.deadbeat import Deadbeat
 from atalante_control.flat_foot import flat_feet
 from atalante_control.gait import PERIOD, Gait, bezier
@@ -62,7 +66,11 @@ class HangConfig:
     gains: PidGains = AIR_GAINS
     friction: Friction = field(default_factory=Friction)
     alpha: float = 0.4  # of a step, until the deadbeat has met the nominal
-    guide_rate: Pair = (28.0, 44.0)  # rad/s, natural frequency of the backup policy on SH and SK
+    guide_rate: Pair = (28.0, 44.0)  # rad/s, natural frequency of the stiffest backup policy on SH and SK
+    gentler: tuple[float, ...] = (0.5, 0.7)  # parts of it to be tried first, rising
+    guide_margin: float = (
+        0.25  # part of the guide that has to be left where it is tightest, for gentler gains to be taken
+    )
     guide_damping: float = 1.05  # damping ratio; 1 and above is monotone
     # Nm, u_ext of SH and SK as separate inertias (see `certificate`). In PyBullet, coupling to the other joints, delay and
     # friction left over came to 14 and 20 Nm in 95 % of the cycles; friction a fifth off, to 43 and 26 Nm.
@@ -88,6 +96,8 @@ class HangConfig:
             raise ValueError(f"fade is an assistance factor in [0, 1), not {self.fade!r}")
         if not (min(self.guide_rate) > 0.0 and self.guide_damping > 0.0):
             raise ValueError("guide_rate and guide_damping are positive")
+        if list(self.gentler) != sorted(self.gentler) or not all(0.0 < part < 1.0 for part in self.gentler):
+            raise ValueError(f"gentler are parts of guide_rate between 0 and 1, rising, not {self.gentler!r}")
 
 
 @dataclass
@@ -130,7 +140,7 @@ class HangController:
     """The controller. It implements `atalante_hal.types.Controller`.
 
     Attributes:
-        guide: the virtual guide filter.
+        guide: the virtual guide filter of this step, one of `guides`, which are the gentlest first.
         statistics: since `reset`.
         telemetry, telemetry_fields: for the recording; angles in rad, stance 0 left and 1 right, phase t / T.
     """
@@ -193,14 +203,21 @@ class HangController:
         if feedforward is not None:
             self._uf = bezier(feedforward, time / gait.duration).tolist()
         swing = [_SH, _SK]
-        self.guide = GuideFilter(
-            self._guide_config(robot, tables[RIGHT].q),
-            shape,
-            self._deadbeat,
-            gait.coefficients[swing],
-            gaits[LEFT].coefficients[swing],
-            feedforward,
-        )
+        self.guides = [
+            GuideFilter(
+                guide_config,
+                shape,
+                self._deadbeat,
+                gait.coefficients[swing],
+                gaits[LEFT].coefficients[swing],
+                feedforward,
+            )
+            for guide_config in self._guide_configs(robot, tables[RIGHT].q)
+        ]
+        self.guide = self.guides[-1]
+        gentler = self.guides[:-1]
+        #: Assistance factor up to which each but the stiffest is taken.
+        self._taken_to = [largest_assistance(guide, config.guide_margin, config.hand_over) for guide in gentler]
 
         ramp = np.arange(round(config.blend / PERIOD)) * (PERIOD / config.blend)
         self._blend: list[float] = (0.5 + 0.5 * np.cos(math.pi * ramp)).tolist()
@@ -216,9 +233,15 @@ class HangController:
         self.statistics = HangStatistics()
         self._forget()
 
+    def guide_at(self, xi: float) -> GuideFilter:
+        """The guide of the steps at an assistance factor: the gentlest certified there with `guide_margin`, or the stiffest."""
+        return next(
+            (guide for guide, to in zip(self.guides, self._taken_to, strict=False) if xi <= to), self.guides[-1]
+        )
+
     def certificate(self, xi: float) -> Certificate:
         """What this controller's guide promises at an assistance factor; nothing at Xi = 1, where no guide acts."""
-        certificate = certify(self.guide, xi, self.config.hand_over)
+        certificate = certify(self.guide_at(xi), xi, self.config.hand_over)
         if baseline_share(xi, self.config.fade) < 1.0:
             return certificate
         return replace(
@@ -244,17 +267,20 @@ class HangController:
         self._flat_deviation = self._flat_rate = (0.0, 0.0)
         self.statistics = HangStatistics()
 
-    def _guide_config(self, robot: Robot, q: Vector) -> GuideConfig:
-        """Backup gains for the inertia the swing leg shows along the step, and the torque left for them."""
+    def _guide_configs(self, robot: Robot, q: Vector) -> Iterator[GuideConfig]:
+        """Backup gains, gentlest first, for the inertia the swing leg shows along the step, and the torque left for them."""
         config = self.config
         level = (1.0, 0.0, 0.0, 0.0)
         weight = np.array([np.abs(self._gravity.torque(pose, level)) for pose in q[::20].copy()]).max(axis=0)
-        policies = []
-        for joint, j, rate in zip((_SH, _SK), self._inertia.inertias, config.guide_rate, strict=True):
-            friction = config.friction.torque(joint, 2.0)
-            limit = float(robot.torque_max[joint] - weight[joint]) - friction
-            policies.append(BackupPolicy(j * rate**2, 2.0 * config.guide_damping * j * rate, j, limit))
-        return GuideConfig((policies[0], policies[1]), config.disturbance, config.points, config.overlap, config.zeta)
+        limits = [
+            float(robot.torque_max[joint] - weight[joint]) - config.friction.torque(joint, 2.0) for joint in (_SH, _SK)
+        ]
+        for part in (*config.gentler, 1.0):
+            hip, knee = (
+                BackupPolicy(j * (part * rate) ** 2, 2.0 * config.guide_damping * j * part * rate, j, limit)
+                for j, rate, limit in zip(self._inertia.inertias, config.guide_rate, limits, strict=True)
+            )
+            yield GuideConfig((hip, knee), config.disturbance, config.points, config.overlap, config.zeta)
 
     def _ideal_feedforward(self, gait: Gait) -> Vector | None:
         """u_f of the swing leg's SH and SK, meant for the separate inertias: Bezier control points (2, 8) [Nm].
@@ -335,6 +361,7 @@ class HangController:
 
         hip, knee = leg + _SH, leg + _SK
         deviations, rates = (float(deviation[hip]), float(deviation[knee])), (float(rate[hip]), float(rate[knee]))
+        self.guide = self.guide_at(xi)
         self.guide.start_step(xi, deviations, rates)
         largest = config.hand_over
         exceeded = max(map(abs, deviations)) > largest.deviation or max(map(abs, rates)) > largest.rate

@@ -61,7 +61,7 @@ def walk() -> Walk:
     """The gait of the demo and its guide filter."""
     network, robot = atalante_dbc.load(), load_robot()
     gait = load_gait(HANG_GAIT, robot)
-    return Walk(network, robot, gait, gait.tables(), HangController(robot, gait, CONSTANT).guide)
+    return Walk(network, robot, gait, gait.tables(), HangController(robot, gait, CONSTANT).guide_at(ASSISTANCE))
 
 
 def cyclic_messages(network: Network) -> list[Message]:
