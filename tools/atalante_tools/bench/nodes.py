@@ -36,9 +36,9 @@ Vector = npt.NDArray[np.float64]
 #: Cycles of the recording: one turn of the alive counters, and how many poses it has.
 TURN = 256
 POSES = 16
-#: Tracking error of the recorded walk [rad], and speed of the tremor [rad/s]: inside the guide, so that nothing saturates.
+#: Tracking error of the recorded walk [rad], and its speed [rad/s]: inside the guide, so that nothing saturates.
 ERROR = 0.01
-SPEED = 0.05
+ERROR_RATE = 0.05
 PERIOD = 1e-3  # s
 ASSISTANCE = 0.5
 _HEADER = 8  # bytes of a frame record before the payload
@@ -94,10 +94,10 @@ class Recording:
         self.values = np.tile(_walking(walk, image), (POSES, 1))
         motor = walk.robot.gear * walk.robot.polarity
         phase = 2.0 * np.pi * np.arange(POSES)[:, None] / POSES
-        swing = SPEED * POSES * PERIOD / (2.0 * np.pi) * np.sin(phase)
+        swing = ERROR_RATE * POSES * PERIOD / (2.0 * np.pi) * np.sin(phase)
         error = rng.uniform(-ERROR, ERROR, len(JOINTS))
         self.values[:, codec.slice("Position")] = (walk.tables.q[0] + error + swing) * motor
-        self.values[:, codec.slice("Velocity")] = SPEED * np.cos(phase) * motor
+        self.values[:, codec.slice("Velocity")] = ERROR_RATE * np.cos(phase) * motor
         turn = np.where(np.arange(POSES) < POSES // 2, 1.0, -1.0)[
             :, None
         ]  # no two of a slow look at the sensors are alike
