@@ -234,8 +234,9 @@ class FuzzedBus:
 class FuzzedRobot:
     """HAL and emulated robot in lock-step, both with fuzz on their end of the line."""
 
-    #: Cycles with fuzz, then without, so that the operator can start the robot again.
-    FUZZED, QUIET = 60, 90
+    #: Cycles without fuzz, in which the operator acknowledges and starts the robot, then with it.
+    QUIET, FUZZED = 1150, 60
+    PRESSES = (150, 1050, 1080, 1110)
 
     def __init__(self, network: Network, robot: Robot, body: PyBulletBody, seed: int) -> None:
         ours, theirs = lockstep_pair(capacity=4096)
@@ -257,13 +258,13 @@ class FuzzedRobot:
 
     def cycle(self, per_end: int) -> None:
         """One cycle, with that many fuzzed frames on each end while it is time for fuzz."""
-        phase = self.tally.cycles % (self.FUZZED + self.QUIET)
+        phase = self.tally.cycles % (self.QUIET + self.FUZZED)
         self.tally.cycles += 1
-        if phase < self.FUZZED:
+        if phase >= self.QUIET:
             for end in self.ends:
                 # Now and then a flood, which the budget has to hold off.
                 end.per_receive = per_end if self._rng.random() < 0.98 else 8 * RECEIVE_BUDGET
-        elif phase == self.FUZZED + self.QUIET // 2:
+        elif phase in self.PRESSES:
             self.operator.start()
         hal = self.hal
         state = hal.read()
