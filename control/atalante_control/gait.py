@@ -120,6 +120,12 @@ def motion(coefficients: Vector, duration: float, phase: Vector) -> tuple[Vector
     )
 
 
+def control_points(phase: Vector, values: Vector) -> Vector:
+    """Control points of the polynomials nearest to samples: phases (n,), values (n, m), to (m, 8), read-only."""
+    basis = bezier(np.eye(DEGREE + 1), phase)
+    return _read_only(np.linalg.lstsq(basis, values, rcond=None)[0].T.astype(np.float64))
+
+
 def power_basis(coefficients: Vector) -> Vector:
     """Coefficients in powers of the phase, lowest first, of Bezier control points. Shape kept, (m, d + 1)."""
     degree = coefficients.shape[1] - 1

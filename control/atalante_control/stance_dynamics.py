@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 import pinocchio
 
-from atalante_control.gait import DEGREE, bezier, motion
+from atalante_control.gait import bezier, control_points, motion
 from atalante_control.idealization import Gravity
 from atalante_control.model import LEG_LINKS, ExoskeletonParameters, Patient, pinocchio_model, urdf
 from atalante_hal.robot import SIDES, Robot
@@ -120,8 +120,7 @@ class StanceDynamics:
             self._gravity.torque(pose, state.pelvis).copy()
             for pose, state in zip(bezier(coefficients, phase), states, strict=True)
         ]
-        feedforward = np.array([state.torque for state in states]) - np.array(gravity)
-        return np.asarray(np.linalg.lstsq(bezier(np.eye(DEGREE + 1), phase), feedforward, rcond=None)[0].T)
+        return control_points(phase, np.array([state.torque for state in states]) - np.array(gravity))
 
 
 def stance_dynamics(robot: Robot, patient: Patient | None = None) -> StanceDynamics:
