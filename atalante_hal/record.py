@@ -33,6 +33,7 @@ class Record:
 
     def __init__(self, codec: Codec, controller_fields: Sequence[tuple[str, int]]) -> None:
         self.layout = Layout(_fields(codec, controller_fields))
+        self._imu_rows = tuple(codec.rows[f"IMU_{imu.upper()}_STATE"] for imu in IMUS)
         self.values = np.zeros(self.layout.size)
         # A memoryview: half the price of an array, a number at a time.
         self.header = memoryview(self.values.data).cast("B").cast("d")[: len(HEADER_FIELDS)]
@@ -70,6 +71,7 @@ class Record:
             valid=np.zeros(messages, np.bool_),
             age=np.zeros(messages, np.int64),
             joints_valid=False,
+            imu_rows=self._imu_rows,
         )
 
 

@@ -51,6 +51,7 @@ class State:
     valid: npt.NDArray[np.bool_]  # (messages,) fresh, intact, plausible, and its sender is trusted
     age: npt.NDArray[np.int64]  # (messages,) cycles between the SYNC the data answers and the last one
     joints_valid: bool  # all twelve joint states are fresh
+    imu_rows: tuple[int, ...] = ()  # places of the IMUs' messages in `valid` and `age`; empty: their age is not known
 
 
 @dataclass(slots=True)
@@ -63,6 +64,7 @@ class Command:
     torque: Vector  # (12,) Nm at the joint
     vibration: Vector  # (8,) level, 0 to 1
     step: int | None = None  # number of the step under way; None: this controller does not walk
+    outside: bool = False  # a joint is outside its safe backward image: told, not acted upon
 
 
 class Controller(Protocol):

@@ -23,7 +23,7 @@ from atalante_control.guide_shapes import SHAPES
 from atalante_control.idealization import Friction, Gravity
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_control.pid import AIR_GAINS, LEFT, RIGHT, Pid
-from atalante_hal.robot import JOINTS, MOTORS, load_robot
+from atalante_hal.robot import IMUS, JOINTS, MOTORS, load_robot
 from atalante_hal.types import State, SupervisorState
 
 ROBOT = load_robot()
@@ -375,6 +375,41 @@ def test_haptics_follow_the_swing_leg_and_are_silent_at_full_assistance():
         assert vibration.shape == (len(MOTORS),)
         assert bool(vibration[:4].any()) is (xi < 1.0)
         assert not vibration[4:].any()
+
+
+def test_a_joint_outside_its_safe_backward_image_is_told():
+    controller = hang()
+    controller.reset(STATES[0])
+    told = []
+    for cycle, state in enumerate(STATES[: STARTUP + 300]):
+        pushed = state.position.copy()
+        pushed[SH] += 0.3 * (cycle > STARTUP + 200)
+        told.append(controller.update(replace(state, assistance_factor=0.5, position=pushed)).outside)
+    assert not any(told[: STARTUP + 200])
+    assert told[-1]
+
+
+@pytest.mark.parametrize("silent", [("left_tibia", "right_tibia"), ("left_tibia", "right_tibia", "pelvis")])
+def test_flat_foot_does_not_listen_to_an_imu_that_is_silent(silent: tuple[str, ...]):
+    def ankles(quaternion: float, age: int) -> np.ndarray:
+        controller = hang(config=replace(CONFIG, gentler=()))
+        controller.reset(STATES[0])
+        targets = []
+        for state in STATES[: STARTUP + STEP + 100]:
+            attitude, ages = state.imu_quaternion.copy(), np.zeros(4, int)
+            for imu in silent[:2]:
+                attitude[IMUS.index(imu), 2] = quaternion
+            for imu in silent:
+                ages[IMUS.index(imu)] = age
+            controller.update(replace(state, imu_quaternion=attitude, age=ages, imu_rows=(0, 1, 2, 3)))
+            targets.append(controller.telemetry[[4, 5, 10, 11]].copy())
+        return np.array(targets)
+
+    assert (ankles(0.0, 0) != ankles(0.1, 0)).any()
+    assert (ankles(0.0, 0) == ankles(0.0, 10)).all()
+    unheard = ankles(0.1, 11)
+    assert (ankles(0.0, 11) == unheard).all()
+    assert np.abs(np.diff(unheard[STARTUP + 1 : STARTUP + STEP], axis=0)).max() < 0.01
 
 
 def test_missed_cycles_do_not_stretch_the_step():

@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
-from atalante_control.flat_foot import FlatFoot, flat_feet
-from atalante_control.model import ExoskeletonParameters
+from atalante_control.flat_foot import FlatFoot, Tibiae, flat_feet
+from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
+from atalante_hal.robot import load_robot
 
 ANGLES = st.floats(-0.6, 0.6)
 STILL = (0.0, 0.0, 0.0)
 HEADING = st.floats(-math.pi, math.pi)
 LEFT, RIGHT = flat_feet(ExoskeletonParameters())
+TIBIAE = Tibiae(pinocchio_model(urdf(ExoskeletonParameters(), load_robot())))
 
 
 def rotation(axis: tuple[float, float, float], angle: float) -> np.ndarray:
@@ -91,3 +94,29 @@ def test_refuses_an_axis_it_has_no_solution_for():
     for axis in ((0.7, 0.1, 0.7), (0.0, 0.0, 1.0)):
         with pytest.raises(ValueError, match="henke axis"):
             FlatFoot(0.0, axis)
+
+
+@pytest.mark.parametrize(("side", "foot"), [(0, LEFT), (1, RIGHT)])
+@given(
+    position=arrays(float, 12, elements=st.floats(-0.5, 0.5)),
+    velocity=arrays(float, 12, elements=st.floats(-2.0, 2.0)),
+    roll=ANGLES,
+    pitch=ANGLES,
+)
+def test_the_joints_say_what_the_tibias_imu_would(
+    side: int, foot: FlatFoot, position: np.ndarray, velocity: np.ndarray, roll: float, pitch: float
+):
+    pelvis, turning = tibia(0.3, roll, pitch), np.array([0.1, -0.2, 0.3])
+
+    def shank(q: np.ndarray, world: np.ndarray) -> np.ndarray:
+        fh, th, sh, sk = q[6 * side : 6 * side + 4]
+        leg = rotation((1, 0, 0), fh) @ rotation((0, 0, 1), th) @ rotation((0, 1, 0), sh) @ rotation((0, 1, 0), sk)
+        return world @ leg
+
+    attitude, gyro = TIBIAE.attitude(side, position, velocity, quaternion(pelvis), turning.tolist())
+    r = shank(position, pelvis)
+    assume(np.trace(r) > -0.9)
+    np.testing.assert_allclose(np.abs(np.dot(attitude, quaternion(r))), 1.0, atol=1e-9)
+    dt = 1e-6
+    later = shank(position + velocity * dt, pelvis @ rotation_vector(turning * dt))
+    np.testing.assert_allclose(rotation_vector(np.array(gyro) * dt), r.T @ later, atol=1e-9)

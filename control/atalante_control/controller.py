@@ -32,7 +32,7 @@ import numpy.typing as npt
 from atalante_control.backup import BackupPolicy
 from atalante_control.certificate import Certificate, HandOver, certify, largest_assistance
 from atalante_control.deadbeat import Deadbeat
-from atalante_control.flat_foot import flat_feet
+from atalante_control.flat_foot import Tibiae, flat_feet
 from atalante_control.gait import PERIOD, Gait, bezier
 from atalante_control.guide import GuideConfig, GuideFilter
 from atalante_control.guide_shapes import GuideShape
@@ -53,6 +53,7 @@ _TAIL = Struct("16d")  # what follows q_des in the telemetry
 _STOP_MARGIN, _STOP_FADE = math.radians(1.0), math.radians(3.0)  # flat foot against the ankle's limits
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = (IMUS.index("left_tibia"), IMUS.index("right_tibia"))
+_IMU_AGE = 10  # cycles after which what an IMU said is no longer used, its timeout in the DBC
 
 
 @dataclass(frozen=True)
@@ -175,7 +176,7 @@ class HangController:
         self._deadbeat = Deadbeat(gait.duration, config.alpha)
         self._gravity = Gravity(articulated)
         self._pid = Pid(config.gains)
-        self._feet = flat_feet(exoskeleton)
+        self._feet, self._tibiae = flat_feet(exoskeleton), Tibiae(articulated)
         self._ankle_low, self._ankle_high = robot.position_min.tolist(), robot.position_max.tolist()
 
         gaits = {RIGHT: gait, LEFT: gait.mirrored()}
@@ -263,6 +264,7 @@ class HangController:
         self._share.fill(1.0)
         self._pid.start_step(RIGHT, self._share)
         self._command.vibration.fill(0.0)
+        self._command.outside = False
         self.telemetry.fill(0.0)
         self._flat_deviation = self._flat_rate = (0.0, 0.0)
         self.statistics = HangStatistics()
@@ -368,16 +370,28 @@ class HangController:
         if exceeded and self.statistics.steps:
             self.statistics.hand_overs_exceeded += 1
         if config.flat_foot:
-            angles, speeds = self._flat_target(state, leg)
+            angles, speeds = self._flat_target(state, 0, leg)
             q, qd = state.position, state.velocity
             self._flat_deviation = (float(q[leg + _SA]) - angles[0], float(q[leg + _HA]) - angles[1])
             self._flat_rate = (float(qd[leg + _SA]) - speeds[0], float(qd[leg + _HA]) - speeds[1])
         self._carry = True
 
-    def _flat_target(self, state: State, leg: int) -> tuple[Pair, Pair]:
-        """Angles and speeds of SA and HA that hold the swing sole level, within the joints' limits."""
+    def _flat_target(self, state: State, cycle: int, leg: int) -> tuple[Pair, Pair]:
+        """Angles and speeds of SA and HA that hold the swing sole level, within the joints' limits.
+
+        Without the tibia's IMU its attitude comes from the joints and the pelvis IMU; without that one, too, the nominal holds.
+        """
         low, high, imu, foot = self._ankle_low, self._ankle_high, _TIBIAE[leg > 0], self._feet[leg > 0]
-        angles, speeds = foot.level(state.imu_quaternion[imu].tolist(), state.imu_gyro[imu].tolist())
+        rows = state.imu_rows
+        if not rows or state.age[rows[imu]] <= _IMU_AGE:
+            angles, speeds = foot.level(state.imu_quaternion[imu].tolist(), state.imu_gyro[imu].tolist())
+        elif state.age[rows[_PELVIS]] <= _IMU_AGE:
+            pelvis = state.imu_quaternion[_PELVIS].tolist(), state.imu_gyro[_PELVIS].tolist()
+            angles, speeds = foot.level(*self._tibiae.attitude(leg > 0, state.position, state.velocity, *pelvis))
+        else:
+            nominal = self._nominal[self._stance][cycle].tolist()
+            sa, ha, n = leg + _SA, leg + _HA, len(JOINTS)
+            return (nominal[sa], nominal[ha]), (nominal[n + sa], nominal[n + ha])
         sagittal, henke = angles[0] + self.config.ankle_offset, angles[1]
         sa, ha = leg + _SA, leg + _HA
         sagittal, sagittal_rate = _within(sagittal, speeds[0], low[sa], high[sa])
@@ -386,7 +400,7 @@ class HangController:
 
     def _level_foot(self, state: State, row: Vector, cycle: int, leg: int) -> None:
         """Put the flat-foot targets, with their own deadbeat, in the place of the nominal ones."""
-        angles, speeds = self._flat_target(state, leg)
+        angles, speeds = self._flat_target(state, cycle, leg)
         if cycle < self._fading:
             c0, c1, c0d, c1d = (values[cycle] for values in self._cubics)
             (d0, d1), (r0, r1) = self._flat_deviation, self._flat_rate
@@ -430,6 +444,7 @@ class HangController:
         acting = config.active
         statistics = self.statistics
         h_hip, h_knee = guide.h
+        self._command.outside = w < 1.0 and (h_hip < 0.0 or h_knee < 0.0)
         if statistics.steps:
             ratio = max(abs(e_hip) / bounds[0], abs(e_knee) / bounds[1])
             statistics.cycles += 1

@@ -1,4 +1,4 @@
-r"""Flat foot: swing ankle angles that hold the sole level, from the tibia IMU alone.
+r"""Flat foot: swing ankle angles that hold the sole level, from the tibia IMU, or from the joints where that is silent.
 
 `tibia attitude -> SA, HA targets`, in place of the nominal ones, for the same PID. The foot's attitude in the world is
 :math:`R_{tibia} R_z(\text{toe}) R_y(q_{SA}) R_a(q_{HA})`; the sole is level when this takes the sole's normal to the
@@ -9,9 +9,18 @@ of :math:`R_a e_z` is :math:`-a_x \sin q_{HA}` and SA does not change it, which 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from atalante_control.model import ExoskeletonParameters
+import numpy as np
+import numpy.typing as npt
+import pinocchio
+
+from atalante_control.model import ArticulatedModel, ExoskeletonParameters, imu_link
+from atalante_hal.robot import SIDES
+
+Vector = npt.NDArray[np.float64]
+Quaternion = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -30,7 +39,7 @@ class FlatFoot:
             raise ValueError(f"the henke axis lies in the foot's x-z plane and is not vertical, not {self.axis!r}")
 
     def level(
-        self, tibia: tuple[float, float, float, float], gyro: tuple[float, float, float]
+        self, tibia: Quaternion, gyro: tuple[float, float, float]
     ) -> tuple[tuple[float, float], tuple[float, float]]:
         """SA and HA that level the sole, or the nearest HA where the tibia leans too far sideways for it.
 
@@ -62,6 +71,42 @@ class FlatFoot:
         sagittal_rate = (tz * gxd - gx * tzd) / leaning if leaning else 0.0
         sagittal_rate -= versine_rate * ax * (nz * az + nx * ax) / (nx * nx + nz * nz)
         return (sagittal, math.asin(sine)), (sagittal_rate, henke_rate)
+
+
+class Tibiae:
+    """Attitude and angular rate of the tibiae from the joints and the pelvis IMU: for a tibia whose own IMU is silent."""
+
+    def __init__(self, articulated: ArticulatedModel) -> None:
+        """Take a model with the pelvis fixed."""
+        self._model, self._into, self._rates = articulated
+        self._data = self._model.createData()
+        self._pelvis, *self._tibiae = (
+            self._model.getFrameId(imu_link(imu)) for imu in ("pelvis", *(f"{side}_tibia" for side in SIDES))
+        )
+
+    def attitude(
+        self, side: int, position: Vector, velocity: Vector, pelvis: Sequence[float], gyro: Sequence[float]
+    ) -> tuple[Quaternion, tuple[float, float, float]]:
+        """What the tibia's IMU would say.
+
+        Args:
+            side: 0 left, 1 right.
+            position, velocity: shape (12,) [rad], [rad/s].
+            pelvis, gyro: attitude (unit quaternion wxyz) and angular velocity [rad/s] of the pelvis IMU.
+
+        Returns:
+            Unit quaternion wxyz, tibia to world, and angular velocity in the tibia's frame [rad/s].
+        """
+        model, data, tibia = self._model, self._data, self._tibiae[side]
+        q, v = pinocchio.neutral(model), np.zeros(model.nv)
+        q[self._into], v[self._rates] = position, velocity
+        pinocchio.forwardKinematics(model, data, q, v)
+        pinocchio.updateFramePlacements(model, data)
+        seen = data.oMf[self._pelvis].rotation.T @ data.oMf[tibia].rotation  # from the pelvis
+        x, y, z, w = (pinocchio.Quaternion(*pelvis) * pinocchio.Quaternion(seen)).coeffs().tolist()
+        own = pinocchio.getFrameVelocity(model, data, tibia, pinocchio.ReferenceFrame.LOCAL).angular
+        p, q_rate, r = (own + seen.T @ np.asarray(gyro)).tolist()
+        return (w, x, y, z), (p, q_rate, r)
 
 
 def flat_feet(parameters: ExoskeletonParameters) -> tuple[FlatFoot, FlatFoot]:
