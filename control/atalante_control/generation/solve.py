@@ -69,13 +69,12 @@ def solve(
     Args:
         warm_start: a neighbour to start from.
         kind: `periodic`, `start` or `stop`.
-        machine_code: compile the programme first if that was not done on this machine yet: a minute, once. It pays for a
+        machine_code: compile the programme first if that was not done on this machine yet: some 15 s, once. It pays for a
             library.
 
     Returns:
         The gait; where none was found, the last iterate, with a status that names the constraint that cannot hold.
     """
-    started = time.perf_counter()
     around = None if kind == "periodic" else solve(subject, machine_code=machine_code)
     if around is not None and not around.solved:
         return around
@@ -90,6 +89,7 @@ def solve(
     else:
         watch = Watch(problem.programme.unknowns, (low, high), progress)
         solver = _solver(kind, machine_code, warm_start is not None, {"iteration_callback": watch})
+    started = time.perf_counter()
     x0 = problem.unknowns(coefficients, parameters)
     solution = solver(x0=x0, p=parameters, lbx=lower, ubx=upper, lbg=low, ubg=high)
     statistics = solver.stats()

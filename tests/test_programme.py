@@ -1,0 +1,86 @@
+"""The sparse programme: its derivatives against finite differences, its rows against what was asked for."""
+
+from __future__ import annotations
+
+import casadi
+import numpy as np
+import pytest
+
+from atalante_control.generation.programme import NAMES, Functions, Programme, Rows
+
+P = np.array([1.3, 0.7])
+X = np.array([0.2, -0.4, 0.9, 1.1, -0.8])
+PLACES = [np.array([0, 2]), np.array([2, 1]), np.array([4, 3])]  # unknown 2 is in two places
+
+
+@pytest.fixture(scope="module")
+def programme() -> Programme:
+    p = casadi.SX.sym("p", 2)
+    built = Programme(5, p)
+    built.add_linear("sum", "m", np.array([[1.0, 0.0, 2.0, 0.0, 0.0]]), np.array([3.0]))
+    x = casadi.SX.sym("x", 2)
+    circle = Rows("circle", "m2", 4.0, casadi.sumsqr(x) * p[0], np.array([-np.inf]), np.array([[1.0], [2.0], [3.0]]))
+    product = Rows("product", "N", 2.0, casadi.vertcat(x[0] * x[1] ** 2, casadi.sin(x[0])), np.zeros(2), np.ones(2))
+    built.add([circle, product], x, PLACES)
+    built.minimise(casadi.exp(x[0] * x[1]) * p[1], x, PLACES, np.array([0.5, 1.0, 2.0]))
+    return built
+
+
+@pytest.fixture(scope="module")
+def functions(programme: Programme) -> Functions:
+    return programme.functions()
+
+
+def slopes(function: object, count: int) -> np.ndarray:
+    """Central differences of a function of x."""
+    step = 1e-6
+    columns = []
+    for k in range(count):
+        ahead, behind = X.copy(), X.copy()
+        ahead[k] += step
+        behind[k] -= step
+        columns.append((np.array(function(ahead)).ravel() - np.array(function(behind)).ravel()) / (2 * step))
+    return np.array(columns).T
+
+
+def test_values(programme: Programme, functions: Functions) -> None:
+    expected = [X[0] + 2.0 * X[2]]
+    for a, b in PLACES:
+        expected += [(X[a] ** 2 + X[b] ** 2) * P[0] / 4.0, X[a] * X[b] ** 2 / 2.0, np.sin(X[a]) / 2.0]
+    np.testing.assert_allclose(np.array(functions.constraints(X, P)).ravel(), expected, rtol=1e-14)
+    objective = sum(w * np.exp(X[a] * X[b]) * P[1] for w, (a, b) in zip((0.5, 1.0, 2.0), PLACES, strict=True))
+    assert float(functions.objective(X, P)) == pytest.approx(objective, rel=1e-14)
+
+
+def test_derivatives(programme: Programme, functions: Functions) -> None:
+    rows = len(programme.lower)
+    gradient = np.array(functions.gradient(X, P)[1]).ravel()
+    np.testing.assert_allclose(gradient, slopes(lambda x: functions.objective(x, P), 5)[0], atol=1e-8)
+    jacobian = np.array(functions.jacobian(X, P)[1])
+    np.testing.assert_allclose(jacobian, slopes(lambda x: functions.constraints(x, P), 5), atol=1e-8)
+    lam = np.random.default_rng(1).normal(size=rows)
+
+    def lagrangian_slope(x: np.ndarray) -> np.ndarray:
+        gradient = 0.6 * np.array(functions.gradient(x, P)[1]).ravel()
+        return gradient + np.array(functions.jacobian(x, P)[1]).T @ lam
+
+    upper = np.array(functions.hessian(X, P, 0.6, lam))
+    assert not np.tril(upper, -1).any()
+    np.testing.assert_allclose(upper + np.triu(upper, 1).T, slopes(lagrangian_slope, 5), atol=1e-7)
+
+
+def test_bounds_are_over_the_groups_size_and_may_change_from_place_to_place(programme: Programme) -> None:
+    circle = next(group for group in programme.groups if group.name == "circle")
+    assert programme.upper[circle.rows].tolist() == [0.25, 0.5, 0.75]
+    product = next(group for group in programme.groups if group.name == "product")
+    assert programme.upper[product.rows].tolist() == [0.5] * 6
+    assert programme.lower[0] == programme.upper[0] == 3.0
+
+
+def test_every_row_is_in_one_group(programme: Programme) -> None:
+    rows = np.concatenate([group.rows for group in programme.groups])
+    assert sorted(rows.tolist()) == list(range(len(programme.lower)))
+
+
+def test_functions_are_named_as_the_solver_calls_them(functions: Functions) -> None:
+    assert tuple(function.name() for function in functions) == NAMES

@@ -1,0 +1,101 @@
+"""A step solved: residuals, determinism, warm starts, steps from and to rest, sentences for what cannot be walked."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from atalante_control.gait import SIGN, SWAP, Gait, check_gait, load_gait, motion, write_gait
+from atalante_control.generation.problem import TRANSITION, Kind, Rules
+from atalante_control.generation.solve import RESIDUAL, code_version, solve
+from atalante_control.generation.solved import SOLVED, SolvedGait
+from atalante_control.model import Patient
+from atalante_control.subject import Subject
+from atalante_hal.robot import JOINTS, load_robot
+
+SUBJECT = Subject(Patient(75.0, 1.75), 0.16, 0.8)
+ROBOT = load_robot()
+
+
+@pytest.fixture(scope="module")
+def solved() -> SolvedGait:
+    return solve(SUBJECT)
+
+
+def test_solved_within_the_residual(solved: SolvedGait) -> None:
+    assert solved.status == SOLVED
+    assert solved.max_residual < RESIDUAL
+    assert all(residual.value < RESIDUAL for residual in solved.residuals.values())
+    wanted = {"impact map", "swing clearance", "landing place", "torque limits", "centre of pressure along the sole"}
+    assert wanted <= set(solved.residuals)
+
+
+def test_it_is_a_gait_of_the_robot_with_its_record(solved: SolvedGait, tmp_path: Path) -> None:
+    check_gait(solved.gait, ROBOT)
+    path = tmp_path / "gait.json"
+    write_gait(solved.gait, path)
+    read = load_gait(path, ROBOT)
+    assert read.hash32 == solved.gait.hash32
+    assert read.parameters == SUBJECT.parameters()
+    assert read.solver["version"] == code_version()
+    assert read.solver["status"] == SOLVED
+    assert read.solver["max_residual"] < RESIDUAL
+
+
+def test_torques_are_those_of_the_class_of_machine(solved: SolvedGait) -> None:
+    # Another optimiser with other weights found 162, 86, 44, 99, 93, 29 Nm for the stance leg of this subject.
+    stance = solved.peak_torque[6:]
+    assert 120.0 < stance[JOINTS.index("right_FH") - 6] < 200.0
+    assert (stance < np.array([200.0, 90.0, 80.0, 110.0, 100.0, 40.0])).all()
+    assert (solved.peak_torque < 0.9 * ROBOT.torque_max).all()
+
+
+def test_same_request_same_bits(solved: SolvedGait) -> None:
+    assert solve(SUBJECT).gait.hash32 == solved.gait.hash32
+
+
+def test_a_neighbour_makes_it_faster_not_different(solved: SolvedGait) -> None:
+    other = Subject(Patient(78.0, 1.77), 0.15, 0.83)
+    cold, warm = solve(other), solve(other, solved.gait)
+    assert warm.solved
+    assert warm.iterations < cold.iterations
+    np.testing.assert_allclose(warm.gait.coefficients, cold.gait.coefficients, atol=math.radians(0.01))
+
+
+@pytest.mark.parametrize("kind", ["start", "stop"])
+def test_steps_from_and_to_rest_join_the_gait(solved: SolvedGait, kind: Kind) -> None:
+    step = solve(SUBJECT, kind=kind)
+    assert step.solved
+    assert step.gait.duration == TRANSITION
+    ends = np.array([0.0, 1.0])
+    q, qd, _ = motion(step.gait.coefficients, TRANSITION, ends)
+    periodic_q, periodic_qd, _ = motion(solved.gait.coefficients, SUBJECT.step_duration, ends)
+    joined, resting = (1, 0) if kind == "start" else (0, 1)
+    np.testing.assert_allclose(q[joined], periodic_q[joined], atol=1e-9)
+    np.testing.assert_allclose(qd[joined], periodic_qd[joined], atol=1e-9)
+    np.testing.assert_allclose(qd[resting], 0.0, atol=1e-9)
+
+
+def test_the_next_step_is_the_mirrored_one(solved: SolvedGait) -> None:
+    q, qd, _ = motion(solved.gait.coefficients, solved.gait.duration, np.array([0.0, 1.0]))
+    np.testing.assert_allclose(q[1], SIGN * q[0][SWAP], atol=1e-9)
+    np.testing.assert_allclose(qd[1], SIGN * qd[0][SWAP], atol=Rules().impact_jump + 1e-9)
+
+
+def test_what_cannot_be_walked_is_said_in_a_sentence() -> None:
+    outcome = solve(Subject(Patient(110.0, 1.5), 0.4, 0.4))
+    assert not outcome.solved
+    assert "cannot hold" in outcome.status
+    assert any(name in outcome.status for name in outcome.residuals)
+    assert isinstance(outcome.gait, Gait)
+
+
+def test_progress_counts_iterations(solved: SolvedGait) -> None:
+    seen: list[tuple[int, float]] = []
+    watched = solve(SUBJECT, progress=lambda iteration, violation: seen.append((iteration, violation)))
+    assert [iteration for iteration, _ in seen] == list(range(watched.iterations + 1))
+    assert seen[-1][1] < 1e-8 < seen[0][1]
+    assert watched.gait.hash32 == solved.gait.hash32
