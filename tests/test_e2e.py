@@ -5,9 +5,22 @@ from __future__ import annotations
 import e2e as oracle
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from atalante_dbc import load
-from atalante_hal.e2e import MAX_DELTA, Check, check_counter, crc, data_id_bytes
+from atalante_hal.e2e import (
+    FULL,
+    MAX_DELTA,
+    REQUALIFY,
+    SETTLED,
+    Check,
+    Qualification,
+    check_counter,
+    crc,
+    data_id_bytes,
+    qualify,
+)
 from atalante_hal.image import ReceiveImage, TransmitImage
 
 NETWORK = load()
@@ -134,3 +147,74 @@ def test_a_frame_under_another_messages_identifier_is_refused_for_every_pair_of_
         for receiver in NETWORK.messages:
             accepted = crc(payload, data_id_bytes(receiver.data_id)) == value
             assert accepted == (receiver is sender)
+
+
+# -- how far a sender is trusted ---------------------------------------------------------------------------------------
+
+
+def after(history: str, start: Qualification | None = None) -> Qualification:
+    """Qualification after cycles: g good, b bad, t timed out (and bad), T timed out (and good)."""
+    now = start or Qualification()
+    for cycle in history:
+        now = qualify(now, good=cycle in "gT", timed_out=cycle in "tT")
+    return now
+
+
+def test_trust_takes_sixteen_good_cycles_in_a_row():
+    assert not after("g" * 15).trusted
+    assert after("g" * 16).trusted
+    assert not after("g" * 15 + "b" + "g" * 15).trusted
+    assert after("g" * 15 + "b" + "g" * 16).trusted
+
+
+def test_a_perfect_sender_is_settled_and_stays_the_same_object():
+    assert after("g" * 16) is SETTLED
+    assert after("g" * 40) is SETTLED
+    assert after("g" * 16) == (0, 16, True)
+
+
+def test_a_bad_cycle_fills_the_bucket_by_four_and_a_good_one_empties_it_by_one():
+    now = after("b", SETTLED)
+    assert now == (4, 0, True)
+    assert after("ggg", now) == (1, 3, True)
+    assert after("g" * 4, now) == (0, 4, True)
+    assert after("g" * 15, now) is not SETTLED
+    assert after("g" * 16, now) is SETTLED
+
+
+def test_the_bucket_trips_when_it_is_full_and_not_before():
+    assert after("b" * 15, SETTLED) == (60, 0, True)
+    assert after("b" * 16, SETTLED) == (64, 0, False)
+    assert after("b" * 40, SETTLED) == (64, 0, False)
+
+
+def test_what_tripped_is_trusted_again_after_sixteen_good_cycles():
+    assert after("b" * 16 + "g" * 15, SETTLED) == (49, 15, False)
+    assert after("b" * 16 + "g" * 16, SETTLED) == (48, 16, True)
+    assert after("b" * 16 + "g" * 16 + "b" * 3, SETTLED).trusted
+    assert not after("b" * 16 + "g" * 16 + "b" * 4, SETTLED).trusted
+
+
+@pytest.mark.parametrize("cycle", "tT")
+def test_a_timeout_takes_the_trust_at_once_and_leaves_the_bucket(cycle: str):
+    assert after("bb" + cycle, SETTLED) == (8, 0, False)
+    assert after(cycle + "g" * 15, SETTLED).trusted is False
+    assert after(cycle + "g" * 16, SETTLED) is SETTLED
+
+
+def test_steady_loss_up_to_a_fifth_never_trips_and_above_it_does():
+    assert after("bgggg" * 500, SETTLED).trusted
+    assert not after("bggg" * 500, SETTLED).trusted
+
+
+@given(st.text("gbtT", max_size=80))
+def test_laws_of_qualification(history: str):
+    now = Qualification()
+    for place, cycle in enumerate(history):
+        before, now = now, after(cycle, now)
+        assert 0 <= now.bucket <= FULL
+        assert 0 <= now.good <= REQUALIFY
+        if now.trusted and not before.trusted:
+            assert history[place - REQUALIFY + 1 : place + 1] == "g" * REQUALIFY
+        if before.trusted and not now.trusted:
+            assert cycle in "tT" or now.bucket == FULL

@@ -1,6 +1,6 @@
 """Every HAL that runs in a test has a witness: it writes the frames it sends into a file of its own, for `command_limits`.
 
-It writes at once, so that a killed process leaves what it sent. `start` watches the HALs of this process and names the folder
+It writes as soon as they are sent, so that a killed process leaves what it sent. `start` watches the HALs of this process and names the folder
 in the environment; every Python that a test starts finds `sitecustomize` beside this file and does the same.
 """
 
@@ -35,8 +35,9 @@ def watch(transceiver_type: type[Any]) -> None:
                 path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_EXCL | os.O_CLOEXEC, 0o600
             )
             _close_with(transceiver)
+        sent = send(transceiver, batch)  # what the transmit table denies is not sent
         os.write(transceiver.witness, batch.frames.tobytes())
-        return send(transceiver, batch)
+        return sent
 
     transceiver_type.__init__, transceiver_type.send = init, send_and_write
 

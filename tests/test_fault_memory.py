@@ -1,0 +1,110 @@
+"""The fault memory: what is active, what is told once, and what is told again."""
+
+from __future__ import annotations
+
+import pytest
+
+from atalante_hal.diagnostics import Dtc
+from atalante_hal.fault_memory import QUIET_CONFIRMED, QUIET_PENDING, FaultMemory
+
+
+@pytest.fixture
+def memory() -> FaultMemory:
+    return FaultMemory()
+
+
+def told(memory: FaultMemory) -> list[tuple[int, str, str, str, float]]:
+    return [(e.cycle, e.code, e.node, e.severity, e.value) for e in memory.events]
+
+
+def test_nothing_is_active_at_first(memory: FaultMemory):
+    memory.close_cycle(1)
+    assert (memory.active, memory.bits, memory.confirmed, memory.events) == ({}, 0, frozenset(), [])
+
+
+def test_a_diagnostic_is_told_when_it_begins_and_not_while_it_lasts(memory: FaultMemory):
+    for cycle in range(5, 2000):
+        memory.raise_dtc(cycle, Dtc.NODE_TIMEOUT, "LEFT_SK", value=cycle)
+        memory.close_cycle(cycle)
+        assert memory.confirmed == {Dtc.NODE_TIMEOUT}
+        assert memory.bits == Dtc.NODE_TIMEOUT.bit
+        assert memory.active[Dtc.NODE_TIMEOUT, "LEFT_SK"].value == cycle
+    assert told(memory) == [(5, "NODE_TIMEOUT", "LEFT_SK", "error", 5)]
+    assert memory.events[0].text == "LEFT_SK: a node is silent"
+
+
+def test_what_is_not_raised_again_is_over(memory: FaultMemory):
+    memory.raise_dtc(1, Dtc.NODE_TIMEOUT, "LEFT_SK")
+    memory.raise_dtc(1, Dtc.E2E_CRC, "LEFT_SA", confirmed=False)
+    memory.close_cycle(1)
+    assert memory.bits == Dtc.NODE_TIMEOUT.bit | Dtc.E2E_CRC.bit
+    memory.raise_dtc(2, Dtc.E2E_CRC, "LEFT_SA", confirmed=False)
+    memory.close_cycle(2)
+    assert (memory.bits, memory.confirmed) == (Dtc.E2E_CRC.bit, frozenset())
+    memory.close_cycle(3)
+    assert (memory.bits, memory.active) == (0, {})
+
+
+def test_pending_is_told_as_a_warning_and_confirmed_once_more_as_what_it_is(memory: FaultMemory):
+    for cycle, confirmed in ((1, False), (2, False), (3, True), (4, True)):
+        memory.raise_dtc(cycle, Dtc.E2E_CRC, "LEFT_SK", confirmed=confirmed, text=f"in cycle {cycle}", value=cycle)
+        memory.close_cycle(cycle)
+        assert memory.confirmed == ({Dtc.E2E_CRC} if confirmed else frozenset())
+    assert told(memory) == [(1, "E2E_CRC", "LEFT_SK", "warning", 1), (3, "E2E_CRC", "LEFT_SK", "error", 3)]
+    assert [e.text for e in memory.events] == ["in cycle 1", "in cycle 3"]
+
+
+def test_what_was_confirmed_and_is_pending_again_does_not_act_any_more(memory: FaultMemory):
+    memory.raise_dtc(1, Dtc.E2E_CRC, "LEFT_SK")
+    memory.close_cycle(1)
+    memory.raise_dtc(2, Dtc.E2E_CRC, "LEFT_SK", confirmed=False)
+    memory.close_cycle(2)
+    assert memory.confirmed == frozenset()
+
+
+@pytest.mark.parametrize("order", [(True, False), (False, True)])
+def test_confirmed_wins_in_one_cycle_whatever_is_raised_first(memory: FaultMemory, order: tuple[bool, bool]):
+    for confirmed in order:
+        memory.raise_dtc(1, Dtc.E2E_CRC, "LEFT_SK", confirmed=confirmed)
+    memory.close_cycle(1)
+    assert memory.confirmed == {Dtc.E2E_CRC}
+
+
+def test_information_stays_information(memory: FaultMemory):
+    memory.raise_dtc(1, Dtc.E2E_SOME_LOST, "LEFT_SK", confirmed=False)
+    memory.raise_dtc(1, Dtc.TORQUE_SATURATED, "HAL", confirmed=False)
+    memory.raise_dtc(1, Dtc.TELEMETRY_DROPPED, "HAL")
+    assert [e.severity for e in memory.events] == ["info", "warning", "info"]
+
+
+@pytest.mark.parametrize(("confirmed", "quiet"), [(False, QUIET_PENDING), (True, QUIET_CONFIRMED)])
+def test_what_comes_and_goes_is_told_anew_after_a_while(memory: FaultMemory, confirmed: bool, quiet: int):
+    for cycle in range(0, 2 * quiet + 1, 2):
+        memory.raise_dtc(cycle, Dtc.E2E_CRC, "LEFT_SK", confirmed=confirmed)
+        memory.close_cycle(cycle)
+        memory.close_cycle(cycle + 1)
+    assert [e.cycle for e in memory.events] == [0, quiet, 2 * quiet]
+
+
+def test_nodes_and_codes_are_told_apart(memory: FaultMemory):
+    for node in ("LEFT_SK", "LEFT_SA"):
+        for dtc in (Dtc.E2E_CRC, Dtc.NODE_TIMEOUT):
+            memory.raise_dtc(7, dtc, node)
+    assert len(memory.events) == 4
+
+
+def test_an_emergency_carries_its_code(memory: FaultMemory):
+    memory.raise_dtc(7, Dtc.EMCY_CURRENT, "LEFT_SK", value=0x2310)
+    assert memory.events[0].code == "EMCY_2310"
+
+
+def test_who_and_what_is_meant(memory: FaultMemory):
+    memory.raise_dtc(1, Dtc.ENC_STUCK, "LEFT_SK", text="stuck")
+    memory.raise_dtc(1, Dtc.OVER_TEMP, "LEFT_SA", text="hot")
+    memory.raise_dtc(1, Dtc.OVER_TEMP, "LEFT_HA", confirmed=False)
+    both = frozenset({Dtc.ENC_STUCK, Dtc.OVER_TEMP})
+    assert memory.nodes_of(both) == ["LEFT_SK", "LEFT_SA"]
+    assert memory.nodes_of(frozenset({Dtc.OVER_TEMP})) == ["LEFT_SA"]
+    assert memory.text_of(frozenset({Dtc.OVER_TEMP})) == "hot"
+    assert memory.text_of(both) == "stuck"
+    assert memory.text_of(frozenset({Dtc.BUS_OFF})) == ""

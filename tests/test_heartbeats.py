@@ -1,0 +1,245 @@
+"""Status and emergencies of the nodes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from atalante_dbc import load
+from atalante_hal.diagnostics import Dtc
+from atalante_hal.fault_memory import FaultMemory
+from atalante_hal.frame import Frames, new_frames
+from atalante_hal.heartbeats import SUPPLY_LOW, UNDER_VOLTAGE, Heartbeats
+from atalante_hal.image import TransmitImage
+
+NETWORK = load()
+SLOW = [m for m in NETWORK.received_by("HAL") if m.cycle_ms != 1]
+NODES = [n.name for n in NETWORK.nodes if n.kind not in ("master", "pendant")]
+
+
+class Nodes:
+    """What the nodes send, and a HAL that hears it."""
+
+    def __init__(self) -> None:
+        self.tx = TransmitImage(SLOW)
+        self.heartbeats, self.memory = Heartbeats(NETWORK), FaultMemory()
+        self.vibration = np.zeros(8)
+        self.now = 0
+        for node in [*NODES, "PENDANT"]:
+            self.say(node, "STATUS", NodeState=5, DbcHash=NETWORK.hash32, SupplyVoltage=48.0)
+
+    def say(self, node: str, kind: str, **signals: float) -> None:
+        for signal, value in signals.items():
+            self.tx.values[self.tx.codec.index(f"{node}_{kind}", signal)] = value
+
+    def frame(self, node: str, kind: str = "STATUS", **signals: float) -> Frames:
+        self.say(node, kind, **signals)
+        return self.tx.seal_row(self.tx.codec.rows[f"{node}_{kind}"]).copy()
+
+    def hear(self, *frames: Frames, cycle: int | None = None) -> list[int]:
+        self.now = self.now + 1 if cycle is None else cycle
+        return self.heartbeats.accept(np.concatenate(frames), self.now, self.vibration)
+
+    def judge(self) -> dict[tuple[str, str], bool]:
+        self.heartbeats.judge(self.now, self.memory)
+        self.memory.close_cycle(self.now)
+        return {(dtc.value, node): entry.confirmed for (dtc, node), entry in self.memory.active.items()}
+
+    def all_well(self) -> None:
+        self.hear(*[self.frame(node) for node in [*NODES, "PENDANT"]])
+
+
+@pytest.fixture
+def nodes() -> Nodes:
+    return Nodes()
+
+
+@pytest.fixture
+def well(nodes: Nodes) -> Nodes:
+    nodes.all_well()
+    return nodes
+
+
+def test_the_nodes_are_known_when_each_but_the_pendant_has_spoken(nodes: Nodes):
+    *first, last = NODES
+    for node in first:
+        nodes.hear(nodes.frame(node))
+        assert not nodes.heartbeats.known
+    assert nodes.heartbeats.missing() == {last}
+    nodes.hear(nodes.frame(last))
+    assert nodes.heartbeats.known
+    assert nodes.heartbeats.missing() == set()
+    assert nodes.heartbeats.quiet
+    assert nodes.judge() == {}
+    assert nodes.heartbeats.quiet
+
+
+def test_a_boot_up_is_a_reset_of_a_node_that_was_there(nodes: Nodes):
+    nodes.hear(nodes.frame("LEFT_SK", NodeState=0))
+    assert nodes.judge() == {}
+    assert nodes.heartbeats.quiet
+    nodes.hear(nodes.frame("LEFT_SK", NodeState=0))
+    assert not nodes.heartbeats.quiet
+    assert nodes.judge() == {("NODE_RESET", "LEFT_SK"): True}
+    nodes.hear(nodes.frame("LEFT_SK", NodeState=5))
+    assert nodes.judge() == {}
+
+
+def test_a_node_that_began_anew_is_believed_whatever_its_counter_says(well: Nodes):
+    well.tx.resume(well.tx.codec.rows["LEFT_SK_STATUS"], 100)
+    well.hear(well.frame("LEFT_SK", NodeState=0))
+    assert well.judge() == {("NODE_RESET", "LEFT_SK"): True}
+
+
+def test_another_dbc(nodes: Nodes):
+    nodes.hear(nodes.frame("IMU_TORSO", DbcHash=NETWORK.hash32 ^ 1))
+    assert not nodes.heartbeats.quiet
+    assert nodes.judge() == {("DBC_MISMATCH", "IMU_TORSO"): True}
+    assert nodes.heartbeats.missing() == set(NODES)
+    assert nodes.memory.events[0].value == NETWORK.hash32 ^ 1
+    nodes.now += 1
+    assert nodes.judge() == {("DBC_MISMATCH", "IMU_TORSO"): True}  # as long as it says nothing else
+    assert not nodes.heartbeats.quiet
+
+
+@pytest.mark.parametrize("node", ["LEFT_SK", "HAPTICS", "PENDANT"])
+def test_a_heartbeat_is_lost_after_its_timeout(well: Nodes, node: str):
+    others = [n for n in [*NODES, "PENDANT"] if n != node]
+    well.hear(*[well.frame(n) for n in others], cycle=150)
+    well.now = 1 + 249
+    assert not well.heartbeats.overdue(well.now)
+    assert well.judge() == {}
+    well.now = 1 + 250
+    assert well.heartbeats.overdue(well.now)
+    assert well.judge() == {("HEARTBEAT_LOST", node): True}
+    assert not well.heartbeats.quiet
+    assert well.memory.events[0].value == 250
+    well.hear(well.frame(node))
+    assert not well.heartbeats.overdue(well.now)
+    assert well.judge() == {}
+    assert well.heartbeats.quiet
+
+
+def test_who_was_never_heard_is_not_overdue(nodes: Nodes):
+    assert not nodes.heartbeats.overdue(10_000)
+    assert nodes.judge() == {}
+
+
+@pytest.mark.parametrize(
+    ("volts", "code"),
+    [
+        (48.0, None),
+        (SUPPLY_LOW, None),
+        (SUPPLY_LOW - 0.1, "SUPPLY_LOW"),
+        (UNDER_VOLTAGE, "SUPPLY_LOW"),
+        (UNDER_VOLTAGE - 0.1, "UNDER_VOLTAGE"),
+        (0.0, "UNDER_VOLTAGE"),
+    ],
+)
+def test_the_supply_of_a_drive(well: Nodes, volts: float, code: str | None):
+    well.hear(well.frame("LEFT_SK", SupplyVoltage=volts))
+    assert well.heartbeats.quiet is (code is None)
+    assert well.judge() == ({(code, "LEFT_SK"): True} if code else {})
+    assert well.heartbeats.quiet is (code is None)
+    assert not code or well.memory.events[0].value == pytest.approx(volts)
+
+
+@pytest.mark.parametrize("node", ["PENDANT", "IMU_TORSO", "FOOT_LEFT", "HAPTICS"])
+def test_the_supply_of_another_node_moves_nothing(well: Nodes, node: str):
+    well.hear(well.frame(node, SupplyVoltage=0.0))
+    assert well.heartbeats.quiet
+    assert well.judge() == {}
+
+
+def test_an_emergency_holds_until_the_node_says_that_it_is_over(well: Nodes):
+    well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0x4310))
+    assert not well.heartbeats.quiet
+    for _ in range(3):
+        assert well.judge() == {("OVER_TEMP", "LEFT_SK"): True}
+        assert not well.heartbeats.quiet
+        well.now += 1
+    assert well.memory.events[0].text == "LEFT_SK: a drive is too hot to hold (emergency 0x4310)"
+    assert well.memory.events[0].value == 0x4310
+    well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0))
+    assert well.judge() == {}
+    assert well.heartbeats.quiet
+    well.hear(well.frame("LEFT_SA", "EMCY", ErrorCode=0))
+    assert well.judge() == {}
+
+
+def test_several_emergencies_of_a_cycle_are_all_heard(well: Nodes):
+    well.hear(
+        well.frame("LEFT_SK", "EMCY", ErrorCode=0x8110),
+        well.frame("LEFT_SA", "EMCY", ErrorCode=0x2310),
+        well.frame("LEFT_SK", "EMCY", ErrorCode=0x8250),
+    )
+    assert well.judge() == {
+        ("CMD_SOME_LOST", "LEFT_SK"): False,
+        ("CMD_TIMEOUT", "LEFT_SK"): True,
+        ("EMCY_2xxx", "LEFT_SA"): True,
+    }
+    well.now += 1
+    assert well.judge() == {("CMD_TIMEOUT", "LEFT_SK"): True, ("EMCY_2xxx", "LEFT_SA"): True}
+    assert [e.code for e in well.memory.events] == ["CMD_SOME_LOST", "EMCY_2310", "CMD_TIMEOUT"]
+
+
+def test_the_operator_acknowledges_all_but_what_is_still_faulty(well: Nodes):
+    for node in ("LEFT_SK", "LEFT_SA"):
+        well.hear(well.frame(node, "EMCY", ErrorCode=0x4310))
+    well.heartbeats.acknowledge({"LEFT_SA"})
+    assert well.heartbeats.emergencies == {"LEFT_SA": (Dtc.OVER_TEMP, 0x4310)}
+    assert well.judge() == {("OVER_TEMP", "LEFT_SA"): True}
+
+
+def test_amplitudes_are_handed_over_when_they_come(well: Nodes):
+    level = well.tx.codec.slice("Amplitude")
+    well.tx.values[level] = 0.5
+    well.hear(well.frame("LEFT_SK"))
+    assert not well.vibration.any()
+    row = well.tx.codec.rows["HAPTICS_STATE"]
+    assert well.hear(well.tx.seal_row(row).copy()) == []
+    assert (well.vibration == 0.5).all()
+    well.tx.values[level] = 1.0
+    damaged = well.tx.seal_row(row).copy()
+    damaged["data"][0, 9] ^= 1
+    well.hear(damaged)
+    assert (well.vibration == 0.5).all()
+    assert not well.heartbeats.quiet
+
+
+def damaged(frame: Frames) -> Frames:
+    frame["data"][0, 6] ^= 1
+    return frame
+
+
+def shortened(frame: Frames) -> Frames:
+    frame["len"] = 12
+    return frame
+
+
+def test_what_is_refused_is_told_and_not_believed(well: Nodes):
+    repeated = well.frame("FOOT_LEFT")
+    out_of_range = well.frame("IMU_TORSO", SupplyVoltage=np.nan)
+    well.hear(
+        damaged(well.frame("LEFT_SK", NodeState=0)),
+        shortened(well.frame("LEFT_SA", NodeState=0)),
+        repeated,
+        repeated,
+        out_of_range,
+    )
+    assert not well.heartbeats.quiet
+    assert well.judge() == {
+        ("E2E_CRC", "LEFT_SK"): False,
+        ("FRAME_LENGTH", "LEFT_SA"): False,
+        ("E2E_REPEATED", "FOOT_LEFT"): False,
+        ("SIGNAL_RANGE", "IMU_TORSO"): False,
+    }
+    well.now += 1
+    assert well.judge() == {}
+
+
+def test_frames_of_nobody_are_handed_back(well: Nodes):
+    stranger = new_frames(1)
+    stranger["can_id"] = 0x7FF
+    assert well.hear(stranger, well.frame("LEFT_SK"), stranger) == [0, 2]
+    assert well.heartbeats.quiet

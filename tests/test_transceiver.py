@@ -1,0 +1,327 @@
+"""The HAL's end of the bus: the transmit table, the receive budget, and a bus that fails in every way."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from atalante_dbc import load
+from atalante_hal.bus import BusDown, BusError, BusFull
+from atalante_hal.fault_memory import FaultMemory
+from atalante_hal.frame import FLAG_FDF, ID_ERROR, ID_EXTENDED, Frames, new_frames
+from atalante_hal.image import ReceiveImage, TransmitImage
+from atalante_hal.transceiver import RECEIVE_BUDGET, SURPLUS, HalDuplicate, Transceiver, TransmitDenied
+
+NETWORK = load()
+OURS = NETWORK.sent_by("HAL")
+CYCLIC = [NETWORK.message(name) for name in ("LEFT_SK_STATE", "RIGHT_SK_STATE")]
+
+
+class Bus:
+    """A bus of lists: what is sent, and what each `receive` delivers."""
+
+    name, dropped, stamps = "bench", 0, np.zeros(256, np.int64)
+
+    def __init__(self) -> None:
+        self.sent: list[Frames] = []
+        self.arrivals: list[Frames | BusError] = []
+        self.timeouts: list[float] = []
+        self.refuses: BusError | None = None
+
+    def send(self, frames: Frames) -> None:
+        if self.refuses is not None:
+            raise self.refuses
+        self.sent.append(frames.copy())
+
+    def receive(self, frames: Frames, timeout: float = 0.0) -> int:
+        self.timeouts.append(timeout)
+        if not self.arrivals:
+            return 0
+        arrived = self.arrivals.pop(0)
+        if isinstance(arrived, BusError):
+            raise arrived
+        count = min(len(arrived), len(frames))
+        frames[:count] = arrived[:count]
+        return count
+
+    def close(self) -> None:
+        pass
+
+
+class Tap:
+    def __init__(self) -> None:
+        self.sent_ids: list[list[int]] = []
+        self.received_ids: list[list[int]] = []
+
+    def sent(self, frames: Frames) -> None:
+        self.sent_ids.append(frames["can_id"].tolist())
+
+    def received(self, frames: Frames, count: int) -> None:
+        self.received_ids.append(frames["can_id"][:count].tolist())
+
+
+class Desk:
+    def __init__(self) -> None:
+        self.bus, self.tap, self.memory = Bus(), Tap(), FaultMemory()
+        self.transceiver = Transceiver(NETWORK, "HAL", self.bus, len(CYCLIC), self.tap)
+        self.cycle = 0
+
+    def judge(self) -> dict[str, bool]:
+        self.cycle += 1
+        self.transceiver.judge(self.cycle, self.memory)
+        self.memory.close_cycle(self.cycle)
+        return {dtc.value: entry.confirmed for (dtc, _), entry in self.memory.active.items()}
+
+
+@pytest.fixture
+def desk() -> Desk:
+    return Desk()
+
+
+def ids(*numbers: int) -> Frames:
+    frames = new_frames(len(numbers))
+    frames["can_id"], frames["len"], frames["flags"] = numbers, 12, 5
+    return frames
+
+
+# -- what leaves -------------------------------------------------------------------------------------------------------
+
+
+def test_every_message_of_the_node_may_be_sent_and_no_other_of_the_network(desk: Desk):
+    for message in NETWORK.messages:
+        frames = TransmitImage([message]).frames
+        if message in OURS:
+            desk.transceiver.send(desk.transceiver.grant(frames))
+        else:
+            with pytest.raises(TransmitDenied, match=f"HAL may not send id 0x{message.frame_id:X}"):
+                desk.transceiver.grant(frames)
+    assert [f["can_id"][0] for f in desk.bus.sent] == [m.frame_id for m in OURS]
+    assert desk.tap.sent_ids == [[m.frame_id] for m in OURS]
+    assert desk.transceiver.quiet
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("can_id", 0x10 | ID_EXTENDED), ("len", 12), ("flags", FLAG_FDF), ("res", 1)]
+)
+def test_a_frame_in_another_format_is_none_of_the_table(desk: Desk, field: str, value: int):
+    frames = TransmitImage([NETWORK.message("SYNC_LEFT_LEG")]).frames
+    frames[field] = value
+    with pytest.raises(TransmitDenied):
+        desk.transceiver.grant(frames)
+
+
+@pytest.mark.parametrize(("field", "value"), [("can_id", 0x181), ("can_id", 0x11), ("len", 12), ("flags", 0)])
+def test_a_header_changed_after_it_was_granted_does_not_leave(desk: Desk, field: str, value: int):
+    batch = desk.transceiver.grant(TransmitImage(OURS).frames)
+    batch.frames[field][0] = value
+    with pytest.raises(TransmitDenied, match="another identifier, length or format"):
+        desk.transceiver.send(batch)
+    assert desk.bus.sent == []
+
+
+def sync(desk: Desk):
+    return desk.transceiver.grant(TransmitImage([NETWORK.message("SYNC_LEFT_LEG")]).frames)
+
+
+def test_a_full_queue_is_confirmed_after_five_cycles_in_a_row(desk: Desk):
+    batch = sync(desk)
+    desk.bus.refuses = BusFull("no room", 3)
+    for cycle in range(1, 8):
+        desk.transceiver.send(batch)
+        desk.transceiver.send(batch)
+        assert not desk.transceiver.quiet
+        assert desk.judge() == {"BUS_TX_FULL": cycle >= 5}
+        assert not desk.transceiver.quiet
+    assert desk.memory.events[0].text == "no room"
+    assert desk.memory.events[0].value == 3
+    desk.bus.refuses = None
+    desk.transceiver.send(batch)
+    assert desk.judge() == {}
+    assert desk.transceiver.quiet
+    desk.bus.refuses = BusFull("no room", 3)
+    desk.transceiver.send(batch)
+    assert desk.judge() == {"BUS_TX_FULL": False}
+
+
+def test_a_bus_that_is_gone_is_confirmed_at_once(desk: Desk):
+    desk.bus.refuses = BusDown("gone")
+    desk.transceiver.send(sync(desk))
+    assert desk.judge() == {"BUS_DOWN": True}
+    assert desk.memory.events[0].text == "the bus bench refuses frames: gone"
+    assert desk.tap.sent_ids == []
+    assert desk.judge() == {}
+
+
+# -- what comes --------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_there_is_appended(desk: Desk):
+    desk.bus.arrivals = [ids(1, 2), ids(3)]
+    assert desk.transceiver.receive() == 2
+    assert desk.transceiver.receive(2) == 3
+    assert desk.transceiver.scratch["can_id"][:3].tolist() == [1, 2, 3]
+    assert desk.tap.received_ids == [[1, 2], [3]]
+    assert desk.bus.timeouts == [0.0, 0.0]
+
+
+def image(*heard: int) -> ReceiveImage:
+    made = ReceiveImage(CYCLIC)
+    made.age[list(heard)] = 0
+    return made
+
+
+def test_a_whole_cycle_is_not_waited_for(desk: Desk):
+    desk.bus.arrivals = [TransmitImage(CYCLIC).frames]
+    assert desk.transceiver.receive(0, image(0, 1), 1.0) == 2
+    assert desk.bus.timeouts == [0.0]
+
+
+def test_who_is_alive_is_waited_for(desk: Desk):
+    first, second = (m.frame_id for m in CYCLIC)
+    desk.bus.arrivals = [ids(first), ids(7), ids(second), ids(8)]
+    assert desk.transceiver.receive(0, image(0, 1), 60.0) == 3
+    assert len(desk.bus.arrivals) == 1
+    assert all(0.0 < t <= 60.0 for t in desk.bus.timeouts[1:])
+
+
+def test_frames_of_the_last_cycle_do_not_count_as_this_ones(desk: Desk):
+    first, second = (m.frame_id for m in CYCLIC)
+    desk.transceiver.scratch["can_id"][:2] = first, second
+    desk.bus.arrivals = [ids(), ids(first), ids(second)]
+    assert desk.transceiver.receive(2, image(0, 1), 60.0) == 4
+
+
+def test_who_is_silent_is_not_waited_for(desk: Desk):
+    desk.bus.arrivals = [ids(CYCLIC[0].frame_id), ids(9)]
+    assert desk.transceiver.receive(0, image(0), 60.0) == 1
+    assert len(desk.bus.timeouts) == 1
+
+
+def test_while_nobody_is_known_whoever_answers_is_taken_until_nobody_does(desk: Desk):
+    desk.bus.arrivals = [ids(1), ids(2), ids(3)]
+    assert desk.transceiver.receive(0, image(), 60.0) == 3
+    assert len(desk.bus.timeouts) == 4
+    assert max(desk.bus.timeouts) <= 0.1
+
+
+def test_without_patience_nothing_is_waited_for(desk: Desk):
+    desk.bus.arrivals = [ids(1), ids(2)]
+    assert desk.transceiver.receive(0, image(0, 1), 0.0) == 1
+
+
+def test_a_cycle_takes_no_more_than_its_budget(desk: Desk):
+    desk.bus.arrivals = [ids(*range(100)), ids(*range(100)), ids(1)]
+    assert desk.transceiver.receive(0, image(), 60.0) == RECEIVE_BUDGET
+    assert len(desk.bus.arrivals) == 1
+
+
+def test_a_flood_is_confirmed_after_five_cycles_in_a_row(desk: Desk):
+    usual = len(CYCLIC) + SURPLUS
+    for cycle in range(1, 8):
+        desk.bus.arrivals = [ids(*range(usual + 1))]
+        desk.transceiver.receive()
+        assert desk.judge() == {"BUS_FLOOD": cycle >= 5}
+        assert not desk.transceiver.quiet
+    assert desk.memory.events[0].value == usual + 1
+    desk.bus.arrivals = [ids(*range(usual))]
+    desk.transceiver.receive()
+    assert desk.judge() == {}
+    assert desk.transceiver.quiet
+    desk.bus.arrivals = [ids(*range(usual + 1))]
+    desk.transceiver.receive()
+    assert desk.judge() == {"BUS_FLOOD": False}
+
+
+def test_a_bus_that_fails_while_receiving_raises_nothing(desk: Desk):
+    desk.bus.arrivals = [BusDown("gone")]
+    assert desk.transceiver.receive(1) == 1
+    assert desk.judge() == {"BUS_DOWN": True}
+    assert desk.memory.events[0].text == "the bus bench fails: gone"
+    desk.bus.arrivals = [ids(1), BusDown("gone")]
+    assert desk.transceiver.receive(0, image(0, 1), 1.0) == 0
+
+
+@pytest.mark.parametrize(
+    ("can_id", "code", "value"),
+    [
+        (0x7FF, "FRAME_UNKNOWN", 0x7FF),
+        (0x10 | ID_EXTENDED, "FRAME_UNKNOWN", 0x10 | ID_EXTENDED),
+        (0x10, "HAL_DUPLICATE", 0x10),
+        (0x100, "HAL_DUPLICATE", 0x100),
+        (0x700, "HAL_DUPLICATE", 0x700),
+        (ID_ERROR | 0x40, "BUS_OFF", 0x40),
+        (ID_ERROR | 0x44, "BUS_OFF", 0x44),
+        (ID_ERROR | 0x04, None, 0),
+    ],
+)
+def test_frames_that_are_no_message_to_this_node(desk: Desk, can_id: int, code: str | None, value: int):
+    desk.transceiver.foreign(ids(can_id))
+    assert desk.transceiver.quiet is (code is None)
+    assert desk.judge() == ({code: True} if code else {})
+    assert [e.value for e in desk.memory.events] == ([value] if code else [])
+    assert desk.judge() == {}
+
+
+def test_each_of_several_strange_frames_counts(desk: Desk):
+    desk.transceiver.foreign(ids(0x7FF, ID_ERROR | 0x40, 0x100))
+    assert desk.judge() == {"FRAME_UNKNOWN": True, "BUS_OFF": True, "HAL_DUPLICATE": True}
+    assert {e.text for e in desk.memory.events} == {
+        "id 0x7FF is no message to this HAL",
+        "HAL: the CAN controller is bus-off",
+        "somebody else sends id 0x100, which is this HAL's",
+    }
+
+
+# -- before the start, and after a pause -------------------------------------------------------------------------------
+
+
+def test_a_hal_that_is_there_is_heard_before_anything_is_sent(desk: Desk):
+    desk.bus.arrivals = [ids(0x181, 0x191), ids(0x700, 0x10)]
+    with pytest.raises(HalDuplicate, match=r"another HAL is at work on bench \(id 0x10 was heard\): end it first"):
+        desk.transceiver.listen(60.0)
+    assert desk.bus.sent == []
+
+
+def test_nodes_that_speak_are_no_hal(desk: Desk):
+    desk.bus.arrivals = [ids(0x181), ids(0x7FF)]
+    desk.transceiver.listen(0.002)
+    assert desk.bus.arrivals == []
+    assert desk.judge() == {}
+
+
+def test_what_is_left_of_an_older_frame_in_the_buffer_is_not_heard(desk: Desk):
+    desk.transceiver.scratch["can_id"].fill(0x10)
+    desk.bus.arrivals = [ids(0x181)]
+    desk.transceiver.listen(0.002)
+
+
+def test_a_bus_that_is_gone_ends_the_listening(desk: Desk):
+    desk.bus.arrivals = [BusDown("gone")]
+    with pytest.raises(BusDown):
+        desk.transceiver.listen(60.0)
+
+
+def test_what_piled_up_is_dropped(desk: Desk):
+    desk.bus.arrivals = [ids(*range(RECEIVE_BUDGET)), ids(*range(RECEIVE_BUDGET)), ids(1), ids(2)]
+    desk.transceiver.discard()
+    assert len(desk.bus.arrivals) == 1
+    assert desk.judge() == {}
+
+
+def test_dropping_ends_however_fast_frames_come(desk: Desk):
+    desk.bus.arrivals = [ids(*range(RECEIVE_BUDGET))] * (RECEIVE_BUDGET + 5)
+    desk.transceiver.discard()
+    assert len(desk.bus.arrivals) == 5
+
+
+def test_dropping_from_a_bus_that_is_gone_raises_nothing(desk: Desk):
+    desk.bus.arrivals = [BusDown("gone")]
+    desk.transceiver.discard()
+    assert desk.judge() == {"BUS_DOWN": True}
+
+
+def test_a_tap_is_not_needed(desk: Desk):
+    desk.transceiver.tap = None
+    desk.bus.arrivals = [ids(1)]
+    desk.transceiver.send(sync(desk))
+    assert desk.transceiver.receive() == 1
