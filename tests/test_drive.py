@@ -375,6 +375,69 @@ class TestErrors:
         assert bench.drives.latched[7] is False  # acknowledged by the QUICK_STOP that goes on
         np.testing.assert_allclose(torque, -0.01 * ROBOT.hold_kp, rtol=0.02)
 
+    def test_a_latched_hold_that_cannot_go_on_is_a_fault_and_no_hold(self, bench: Bench) -> None:
+        bench.enable()
+        bench.drives.fail(7, 0x8250)
+        bench.drives.fail(7, 0x7305)
+        assert bench.drives.state[7] is DriveState.FAULT_REACTION_ACTIVE
+        assert not bench.drives.latched[7]
+        assert bench.signals.state[7] == DriveState.FAULT_REACTION_ACTIVE
+
+    def test_disabling_a_latched_hold_acknowledges_it(self, bench: Bench) -> None:
+        bench.enable()
+        bench.drives.fail(7, 0x8250)
+        bench.word[7] = Controlword.DISABLE_VOLTAGE
+        bench.cycle()
+        assert (bench.drives.state[7], bench.drives.latched[7]) == (DriveState.SWITCH_ON_DISABLED, False)
+        assert [e.code for e in bench.drives.emergencies] == [0x8250, 0]
+
+    def test_every_other_command_leaves_a_latched_hold_and_its_error(self, bench: Bench) -> None:
+        bench.enable()
+        bench.drives.fail(7, 0x8250)
+        for word in (
+            Controlword.ENABLE_OPERATION,
+            Controlword.SHUTDOWN,
+            Controlword.SWITCH_ON,
+            Controlword.FAULT_RESET,
+        ):
+            bench.word[7] = word
+            bench.cycle()
+            assert (bench.drives.state[7], bench.drives.latched[7]) == (DriveState.QUICK_STOP_ACTIVE, True)
+        assert [e.code for e in bench.drives.emergencies] == [0x8250]
+
+    def test_a_fault_reset_acknowledges_all_that_is_over(self, bench: Bench) -> None:
+        bench.drives.fail(7, 0x2310)
+        bench.drives.fail(7, 0x4310)
+        bench.drives.leave(7, DriveState.FAULT)
+        bench.word[7] = Controlword.FAULT_RESET
+        bench.cycle()
+        assert bench.drives.state[7] is DriveState.SWITCH_ON_DISABLED
+        assert [e.code for e in bench.drives.emergencies] == [0x2310, 0x4310, 0]
+
+    def test_the_end_of_an_error_is_not_its_acknowledgement(self, bench: Bench) -> None:
+        bench.drives.fail(7, 0x2310, stands=True)
+        for _ in range(SLOW_CYCLES):
+            bench.cycle()
+        bench.drives.recover(7, 0x2310)
+        bench.cycle()
+        assert bench.drives.state[7] is DriveState.FAULT
+        assert [e.code for e in bench.drives.emergencies] == [0x2310]
+
+    def test_commands_of_a_leg_that_are_not_fresh_acknowledge_nothing(self, bench: Bench) -> None:
+        bench.enable()
+        bench.drives.fail(7, 0x8250)
+        bench.word[:] = Controlword.QUICK_STOP
+        bench.cycle((True, False))
+        assert bench.drives.latched[7]
+        bench.cycle()
+        assert not bench.drives.latched[7]
+
+    def test_emergencies_go_where_they_are_wanted(self) -> None:
+        outbox: list[Emergency] = []
+        drives = Drives(ROBOT, SMOOTH, DriveSignals(*np.zeros((5, 12))), outbox)
+        drives.fail(0, 0x4310)
+        assert outbox == [Emergency("LEFT_FH", 0x09, 0x4310)]
+
     def test_an_error_in_a_fault_changes_nothing(self, bench: Bench) -> None:
         bench.drives.fail(7, 0x4310)
         bench.drives.leave(7, DriveState.FAULT)
