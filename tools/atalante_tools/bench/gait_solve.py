@@ -1,0 +1,52 @@
+"""Benchmarks of the gait optimiser: one gait from scratch, and one from its neighbour, on one core."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from itertools import cycle, islice
+from typing import Final
+
+from atalante_control.gait import Gait
+from atalante_control.model import Patient
+from atalante_control.subject import Subject
+from atalante_tools.bench.measure import Effort, Measurement, require
+
+#: What a gait may take on a core, and what it should [s].
+_LIMIT: Final = 3.0
+_TARGET: Final = 1.0
+_ROUNDS: Final = 12
+_CENTRE: Final = Subject(Patient(75.0, 1.75), 0.15, 0.9)
+_SUBJECTS: Final = (
+    Subject(Patient(78.0, 1.75), 0.15, 0.9),
+    Subject(Patient(75.0, 1.80), 0.15, 0.9),
+    Subject(Patient(75.0, 1.75), 0.17, 0.9),
+    Subject(Patient(75.0, 1.75), 0.15, 0.95),
+)
+
+
+def gait_solve_cold(effort: Effort) -> Measurement:
+    """A gait from the kinematic guess."""
+    return Measurement(_solved(effort, None), _LIMIT)
+
+
+def gait_solve_warm(effort: Effort) -> Measurement:
+    """A gait from that of a neighbour."""
+    from atalante_control.generation.solve import solve
+
+    return Measurement(_solved(effort, solve(_CENTRE).gait), _TARGET)
+
+
+def _solved(effort: Effort, neighbour: Gait | None) -> float:
+    """Median processor time of a solve [s], the programme being built; compiled, unless it has to be quick."""
+    from atalante_control.generation.solve import solve
+
+    solve(_CENTRE, neighbour, machine_code=not effort.quick)
+    rounds, seconds = 2 if effort.quick else _ROUNDS, []
+    for done, subject in enumerate(islice(cycle(_SUBJECTS), rounds), 1):
+        began = time.thread_time()
+        solved = solve(subject, neighbour, machine_code=not effort.quick)
+        seconds.append(time.thread_time() - began)
+        require(solved.solved, f"{subject}: {solved.status}")
+        effort.progress(done, rounds)
+    return statistics.median(seconds)

@@ -1,0 +1,140 @@
+"""`atalante gait solve`: one gait, with what it demands of the machine as figures, a table, a plot and an animation."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from atalante_tools.gait.extra import extra
+from atalante_tools.options import json_option, subject_options
+from atalante_tools.outcome import Failed
+from atalante_tools.terminal import Progress, say, show_json, table
+
+if TYPE_CHECKING:
+    from atalante_control.generation.problem import Kind
+    from atalante_control.generation.solved import SolvedGait
+    from atalante_control.generation.verify import Check
+    from atalante_control.subject import Subject
+
+_FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+@click.command()
+@subject_options
+@click.option(
+    "--kind",
+    type=click.Choice(["periodic", "start", "stop"]),
+    default="periodic",
+    show_default=True,
+    help="The step that repeats, the one from rest into it, or the one from it to rest.",
+)
+@click.option("--out", type=_FILE, metavar="FILE", help="Write the gait, .json.")
+@click.option(
+    "--plot", type=_FILE, metavar="FILE", help="Angles, torques, centre of pressure, clearance: .png, .svg, .pdf."
+)
+@click.option("--animate", type=_FILE, metavar="FILE", help="The step as a stick figure, .gif.")
+@json_option
+def solve(
+    subject: Subject | None, kind: Kind, out: Path | None, plot: Path | None, animate: Path | None, as_json: bool
+) -> None:
+    """Optimise the gait of a patient; exit code 1 and the constraint that cannot hold where there is none.
+
+    The solved gait is judged by Pinocchio, which shares no code with the optimiser. Torques are Nm, angles degrees.
+
+    \b
+    Example: atalante gait solve --mass 75 --height 175
+             atalante gait solve --mass 58 --height 1.62 --step-length 0.12 --step-duration 0.9 --out gait.json --plot gait.png
+             atalante gait solve --mass 75 --height 175 --kind start --animate start.gif
+    """
+    if subject is None:
+        raise click.UsageError("a gait is a patient's: --mass and --height")
+    with extra():
+        from atalante_control.generation.solve import solve as optimise
+    from atalante_control.gait import write_gait
+    from atalante_control.generation.verify import Verifier
+    from atalante_hal.robot import load_robot
+
+    progress = Progress()
+    progress.show(f"{subject}: building the programme")
+
+    def show(iteration: int, violation: float) -> None:
+        if progress.due():
+            progress.show(f"{subject}: iteration {iteration}, constraints violated by up to {violation:.1e}")
+
+    solved = optimise(subject, kind=kind, progress=show)
+    progress.clear()
+    if as_json:
+        show_json(_summary(subject, solved))
+    if not solved.solved:
+        raise Failed(solved.status)
+    checks = Verifier(load_robot(), subject.patient).verify(solved.gait, kind)
+    if not as_json:
+        click.echo(_torques(solved))
+        click.echo()
+        click.echo(_residuals(solved))
+        click.echo()
+        click.echo(_judgement(checks))
+    say(f"{kind} step of {subject}: {solved.iterations} iterations, {solved.solve_s:.2f} s")
+    if failed := [check.name for check in checks if not check.holds]:
+        raise Failed(f"Pinocchio does not confirm the gait: {', '.join(failed)}")
+    if out is not None:
+        write_gait(solved.gait, out)
+        say(f"gait in {out}")
+    if plot is not None or animate is not None:
+        _draw(solved, subject, plot, animate)
+
+
+def _summary(subject: Subject, solved: SolvedGait) -> dict[str, Any]:
+    """What scripts get. `status` is "solved" or the sentence; `peak_torque` is the largest of `peak_torques`, Nm."""
+    from atalante_hal.robot import JOINTS
+
+    return {
+        "status": solved.status,
+        "solve_s": solved.solve_s,
+        "max_residual": solved.max_residual,
+        "step_length": subject.step_length,
+        "step_duration": subject.step_duration,
+        "peak_torque": float(solved.peak_torque.max()),
+        "peak_torques": dict(zip(JOINTS, solved.peak_torque.tolist(), strict=True)),
+    }
+
+
+def _torques(solved: SolvedGait) -> str:
+    """Peaks by leg joint: right leg stands, left leg swings."""
+    from atalante_hal.robot import LEG_JOINTS, load_robot
+
+    limits = load_robot().torque_max
+    angles = solved.gait.tables().q
+    rows = []
+    for i, joint in enumerate(LEG_JOINTS):
+        ranges = []
+        for column in (i + len(LEG_JOINTS), i):
+            low, high = (math.degrees(value) for value in (angles[:, column].min(), angles[:, column].max()))
+            ranges.append(f"{low:.0f} to {high:.0f}")
+        stance, swing = solved.peak_torque[i + len(LEG_JOINTS)], solved.peak_torque[i]
+        rows.append([joint, f"{stance:.1f}", f"{swing:.1f}", f"{limits[i]:.0f}", *ranges])
+    return table([["joint", "stance Nm", "swing Nm", "limit Nm", "stance deg", "swing deg"], *rows])
+
+
+def _residuals(solved: SolvedGait) -> str:
+    rows = [[name, f"{residual.value:.1e}", residual.unit] for name, residual in solved.residuals.items()]
+    return table([["constraint", "violated by", "unit"], *rows])
+
+
+def _judgement(checks: tuple[Check, ...]) -> str:
+    rows = [[c.name, f"{c.value:.3g}", f"{c.limit:.3g}", c.unit, "ok" if c.holds else "FAIL"] for c in checks]
+    return table([["by Pinocchio", "found", "limit", "unit", ""], *rows])
+
+
+def _draw(solved: SolvedGait, subject: Subject, plot: Path | None, animate: Path | None) -> None:
+    try:
+        from atalante_tools.gait.figures import draw_animation, draw_plot
+    except ModuleNotFoundError as error:
+        raise Failed(f"a picture needs {error.name}: type `pip install 'atalante-hal[plot]'`") from error
+    for draw, file, what in ((draw_plot, plot, "plot"), (draw_animation, animate, "animation")):
+        if file is not None:
+            draw(solved.gait, subject.patient, file)
+            say(f"{what} in {file}")
