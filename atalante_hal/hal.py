@@ -121,8 +121,8 @@ class Hal:
         self._header = parts.header
         self._header[3] = assistance_factor
         self._image = ReceiveImage(fast, parts.signals)
+        self._plausibility = Plausibility(self.robot, self._image, PERIOD)
         self._judgement = Judgement(self.network, self._image)
-        self._plausibility = Plausibility(self.robot, self._image.codec, self._image.values, self._image.age, PERIOD)
         self._heartbeats = Heartbeats(self.network)
         self._pendant = Pendant(self._image)
         self.state = parts.state(assistance_factor, len(fast))
@@ -188,10 +188,7 @@ class Hal:
         foreign = image.accept(transceiver.scratch, count, cycle & 0xFF)
         if foreign:
             self._accept_foreign(foreign)
-        plausibility = self._plausibility
-        findings = plausibility.check(image.all_fresh)
-        if plausibility.rejected:
-            self._judgement.refuse(plausibility.rejected)
+        findings = self._plausibility.check()
         parts, pendant = self._parts, self._pendant
         np.multiply(parts.motor_side, self._to_joint, parts.joint_side)
         if not (

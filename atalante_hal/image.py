@@ -66,8 +66,11 @@ class ReceiveImage:
         self._expected_headers = as_words(self.frames)[:, 0].tobytes()
         self._expected_counters: bytes | None = None
         self._counters_of = [bytes([tag]) * count for tag in range(256)]
+        #: The values before the last `accept`.
+        self.values_before = self.values.copy()
+        self._age_before: npt.NDArray[np.int64] = self.age.copy()
         #: The last cycle was perfect: every row was committed exactly as expected.
-        self.all_fresh = False
+        self.all_fresh = self._was_fresh = False
         self._scratch: _Scratch | None = None
         self._ordered = _Scratch(new_frames(count), self.codec.messages)
 
@@ -90,6 +93,9 @@ class ReceiveImage:
         """
         rows = len(self._headers)
         row_of = self.frame_ids
+        self._was_fresh = self.all_fresh
+        if not self._was_fresh:
+            self._age_before[:] = self.age
         if (count == rows or (count > rows and row_of.keys().isdisjoint(frames["can_id"][rows:count].tolist()))) and (
             self.accept_exact(self._scratch_of(frames), tag)
         ):
@@ -105,9 +111,12 @@ class ReceiveImage:
         self.new_cycle()
         return self.accept_each(frames, count, tag)
 
-    def refuse(self, row: int, age: int) -> None:
-        """What `accept` just committed cannot be true, and its values were put back to those of `age` cycles ago."""
-        self.age[row], self.check[row] = age, Check.IMPLAUSIBLE
+    def refuse(self, row: int) -> None:
+        """What `accept` just committed cannot be true: the row keeps the values it had before, and is a cycle older."""
+        mine = self.codec.row_of == row
+        self.values[mine] = self.values_before[mine]
+        self.age[row] = 1 if self._was_fresh else self._age_before[row] + 1
+        self.check[row] = Check.IMPLAUSIBLE
         self.all_fresh = False
 
     def begins(self, frames: Frames, count: int) -> bool:
@@ -138,6 +147,7 @@ class ReceiveImage:
             return False
         if not self.codec.extract(scratch.words):
             return False
+        self.values_before[:] = self.values
         self.codec.scale(self.values)
         self._bytes[:] = scratch.bytes
         self._expected_counters = expected.translate(_NEXT)
@@ -155,6 +165,7 @@ class ReceiveImage:
             Places in `frames[:count]` of the frames that are no message of this image.
         """
         self._synchronise_counters()
+        self.values_before[:] = self.values
         foreign: list[int] = []
         checks, words = self.check, as_words(frames)
         for place, header in enumerate(words[:count, 0].tolist()):

@@ -8,8 +8,6 @@ that loses more than a fifth of its frames trips its leaky bucket. What tripped 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 import numpy.typing as npt
 
@@ -70,11 +68,6 @@ class Judgement:
         """Whether a row's sender is trusted."""
         return self.qualification[row].trusted
 
-    def refuse(self, rejected: Mapping[int, int]) -> None:
-        """What these rows of the cycle say cannot be true and was put back: row -> cycles since its last good value."""
-        for row, age in rejected.items():
-            self._image.refuse(row, age)
-
     def judge(self, cycle: int, memory: FaultMemory) -> None:
         """Judge a cycle that is not perfect, or follows one that was not."""
         image = self._image
@@ -99,7 +92,7 @@ class Judgement:
         now = self.qualification[row] = qualify(self.qualification[row], good=intact, timed_out=late)
         self._known[row] |= now.trusted
         confirmed = late and self._known[row] and self._confirms[row]
-        if confirmed and check is not Check.IMPLAUSIBLE:  # which has its own finding
+        if confirmed and check is not Check.IMPLAUSIBLE:  # which `plausibility` tells
             dtc = self._invalid[row] if check is Check.INVALID else CONFIRMED[check]
             text = f"{sender}: {dtc.meaning}; its data is {age} cycles old"
             memory.raise_dtc(cycle, dtc, sender, value=age, text=text)

@@ -17,6 +17,8 @@ import atalante_dbc
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.codec import Codec
 from atalante_hal.diagnostics import Dtc
+from atalante_hal.e2e import Check
+from atalante_hal.image import ReceiveImage
 from atalante_hal.plausibility import Finding, Plausibility
 from atalante_hal.plausibility.finding import Signals, measured, signals_of
 from atalante_hal.plausibility.imus import hip_angles
@@ -62,14 +64,14 @@ class Machine:
 
     cycles: int = 0
     missing: set[int] = field(default_factory=set)  # rows that are not heard
+    late: dict[int, int] = field(default_factory=dict)  # rows whose data is so many cycles old
     amplitude: float = 0.05  # rad
     standing: bool = False
 
     def __post_init__(self) -> None:
-        self.values = np.zeros(CODEC.size)
-        self.age = np.zeros(len(MESSAGES), np.int64)
-        self.now = signals_of(CODEC, self.values)
-        self.checks = Plausibility(ROBOT, CODEC, self.values, self.age, PERIOD)
+        self.image = ReceiveImage(MESSAGES, np.zeros(CODEC.size))
+        self.now = signals_of(CODEC, self.image.values)
+        self.checks = Plausibility(ROBOT, self.image, PERIOD)
         self.attitudes = attitudes(MIDDLE)
         self.run(1)
 
@@ -77,18 +79,27 @@ class Machine:
     def time(self) -> float:
         return self.cycles * PERIOD
 
+    @property
+    def refused(self) -> dict[int, int]:
+        """Row -> age of what came and was not used."""
+        rows = np.flatnonzero(self.image.check == Check.IMPLAUSIBLE).tolist()
+        assert not rows or not self.image.all_fresh
+        return {row: int(self.image.age[row]) for row in rows}
+
     def position(self) -> np.ndarray:
         return MIDDLE + self.amplitude * math.sin(3.0 * self.time)
 
     def cycle(self, change: Change = lambda now: None) -> tuple[Finding, ...]:
-        kept = self.values.copy() if self.missing else self.values
-        now, noise = self.now, NOISE[self.cycles % len(NOISE)]
+        image, now, noise = self.image, self.now, NOISE[self.cycles % len(NOISE)]
+        values, age = image.values, image.age
+        image.values_before[:] = values
+        image._age_before[:] = age
         position = self.position()
         now.position[:] = position * GEAR
         now.velocity[:] = self.amplitude * 3.0 * math.cos(3.0 * self.time) * GEAR
         swing = 20.0 * math.sin(50.0 * self.time) if self.amplitude else 0.0  # who is pushed moves
         now.torque[:] = swing + 0.05 * noise.torque
-        if self.cycles % 16 in (0, 7):  # when they may be looked at
+        if self.cycles % 16 in (0, 8):  # when they may be looked at
             self.attitudes = attitudes(position)
         now.quaternion[:] = self.attitudes
         now.gyro[:] = 4e-3 * noise.gyro
@@ -98,20 +109,20 @@ class Machine:
         if self.standing:
             now.force[:, :, 2] += 100.0
         change(now)
-        if self.missing:
-            lost = np.isin(CODEC.row_of, list(self.missing))
-            self.values[lost] = kept[lost]
-            missing = list(self.missing)
-            aged = self.age[missing] + 1
-            self.age.fill(0)
-            self.age[missing] = aged
-        else:
-            self.age.fill(0)
-        found = self.checks.check(not self.missing)
+        image.check.fill(Check.OK)
+        missing = list(self.missing)
+        aged = age[missing] + 1
+        age.fill(0)
+        if missing:
+            lost = np.isin(CODEC.row_of, missing)
+            values[lost] = image.values_before[lost]
+            age[missing] = aged
+            image.check[missing] = Check.NO_DATA
+        for row, cycles in self.late.items():
+            age[row] = cycles
+        image.all_fresh = not (self.missing or self.late)
+        found = self.checks.check()
         assert found is self.checks.findings
-        for refused, age in self.checks.rejected.items():
-            assert self.age[refused] == 0
-            self.age[refused] = age
         self.cycles += 1
         return found
 
@@ -154,7 +165,7 @@ def test_a_healthy_robot_is_never_doubted(standing: bool):
     nothing = machine.checks.findings
     for _ in range(3000):
         assert machine.cycle() is nothing
-        assert not machine.checks.rejected
+        assert not machine.refused
     assert nothing == ()
 
 
@@ -164,7 +175,7 @@ def test_losing_frames_is_not_implausible():
     for _ in range(3000):
         machine.missing = set(np.flatnonzero(rng.random(len(MESSAGES)) < 0.3).tolist())
         assert machine.cycle() == ()
-        assert not machine.checks.rejected
+        assert not machine.refused
 
 
 class TestEncoderJump:
@@ -182,7 +193,7 @@ class TestEncoderJump:
             found = machine.cycle(move)
             if not refused:
                 assert found == ()
-                assert not machine.checks.rejected
+                assert not machine.refused
                 assert machine.now.velocity[joint] == 7.0
                 continue
             finding = only(found)
@@ -190,7 +201,7 @@ class TestEncoderJump:
             assert not finding.confirmed
             assert finding.value == pytest.approx(REACH[joint])
             assert f"{JOINTS[joint]} jumped by {math.degrees(REACH[joint]):.2f} degrees" in finding.text
-            assert machine.checks.rejected == {row(JOINTS[joint]): 1}
+            assert machine.refused == {row(JOINTS[joint]): 1}
             assert machine.now.position[joint] == MIDDLE[joint] * GEAR[joint]
             assert machine.now.velocity[joint] == 0.0
             assert machine.cycle() == ()
@@ -207,7 +218,25 @@ class TestEncoderJump:
             target = (MIDDLE[joint] + (lost + 1) * way + noise + size) * GEAR[joint]
             found = machine.cycle(lambda now, target=target: now.position.__setitem__(joint, target))
             assert bool(found) is refused
-            assert machine.checks.rejected == ({row(JOINTS[joint]): lost + 1} if refused else {})
+            assert machine.refused == ({row(JOINTS[joint]): lost + 1} if refused else {})
+
+    @pytest.mark.parametrize(("before", "after", "cycles"), [(3, 3, 1), (3, 0, 4), (0, 2, 1), (4, 2, 3)])
+    def test_the_time_between_two_samples_counts_and_not_when_they_came(self, before: int, after: int, cycles: int):
+        """From data `before` cycles old to data `after` cycles old; where that is less than a cycle, one has to be missed."""
+        way, noise = ROBOT.velocity_max[2] * PERIOD, 3.0 * ROBOT.encoder_noise[2]
+        for size, refused in ((-1e-9, False), (1e-9, True)):
+            machine = Machine(amplitude=0.0)
+            machine.late = {row("left_SH"): before}
+            machine.run(6)
+            lost = cycles - 1 - before + after
+            machine.missing = {row("left_SH")} if lost else set()
+            machine.late = {}
+            machine.run(lost)
+            machine.missing, machine.late = set(), {row("left_SH"): after}
+            target = (MIDDLE[2] + cycles * way + noise + size) * GEAR[2]
+            found = machine.cycle(lambda now, target=target: now.position.__setitem__(2, target))
+            assert bool(found) is refused
+            machine.late = {}
 
     def test_five_in_a_row_are_no_stray(self):
         machine = Machine()
@@ -216,10 +245,10 @@ class TestEncoderJump:
             now.position[3] += 1.0 * GEAR[3]
 
         assert [only(machine.cycle(away)).confirmed for _ in range(6)] == [False] * 4 + [True] * 2
-        assert machine.checks.rejected == {row("left_SK"): 6}
+        assert machine.refused == {row("left_SK"): 6}
         machine.missing = {row("left_SK")}
         assert only(machine.cycle()).confirmed
-        assert machine.checks.rejected == {}
+        assert machine.refused == {}
         machine.missing = set()
         assert machine.cycle() == ()
         assert not only(machine.cycle(away)).confirmed
@@ -230,26 +259,28 @@ class TestEncoderJump:
         away = MIDDLE[3] + 0.1
         for cycle in range(1, cycles + 3):
             machine.cycle(lambda now: now.position.__setitem__(3, away * GEAR[3]))
-            assert bool(machine.checks.rejected) == (cycle * ROBOT.velocity_max[3] * PERIOD + 3e-5 < 0.1)
+            assert bool(machine.refused) == (cycle * ROBOT.velocity_max[3] * PERIOD + 3e-5 < 0.1)
 
     def test_two_joints_at_once(self):
         machine = Machine()
         found = machine.cycle(lambda now: now.position.__setitem__(slice(1, 8, 6), 0.0))
         assert [f.node for f in found] == ["LEFT_TH", "RIGHT_TH"]
-        assert machine.checks.rejected == {row("left_TH"): 1, row("right_TH"): 1}
+        assert machine.refused == {row("left_TH"): 1, row("right_TH"): 1}
 
     def test_the_first_value_may_be_any(self):
-        values, age = np.full(CODEC.size, np.nan), np.zeros(len(MESSAGES), np.int64)
-        checks = Plausibility(ROBOT, CODEC, values, age, PERIOD)
-        values[:100] = Machine().values[:100]
-        assert checks.check(True) == ()
-        assert not checks.rejected
+        image = ReceiveImage(MESSAGES)  # of NaN
+        checks = Plausibility(ROBOT, image, PERIOD)
+        image.values[:100] = Machine().image.values[:100]
+        image.check.fill(Check.OK)
+        image.age.fill(0)
+        assert checks.check() == ()
+        assert not (image.check == Check.IMPLAUSIBLE).any()
 
     def test_many_quick_joints_are_no_jump(self):
         machine = Machine(amplitude=0.0)
         machine.cycle(lambda now: now.position.__iadd__(0.9 * REACH * GEAR))
         assert machine.checks.findings == ()
-        assert not machine.checks.rejected
+        assert not machine.refused
 
 
 class TestVelocity:
@@ -257,7 +288,7 @@ class TestVelocity:
     @signs
     def test_the_threshold_is_tight_and_found_in_time(self, joint: int, sign: float):
         error = ROBOT.sensors.velocity_error
-        for phase in (0, 3, 7):
+        for phase in (0, 3, 15):
             machine = Machine(amplitude=0.0)
             machine.run(40 + phase)
 
@@ -265,35 +296,34 @@ class TestVelocity:
                 now.velocity[joint] = sign * size * error * GEAR[joint]
 
             assert machine.run(100, lambda now: off(now, 1.0 - 1e-9)) == ()
-            machine.run(9)
-            assert machine.until_found(Dtc.ENC_VELOCITY, 56, lambda now: off(now, 1.0 + 1e-6)) >= 40
+            machine.run(17)
+            assert machine.until_found(Dtc.ENC_VELOCITY, 64, lambda now: off(now, 1.0 + 1e-6)) >= 48
             finding = only(machine.checks.findings)
             assert finding.node == JOINTS[joint].upper()
             assert finding.value == pytest.approx(sign * error, rel=1e-5)
             assert f"velocity of {JOINTS[joint]} is {math.degrees(sign * error):+.0f} deg/s" in finding.text
-            assert machine.run(17) == ()
+            assert machine.run(33) == ()
 
     def test_the_mean_counts_and_not_the_moment(self):
         machine = Machine()
         rng = np.random.default_rng(3)
         jitter = [rng.choice([-0.9, 0.9]) for _ in range(1000)]
-        assert machine.run(400, lambda now: now.velocity.__iadd__(jitter[machine.cycles // 8] * GEAR)) == ()
+        assert machine.run(400, lambda now: now.velocity.__iadd__(jitter[machine.cycles // 16] * GEAR)) == ()
 
     def test_a_cycle_with_a_loss_starts_the_comparison_anew(self):
         machine = Machine()
         for cycle in range(200):
-            machine.missing = {row("right_HA")} if cycle % 8 < 4 else set()
+            machine.missing = {row("right_HA")} if cycle % 16 < 4 else set()
             assert machine.cycle(lambda now: now.velocity.__setitem__(5, 1000.0)) == ()
 
     def test_it_follows_the_way_of_the_encoder(self):
         machine = Machine(amplitude=0.0)
 
         def turn(now: Signals) -> None:
-            now.position[5] += 0.3 * machine.time * GEAR[5]
-            now.velocity[5] = 0.3 * GEAR[5]
+            now.position[5] += 0.9 * machine.time * GEAR[5]
+            now.velocity[5] = 0.9 * GEAR[5]
 
-        machine.checks._before[5] = 0.0
-        assert all(f.dtc is not Dtc.ENC_VELOCITY for f in machine.run(300, turn))
+        assert machine.run(300, turn) == ()
 
 
 class TestImuRange:
@@ -317,7 +347,7 @@ class TestImuRange:
         assert (finding.dtc, finding.node) == (Dtc.IMU_SATURATED, f"IMU_{IMUS[imu].upper()}")
         assert finding.value == pytest.approx(signal.maximum)
         assert f"the {IMUS[imu]} IMU is at the end of its range, {signal.maximum:.0f}" in finding.text
-        assert machine.checks.rejected == {row(f"IMU_{IMUS[imu]}"): 1}
+        assert machine.refused == {row(f"IMU_{IMUS[imu]}"): 1}
         for name, value in before.items():
             assert np.array_equal(getattr(machine.now, name)[imu], value)
         assert machine.cycle() == ()
@@ -327,7 +357,7 @@ class TestImuRange:
         machine = Machine()
         found = [only(machine.cycle(lambda now: now.gyro.__setitem__(imu, 40.95875))) for _ in range(11)]
         assert [f.confirmed for f in found] == [False] * 9 + [True] * 2
-        assert machine.checks.rejected == {row(f"IMU_{IMUS[imu]}"): 11}
+        assert machine.refused == {row(f"IMU_{IMUS[imu]}"): 11}
 
     def test_all_shaking_hard_is_no_saturation(self):
         machine = Machine()
@@ -343,7 +373,7 @@ class TestQuaternion:
         machine.run(phase)
         for squared in (1.0 + allowed * (1.0 - 1e-9), 1.0 - allowed * (1.0 - 1e-9)):
             assert machine.run(9, lambda now, s=squared: now.quaternion[imu].__imul__(math.sqrt(s))) == ()
-            assert not machine.checks.rejected
+            assert not machine.refused
             machine.cycle()
         for squared in (1.0 + allowed * (1.0 + 1e-9), 1.0 - allowed * (1.0 + 1e-9)):
 
@@ -355,15 +385,22 @@ class TestQuaternion:
             assert not finding.confirmed
             assert finding.value == pytest.approx(math.sqrt(squared))
             assert f"quaternion of the {IMUS[imu]} IMU has the norm {math.sqrt(squared):.3f}" in finding.text
-            assert machine.checks.rejected == {row(f"IMU_{IMUS[imu]}"): 1}
+            assert machine.refused == {row(f"IMU_{IMUS[imu]}"): 1}
             assert np.allclose(np.linalg.norm(machine.now.quaternion[imu]), 1.0)
             assert not only(machine.run(8, stretch)).confirmed
             assert only(machine.cycle(stretch)).confirmed
             assert machine.cycle() == ()
-            assert machine.checks.rejected == {}
+            assert machine.refused == {}
 
-    @pytest.mark.parametrize("phase", range(8))
-    def test_two_that_err_the_opposite_way_are_found_within_eight_cycles(self, phase: int):
+    def test_an_imu_that_was_never_heard_is_not_judged(self):
+        image = ReceiveImage(MESSAGES, np.zeros(CODEC.size))
+        checks = Plausibility(ROBOT, image, PERIOD)
+        for _ in range(40):
+            image.new_cycle()
+            assert checks.check() == ()
+
+    @pytest.mark.parametrize("phase", range(0, 32, 5))
+    def test_two_that_err_the_opposite_way_are_found_within_a_round(self, phase: int):
         machine = Machine()
         machine.run(phase)
 
@@ -371,9 +408,9 @@ class TestQuaternion:
             now.quaternion[1] *= math.sqrt(1.1)
             now.quaternion[3] *= math.sqrt(0.9)
 
-        assert any(machine.cycle(stretch) for _ in range(8))
+        assert any(machine.cycle(stretch) for _ in range(32))
         assert [f.node for f in machine.checks.findings] == ["IMU_PELVIS", "IMU_RIGHT_TIBIA"]
-        assert machine.checks.rejected == {row("IMU_pelvis"): 1, row("IMU_right_tibia"): 1}
+        assert machine.refused == {row("IMU_pelvis"): 1, row("IMU_right_tibia"): 1}
 
 
 angles = st.floats(-1.2, 1.2)
@@ -439,7 +476,7 @@ class TestDrift:
 
 class TestStuckEncoder:
     @joints
-    @pytest.mark.parametrize("phase", [0, 1, 4, 7])
+    @pytest.mark.parametrize("phase", [0, 1, 9, 15])
     def test_found_within_fifty_cycles_while_the_torque_swings(self, joint: int, phase: int):
         machine = Machine()
         machine.run(20 + phase)
@@ -449,13 +486,13 @@ class TestStuckEncoder:
             now.position[joint] = stuck
             now.velocity[joint] = 0.0
 
-        assert 33 <= machine.until_found(Dtc.ENC_STUCK, 50, stick) <= 50
+        assert 32 < machine.until_found(Dtc.ENC_STUCK, 50, stick) <= 48
         finding = only(machine.checks.findings)
         assert finding.node == JOINTS[joint].upper()
         assert finding.value >= ROBOT.breakaway[joint]
         assert f"{JOINTS[joint]} stands still while the torque swings by {finding.value:.0f} Nm" in finding.text
-        assert machine.checks.rejected == {}
-        assert machine.run(9) == ()
+        assert machine.refused == {}
+        assert machine.run(17) == ()
 
     @joints
     def test_the_swing_of_the_torque_is_tight_and_counted_from_where_it_stood(self, joint: int):
@@ -468,13 +505,13 @@ class TestStuckEncoder:
             now.torque[:] = 3.0 + wobble
 
         wobble = 30.0
-        machine.run(16, lambda now: (hold(now), now.position.__iadd__(1e-4 * machine.cycles)))
+        machine.run(32, lambda now: (hold(now), now.position.__iadd__(1e-4 * machine.cycles)))
         wobble = 0.0
-        machine.run(16, hold)
+        machine.run(32, hold)
         wobble = ROBOT.breakaway[joint] * (1.0 - 1e-9)
         assert machine.run(100, hold) == ()
         wobble = -1e-6
-        assert machine.until_found(Dtc.ENC_STUCK, 8, hold) <= 8
+        assert machine.until_found(Dtc.ENC_STUCK, 16, hold) <= 16
         assert only(machine.checks.findings).value == pytest.approx(ROBOT.breakaway[joint], rel=1e-5)
 
     @joints
@@ -484,13 +521,13 @@ class TestStuckEncoder:
         inwards = 1.0 if limit == "position_min" else -1.0
         for distance, found in ((0.0049, False), (0.0051, True)):
             machine = Machine(amplitude=0.0)
-            machine.now.position[joint] = machine.checks._before[joint] = (end + inwards * distance) * GEAR[joint]
+            machine.now.position[joint] = at = (end + inwards * distance) * GEAR[joint]
 
-            def push(now: Signals, machine: Machine = machine) -> None:
-                now.position[joint] = machine.checks._before[joint]
+            def push(now: Signals, machine: Machine = machine, at: float = at) -> None:
+                now.position[joint] = at
                 now.torque[joint] = 20.0 * math.sin(50.0 * machine.time)
 
-            machine.run(60, push)
+            machine.run(100, push)
             stuck = [f.node for f in machine.checks.findings if f.dtc is Dtc.ENC_STUCK]
             assert stuck == ([JOINTS[joint].upper()] if found else [])
 
@@ -502,7 +539,7 @@ class TestStuckEncoder:
 
 class TestFrozenImu:
     @imus
-    @pytest.mark.parametrize("phase", range(0, 8, 3))
+    @pytest.mark.parametrize("phase", [0, 7, 15])
     def test_found_within_a_hundred_cycles(self, imu: int, phase: int):
         machine = Machine()
         machine.run(20 + phase)
@@ -511,15 +548,15 @@ class TestFrozenImu:
         def freeze(now: Signals) -> None:
             now.gyro[imu] = frozen
 
-        assert 88 <= machine.until_found(Dtc.IMU_STUCK, 100, freeze) <= 96
+        assert 80 < machine.until_found(Dtc.IMU_STUCK, 100, freeze) <= 96
         finding = only(machine.checks.findings)
         assert (finding.node, finding.value) == (f"IMU_{IMUS[imu].upper()}", 100.0)
         assert f"gyro of the {IMUS[imu]} IMU" in finding.text
-        assert machine.checks.rejected == {row(f"IMU_{IMUS[imu]}"): 1}
+        assert machine.refused == {row(f"IMU_{IMUS[imu]}"): 1}
         assert only(machine.run(20, freeze)) == finding
-        assert machine.checks.rejected == {row(f"IMU_{IMUS[imu]}"): 21}
-        assert machine.run(9) == ()
-        assert machine.checks.rejected == {}
+        assert machine.refused == {row(f"IMU_{IMUS[imu]}"): 21}
+        assert machine.run(17) == ()
+        assert machine.refused == {}
 
     def test_an_axis_alone_may_stand_still(self):
         machine = Machine()
@@ -530,7 +567,7 @@ class TestFrozenImu:
         frozen = machine.now.gyro[0].copy()
         waited = 0
         while not machine.checks.findings:
-            machine.missing = {row("IMU_torso")} if waited % 16 < 8 else set()
+            machine.missing = {row("IMU_torso")} if waited % 32 < 16 else set()
             machine.cycle(lambda now: now.gyro.__setitem__(0, frozen))
             waited += 1
         assert 150 < waited < 200
@@ -547,7 +584,7 @@ class TestForceCells:
         def stick(now: Signals) -> None:
             now.force[foot, cell, axis] = value
 
-        assert 88 <= machine.until_found(Dtc.FOOT_CELL, 100, stick) <= 96
+        assert 80 < machine.until_found(Dtc.FOOT_CELL, 100, stick) <= 96
         finding = only(machine.checks.findings)
         assert finding.node == f"FOOT_{FEET[foot].upper()}"
         assert f"force cell {CELLS[cell]} of the {FEET[foot]} foot repeats" in finding.text
@@ -555,14 +592,14 @@ class TestForceCells:
             assert finding.value == value
         assert not machine.now.force[foot, cell].any()
         assert np.count_nonzero(machine.now.force) == 21
-        assert machine.checks.rejected == {}
+        assert machine.refused == {}
         machine.run(30, stick)
         assert not machine.now.force[foot, cell].any()
         machine.missing = {row(f"FOOT_{FEET[foot]}")}
         machine.run(20, stick)
         machine.missing = set()
         assert only(machine.cycle(stick)).dtc is Dtc.FOOT_CELL
-        assert machine.run(9) == ()
+        assert machine.run(17) == ()
         assert machine.now.force[foot, cell].all()
 
     def stick_out(self, foot: int, cell: int, force: float) -> Change:
@@ -661,7 +698,7 @@ def test_what_was_kept_is_what_was_good_last():
         machine.missing = missing
         machine.cycle(lambda now, change=change: now.position.__setitem__(4, change * GEAR[4]))
         assert machine.now.position[4] == good
-    assert machine.checks.rejected == {row("left_SA"): 3}
+    assert machine.refused == {row("left_SA"): 3}
     assert only(machine.checks.findings).dtc is Dtc.ENC_JUMP
 
 

@@ -1,8 +1,8 @@
 """Encoders against physics: a joint moves no further than it can, and turns as fast as it says.
 
 *Jump.* Between two good values, n cycles apart, a joint moves at most n * velocity_max * period, give or take 3 sigma of the
-encoder. What moved further is not used. *Velocity.* The mean of the reported velocity over eight cycles, by the trapezoidal
-rule, is the way the encoder made in them; the drive's low-pass puts them apart for a few cycles, not for fifty.
+encoder. What moved further is not used. *Velocity.* The mean of the reported velocity between two samples, by the
+trapezoidal rule, is the way the encoder made; the drive's low-pass puts them apart for a few cycles, not for fifty.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from atalante_hal.robot import JOINTS, Robot
 
 #: Jumps on end, without a good value between them, that are no stray any more.
 JUMPS_TO_CONFIRM = 5
-#: Samples on end, `samples` cycles apart, in which the velocity has to be wrong.
-VELOCITY_SAMPLES = 6
+#: Comparisons on end in which the velocity has to be wrong.
+VELOCITY_SAMPLES = 3
 _ALL = b"\1" * len(JOINTS)
 
 
@@ -60,13 +60,10 @@ class Encoders:
         return np.less_equal(np.abs(moved), self._reach).tobytes() == _ALL
 
     def accept(self, joint: int, cycles: int) -> bool:
-        """Judge the new value of one joint against the last good one.
+        """Whether the new value of one joint may be used.
 
         Args:
-            cycles: since then.
-
-        Returns:
-            Whether it may be used; if not, the last good position and velocity are put in its place.
+            cycles: from the last good one to this.
         """
         moved = abs(float(self._now.position[joint] - self._before.position[joint]))
         if not moved > cycles * self._way[joint] + self._noise[joint]:  # NaN: there was no value before
@@ -74,8 +71,6 @@ class Encoders:
             return True
         self.jumps[joint] += 1
         self._jump_of[joint] = moved / self._gear[joint]
-        self._now.position[joint] = self._before.position[joint]
-        self._now.velocity[joint] = self._before.velocity[joint]
         return False
 
     def judge_velocity(self, whole: bool) -> bool:

@@ -5,9 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from atalante_hal.codec import Codec
 from atalante_hal.diagnostics import Dtc
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, Vector
@@ -78,6 +75,3 @@ def signals_of(codec: Codec, values: Vector) -> Signals:
 def rows_of(codec: Codec, messages: tuple[str, ...]) -> list[int]:
     """Rows of messages in the image."""
     return [codec.rows[message] for message in messages]
-
-
-Ages = npt.NDArray[np.int64]

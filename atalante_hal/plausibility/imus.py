@@ -32,11 +32,10 @@ class Imus:
 
     Args:
         now: what was decoded in this cycle.
-        before: the last good values.
     """
 
-    def __init__(self, robot: Robot, codec: Codec, now: Signals, before: Signals) -> None:
-        self._now, self._before = now, before
+    def __init__(self, robot: Robot, codec: Codec, now: Signals) -> None:
+        self._now = now
         self._gyro_end, self._accel_end = (_end_of_range(codec, signal) for signal in ("GyroX", "AccelX"))
         self._surely = min(self._gyro_end, self._accel_end) ** 2
         self._norm_error = robot.sensors.quaternion_error
@@ -61,43 +60,44 @@ class Imus:
             return False
         return bool(inertial.dot(inertial) < self._surely) or not any(map(self.saturation, range(len(IMUS))))
 
-    def saturation(self, imu: int) -> float:
-        """The largest reading of an IMU that is at the end of its range [rad/s or m/s2], 0 if none is."""
+    def saturation(self, imu: int) -> float | None:
+        """The largest reading of an IMU that is at the end of its range [rad/s or m/s2], None if none is."""
         gyro = max(map(abs, self._now.gyro[imu].tolist()))
         accel = max(map(abs, self._now.accel[imu].tolist()))
-        return float(gyro if gyro >= self._gyro_end else accel if accel >= self._accel_end else 0.0)
+        return gyro if gyro >= self._gyro_end else accel if accel >= self._accel_end else None
 
     def accept(self, imu: int, cycles: int, *, frozen: bool) -> bool:
-        """Judge the new values of one IMU; if they may not be used, the last good ones are put in their place.
+        """Whether the new values of one IMU may be used.
 
         Args:
-            cycles: since those.
+            cycles: from the last good ones to these.
             frozen: it repeats itself.
         """
-        saturation = self.saturation(imu)
-        if saturation:
-            self.saturated[imu] = saturation
-        else:
-            self.saturated.pop(imu, None)
-        usable = not (frozen or saturation or imu in self.no_attitude)
+        saturation, norm = self.saturation(imu), self._wrong_norm(imu)
+        for value, standing in ((saturation, self.saturated), (norm, self.no_attitude)):
+            if value is None:
+                standing.pop(imu, None)
+            else:
+                standing[imu] = value
+        usable = not frozen and saturation is None and norm is None
         self._useless[imu] = 0 if usable else cycles
-        if usable:
-            return True
-        for now, before in (
-            (self._now.quaternion, self._before.quaternion),
-            (self._now.gyro, self._before.gyro),
-            (self._now.accel, self._before.accel),
-        ):
-            now[imu] = before[imu]
-        return False
+        return usable
 
-    def judge_norms(self, _whole: bool) -> bool:
-        """Look at the norm of every quaternion; returns whether one is none."""
-        self.no_attitude.clear()
-        for imu, (w, x, y, z) in enumerate(self._now.quaternion.tolist()):
-            squared = w * w + x * x + y * y + z * z
-            if not abs(squared - 1.0) <= self._norm_error:
-                self.no_attitude[imu] = math.sqrt(squared)
+    def _wrong_norm(self, imu: int) -> float | None:
+        """The norm of the quaternion of an IMU, None if it is a unit."""
+        w, x, y, z = self._now.quaternion[imu].tolist()
+        squared = w * w + x * x + y * y + z * z
+        return None if abs(squared - 1.0) <= self._norm_error else math.sqrt(squared)
+
+    def judge_norms(self, whole: bool) -> bool:
+        """Look at each quaternion by itself; returns whether one is none.
+
+        Args:
+            whole: every node was heard in this cycle; otherwise `accept` looks at those that were.
+        """
+        if whole:
+            norms = ((imu, self._wrong_norm(imu)) for imu in range(len(IMUS)))
+            self.no_attitude.update((imu, norm) for imu, norm in norms if norm is not None)
         return bool(self.no_attitude)
 
     def judge_left_drift(self, whole: bool) -> bool:

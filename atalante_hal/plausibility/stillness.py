@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from atalante_hal.codec import Codec
 from atalante_hal.diagnostics import Dtc
-from atalante_hal.plausibility.finding import FOOT_NODES, IMU_NODES, JOINT_NODES, Ages, Finding, Signals, measured
+from atalante_hal.e2e import Check
+from atalante_hal.image import ReceiveImage
+from atalante_hal.plausibility.finding import FOOT_NODES, IMU_NODES, JOINT_NODES, Finding, Signals, measured
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, Robot, Vector
 
 #: Cycles after which a standstill is found at the latest, counted from the first repeated sample.
@@ -29,14 +30,15 @@ class Stillness:
     """Encoders, gyros and force cells that repeat themselves.
 
     Args:
-        values: decoded values of this cycle, shape (codec.size,).
-        age: of the rows, shape (rows,).
+        image: whose decoded values are sampled.
+        now: views of them.
         every: cycles between two calls of `sample`.
     """
 
-    def __init__(self, robot: Robot, codec: Codec, values: Vector, now: Signals, age: Ages, every: int) -> None:
+    def __init__(self, robot: Robot, image: ReceiveImage, now: Signals, every: int) -> None:
+        codec = image.codec
         where = measured(codec)
-        self._values, self._now, self._age = values[where], now, age
+        self._values, self._now, self._check = image.values[where], now, image.check
         self._row_of = codec.row_of[where]
         size = len(self._values)
         self._sampled = np.full(size, np.nan)
@@ -74,7 +76,7 @@ class Stillness:
         """
         same, repeats = self._same, self._repeats
         np.equal(self._values, self._sampled, same)
-        heard = None if whole else self._age[self._row_of] == 0
+        heard = None if whole else self._check[self._row_of] <= Check.SOME_LOST
         if heard is None:
             repeats += 1
             repeats *= same
