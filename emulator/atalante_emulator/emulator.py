@@ -343,7 +343,7 @@ class Emulator:
             self._seal()
 
     def _seal(self) -> None:
-        np.add(self._truth, self._noise_rows[self.cycle % _NOISE_CYCLES], out=self._tx.values)
+        np.add(self._truth, self._noise_rows[self.cycle % _NOISE_CYCLES], self._tx.values)
         for rewrite in self.before_send:
             rewrite(self.cycle, self._tx.values)
         self._tx.seal(self._tag)

@@ -88,8 +88,8 @@ class Motors:
             Shape (12,) [Nm].
         """
         direction = self._direction
-        np.multiply(velocity, self._per_friction_speed, out=direction)
-        np.tanh(direction, out=direction)
+        np.multiply(velocity, self._per_friction_speed, direction)
+        np.tanh(direction, direction)
         self._velocity[:] = velocity
         self._matrix.dot(self._inputs, self._outputs)
         if self._external is not None:
