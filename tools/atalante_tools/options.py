@@ -89,7 +89,7 @@ def _patient(mass: float | None, height: float | None, thigh: float | None, shan
 
 @dataclass(frozen=True)
 class Target:
-    """Where the robot is: an interface of python-can, or the emulator in this process."""
+    """Where the robot is: an interface of python-can, or embedded: emulated for this program alone."""
 
     interface: str
     channel: str  # one channel, or a channel map; empty when embedded
@@ -97,7 +97,7 @@ class Target:
 
     @property
     def embedded(self) -> bool:
-        """The robot is emulated in this process."""
+        """The robot is emulated for this program alone, in its process or in one beside it."""
         return self.interface == EMBEDDED
 
     def __str__(self) -> str:
@@ -114,7 +114,7 @@ def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command]
     """Give a command `-i`, `-c` and `--lockstep/--wall`, and hand it their meaning as the argument `target`.
 
     Args:
-        embedded: whether the emulator in this process is a choice, and then the default.
+        embedded: whether an embedded robot is a choice, and then the default.
         clock: whether the command has one.
     """
     interfaces = "socketcan, virtual, pcan, ..."
@@ -125,7 +125,7 @@ def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command]
             default=EMBEDDED if embedded else "socketcan",
             show_default=True,
             metavar="NAME",
-            help=f"{interfaces}{' or embedded: an emulated robot in this process' if embedded else ''}",
+            help=f"{interfaces}{' or embedded: an emulated robot of its own' if embedded else ''}",
         ),
         click.option(
             "-c",
