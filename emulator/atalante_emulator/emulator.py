@@ -29,7 +29,8 @@ from atalante_emulator.heartbeat import Heartbeats
 from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
 from atalante_emulator.link import FaultyBus
 from atalante_emulator.node_faults import NodeFaults
-from atalante_emulator.pendant import Operator, PendantSignals
+from atalante_emulator.noise import NOISE_CYCLES, SensorNoise
+from atalante_emulator.pendant import Operator, PendantNode
 from atalante_hal.bus import Bus, BusFull
 from atalante_hal.codec import Codec
 from atalante_hal.e2e import Check
@@ -43,8 +44,6 @@ Vector = npt.NDArray[np.float64]
 _RECEIVE_BUDGET = 128
 #: Frames of one cycle at most: nineteen, now and then a slow one, and what goes wrong.
 _BATCH = 128
-#: Cycles of noise drawn at once.
-_NOISE_CYCLES = 128
 #: What a command frame is when it came, and is not to be followed.
 _REFUSED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
 #: Longest wait [s] for the other SYNCs of a cycle once the first is there.
@@ -103,7 +102,7 @@ class Emulator:
         self._build_images()
         self._bind_commands()
         self._build_nodes(robot, parameters)
-        self._build_noise(seed)
+        self._noise = SensorNoise(seed, self._tx.codec, self.drives, self._imus, self._feet)
         self._node_faults: NodeFaults | None = None
         if any(fault.kind in NODE_KINDS or fault.kind in SENSOR_KINDS for fault in faults):
             self._node_faults = NodeFaults(
@@ -203,23 +202,7 @@ class Emulator:
         amplitude = self._haptics_tx.values[self._haptics_tx.codec.slice("Amplitude")]
         self._haptics = Haptics(parameters.haptics, amplitude)
         self._haptics_cycles = self._haptics_tx.codec.messages[0].cycle_ms
-        self._operator_said: PendantSignals | None = None
-
-    def _build_noise(self, seed: int) -> None:
-        codec = self._tx.codec
-        self._noise = np.zeros((_NOISE_CYCLES, codec.size))
-        self._noise_rows = list(self._noise)
-        torque, gyro, accel, force = (self._noise[:, codec.slice(s)] for s in ("Torque", "Gyro", "Accel", "Force"))
-        # One generator a family: another IMU model does not change what the feet feel.
-        of_drives, of_imus, of_feet = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
-        bias = self._imus.draw_bias(of_imus)
-
-        def draw() -> None:
-            self.drives.draw_noise(of_drives, torque)
-            self._imus.draw_noise(of_imus, bias, gyro, accel)
-            self._feet.draw_noise(of_feet, force)
-
-        self._draw_noise = draw
+        self._pendant = None if self.operator is None else PendantNode(self.operator, codec, truth)
 
     # -- bus ---------------------------------------------------------------------------------------------------------
 
@@ -337,13 +320,13 @@ class Emulator:
         self.drives.sample(position)
         self._imus.sample(body.imu)
         self._feet.sample(body.contact, body.foot_rotation)
-        if not self.cycle % _NOISE_CYCLES:
-            self._draw_noise()
+        if not self.cycle % NOISE_CYCLES:
+            self._noise.draw()
         if not self.before_send:
             self._seal()
 
     def _seal(self) -> None:
-        np.add(self._truth, self._noise_rows[self.cycle % _NOISE_CYCLES], self._tx.values)
+        np.add(self._truth, self._noise.rows[self.cycle % NOISE_CYCLES], self._tx.values)
         for rewrite in self.before_send:
             rewrite(self.cycle, self._tx.values)
         self._tx.seal(self._tag)
@@ -351,7 +334,7 @@ class Emulator:
 
     def _complete_answer(self, number: int) -> None:
         """SYNC of this cycle is there: what could not be said ahead of it."""
-        changed = self.operator is not None and self._ask_operator(self.operator)
+        changed = self._pendant is not None and self._pendant.hear(int(self._rx.values[self._pendant_hears]))
         if changed or self.before_send or not self._sealed or number & 0xFF != self._tag:
             self._tag = number & 0xFF
             self._seal()
@@ -366,25 +349,6 @@ class Emulator:
         self.body.step(drives.drive(self.body.velocity))
         self.cycle += 1
         self._look_ahead()
-
-    def _ask_operator(self, operator: Operator) -> bool:
-        """Whether the pendant says something else than before."""
-        operator.hear(int(self._rx.values[self._pendant_hears]))
-        said = operator.signals
-        if said is self._operator_said:
-            return False
-        self._speak_for(said)
-        return True
-
-    def _speak_for(self, said: PendantSignals) -> None:
-        self._operator_said = said
-        factor = said.assistance_factor
-        at, truth = self._tx.codec.index, self._truth
-        truth[at("PENDANT_STATE", "DeadMan")] = said.dead_man
-        truth[at("PENDANT_STATE", "Request")] = said.request
-        truth[at("PENDANT_STATE", "RequestCounter")] = said.request_counter
-        truth[at("PENDANT_STATE", "AssistanceSet")] = factor is not None
-        truth[at("PENDANT_STATE", "AssistanceFactor")] = factor or 0.0
 
     def _with_slow(self, parts: list[Frames]) -> list[Frames]:
         """`parts`, and the messages slower than the cycle that are due."""

@@ -8,6 +8,13 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import NamedTuple
 
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.codec import Codec
+
+Vector = npt.NDArray[np.float64]
+
 #: `HalState` on the wire in which an operator presses START.
 HAL_READY = 1
 
@@ -95,3 +102,32 @@ class Operator:
     def _press(self, request: Request) -> None:
         counter = (self.signals.request_counter + 1) & 0xFF
         self.signals = self.signals._replace(request=request, request_counter=counter)
+
+
+class PendantNode:
+    """The pendant in an operator's hand: hears what SYNC says, and says `PENDANT_STATE`."""
+
+    def __init__(self, operator: Operator, codec: Codec, values: Vector) -> None:
+        """Take the pendant; `values`, shape (codec.size,), are what the nodes say."""
+        self._operator = operator
+        self._values = values
+        self._said: PendantSignals | None = None
+        names = ("DeadMan", "Request", "RequestCounter", "AssistanceSet", "AssistanceFactor")
+        self._places = [codec.index("PENDANT_STATE", name) for name in names]
+
+    def hear(self, hal_state: int) -> bool:
+        """One cycle, with the HAL's state as SYNC carries it; whether the pendant now says something else."""
+        self._operator.hear(hal_state)
+        said = self._operator.signals
+        if said is self._said:
+            return False
+        self._said = said
+        factor = said.assistance_factor
+        self._values[self._places] = (
+            said.dead_man,
+            said.request,
+            said.request_counter,
+            factor is not None,
+            factor or 0.0,
+        )
+        return True
