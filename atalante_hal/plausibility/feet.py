@@ -15,7 +15,7 @@ from atalante_hal.robot import CELLS, FEET, Robot
 #: Cycles in which a cell has to contradict the others, both feet have to swing, and after which they swing on purpose.
 CELL_CYCLES = 256
 SWING_CYCLES = 20
-LIFTED_CYCLES = 1000
+LIFTED_CYCLES = 100
 
 
 class Feet:
