@@ -11,6 +11,7 @@ from atalante_emulator import emergency
 from atalante_emulator.body import PERIOD
 from atalante_emulator.drive import NODES, SLOW_CYCLES, WATCHDOG, DriveParameters, Drives, DriveSignals
 from atalante_emulator.emergency import Emergency
+from atalante_emulator.encoder import COUNTS
 from atalante_emulator.motor import MotorParameters
 from atalante_hal.cia402 import Controlword, DriveState, controlword_towards_operation
 from atalante_hal.robot import Robot, load_robot
@@ -320,6 +321,17 @@ class TestHeat:
         assert bench.drives.state[3] is DriveState.FAULT
         assert bench.signals.state[3] == DriveState.FAULT
 
+    def test_a_joint_at_the_speed_of_rest_still_moves(self) -> None:
+        counts = ROBOT.gear[3] * COUNTS / (2.0 * math.pi)
+        bench = Bench(dataclasses.replace(SMOOTH, rest_speed=4.0 / (counts * PERIOD)))
+        bench.enable()
+        bench.drives.heat(3, 120.0)
+        for moved, state in ((4, DriveState.FAULT_REACTION_ACTIVE), (3, DriveState.FAULT)):
+            for _ in range(SLOW_CYCLES):
+                bench.position[3] += moved / counts
+                bench.cycle()
+            assert bench.drives.state[3] is state
+
     def test_a_fault_cannot_be_reset_while_the_drive_is_hot(self) -> None:
         bench = Bench(SMOOTH)
         bench.enable()
@@ -380,7 +392,7 @@ class TestErrors:
         bench.drives.fail(7, 0x8250)
         bench.drives.fail(7, 0x7305)
         assert bench.drives.state[7] is DriveState.FAULT_REACTION_ACTIVE
-        assert not bench.drives.latched[7]
+        assert bench.drives.latched[7] is False
         assert bench.signals.state[7] == DriveState.FAULT_REACTION_ACTIVE
 
     def test_disabling_a_latched_hold_acknowledges_it(self, bench: Bench) -> None:
@@ -526,6 +538,11 @@ class TestSync:
             bench.drives.miss_sync(0, cycle)
             bench.drives.find_sync(0)
         assert states(bench) == {DriveState.OPERATION_ENABLED}
+        for cycle in range(20, 20 + WATCHDOG - 1):
+            bench.drives.miss_sync(0, cycle)
+        assert states(bench) == {DriveState.OPERATION_ENABLED}
+        bench.drives.miss_sync(0, 20 + WATCHDOG - 1)
+        assert set(bench.drives.state[:6]) == {DriveState.QUICK_STOP_ACTIVE}
 
 
 class TestSupply:
@@ -546,6 +563,17 @@ class TestSupply:
         assert bench.drives.state[2] is state
         assert [e.code for e in bench.drives.emergencies] == told
         assert bench.drives.voltage == [48.0, 48.0, volts] + [48.0] * 9
+
+    @pytest.mark.parametrize("volts", [30.0, 10.0])
+    def test_nothing_is_acknowledged_while_the_voltage_is_low(self, bench: Bench, volts: float) -> None:
+        bench.enable()
+        bench.drives.supply(2, volts)
+        for _ in range(2 * SLOW_CYCLES):
+            bench.word[2] = Controlword.FAULT_RESET if volts < 20.0 else Controlword.QUICK_STOP
+            bench.cycle()
+        assert bench.drives.state[2] is (DriveState.FAULT if volts < 20.0 else DriveState.QUICK_STOP_ACTIVE)
+        assert bench.drives.latched[2] is (volts >= 20.0)
+        assert [e.code for e in bench.drives.emergencies][-1] != 0
 
     def test_the_hold_stays_when_the_voltage_is_back(self, bench: Bench) -> None:
         bench.enable()

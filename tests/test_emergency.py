@@ -67,8 +67,8 @@ class TestErrors:
         assert errors.stand(0)
         assert len(told) == 2
         errors.end(0, 0x4310)
-        assert not errors.stand(0)
-        assert not errors.has(0, 0x4310)
+        assert errors.stand(0) is False
+        assert errors.has(0, 0x4310) is False
         assert len(told) == 2
         errors.acknowledge(0)
         assert told[2:] == [Emergency("LEFT", 0, 0)]

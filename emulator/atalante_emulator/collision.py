@@ -18,7 +18,7 @@ class Senders:
     def __init__(self, message: Message) -> None:
         self._message = message
         self._data_id = data_id_bytes(message.data_id)
-        self._last = b""  # heard last
+        self._last: bytes | None = None  # heard last
         self._last_cycle = -1
 
     def are_two(self, frames: Frames, cycle: int) -> bool:
@@ -29,11 +29,11 @@ class Senders:
             cycle: a number that goes on by one.
         """
         if self._last_cycle != cycle - 1:
-            self._last = b""
+            self._last = None
         self._last_cycle = cycle
         two, first = False, True
         for payload in self._intact(frames):
-            if self._last and payload != self._last:
+            if self._last is not None and payload != self._last:
                 step = (payload[COUNTER_BYTE] - self._last[COUNTER_BYTE]) & 0xFF
                 two |= step == 0 or (step != 1 and not first)
             self._last, first = payload, False

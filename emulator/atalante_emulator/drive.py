@@ -229,11 +229,11 @@ class Drives:
             (emergency.UNDER_VOLTAGE, self.parameters.hold_below),
             (emergency.NO_VOLTAGE, self.parameters.off_below),
         ):
-            if (voltage < least) != self.errors.has(drive, code):
-                if voltage < least:
-                    self.fail(drive, code, stands=True)
-                else:
-                    self.recover(drive, code)
+            low = voltage < least
+            if low and not self.errors.has(drive, code):
+                self.fail(drive, code, stands=True)
+            elif not low and self.errors.has(drive, code):
+                self.recover(drive, code)
 
     # -- state -------------------------------------------------------------------------------------------------------
 

@@ -22,8 +22,8 @@ TWO_SENDERS: Final = 0x8150  # identifier collision: two sources of one command
 COMMAND_REFUSED: Final = 0x8200  # protocol error: damaged, or not this node's
 COMMAND_TIMEOUT: Final = 0x8250  # no command any more
 
-#: Bits of the CiA 301 error register by class of code; the first is always set.
-_REGISTER: Final = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x7: 0x20, 0x8: 0x10}
+#: Bits of the CiA 301 error register by class of code: the generic one, and that of the class if it has one.
+_REGISTER: Final = {0x2: 0x03, 0x3: 0x05, 0x4: 0x09, 0x7: 0x21, 0x8: 0x11}
 _GENERIC: Final = 0x01
 
 #: Turns of `Errors.turn` after which a notice is over, and after which the next may be told: the inhibit time, each.
@@ -49,9 +49,9 @@ def reaction_to(code: int) -> Reaction:
 
 def register_of(codes: Sequence[int]) -> int:
     """CiA 301 error register (object 0x1001) of the errors there are."""
-    register = _GENERIC if codes else 0
+    register = 0
     for code in codes:
-        register |= _REGISTER.get(code >> 12, 0)
+        register |= _REGISTER.get(code >> 12, _GENERIC)
     return register
 
 
