@@ -9,7 +9,8 @@ import pytest
 
 from atalante_control.gait import bezier
 from atalante_control.generation.guess import guess
-from atalante_control.generation.problem import Rules, StepProblem
+from atalante_control.generation.problem import StepProblem
+from atalante_control.generation.rules import Rules
 from atalante_control.model import Patient
 from atalante_control.stance_dynamics import stance_dynamics
 from atalante_control.subject import Subject

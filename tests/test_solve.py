@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from atalante_control.gait import SIGN, SWAP, Gait, check_gait, load_gait, motion, write_gait
-from atalante_control.generation.problem import TRANSITION, Kind, Rules
+from atalante_control.generation.problem import TRANSITION, Kind
+from atalante_control.generation.rules import Rules
 from atalante_control.generation.solve import RESIDUAL, code_version, solve
 from atalante_control.generation.solved import SOLVED, SolvedGait
 from atalante_control.model import Patient
@@ -85,8 +86,16 @@ def test_the_next_step_is_the_mirrored_one(solved: SolvedGait) -> None:
     np.testing.assert_allclose(qd[1], SIGN * qd[0][SWAP], atol=Rules().impact_jump + 1e-9)
 
 
-def test_what_cannot_be_walked_is_said_in_a_sentence() -> None:
-    outcome = solve(Subject(Patient(110.0, 1.5), 0.4, 0.4))
+def test_what_is_out_of_reach_is_said_at_once() -> None:
+    subject = Subject(Patient(110.0, 1.5), 0.4, 0.4)
+    outcome = solve(subject)
+    assert not outcome.solved
+    assert outcome.iterations == 0
+    assert outcome.status.startswith(f"no such gait for {subject}: with both feet flat on the ground")
+
+
+def test_what_cannot_be_walked_is_named_by_its_constraint() -> None:
+    outcome = solve(Subject(Patient(75.0, 1.75), 0.4, 0.4))
     assert not outcome.solved
     assert "cannot hold" in outcome.status
     assert any(name in outcome.status for name in outcome.residuals)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from atalante_control.gait import Gait, motion
-from atalante_control.generation.problem import KINDS, Kind, Rules, StepProblem
+from atalante_control.generation.problem import KINDS, Kind, StepProblem
+from atalante_control.generation.rules import Rules
 from atalante_control.generation.solve import solve
 from atalante_control.generation.verify import Verifier
 from atalante_control.model import Patient

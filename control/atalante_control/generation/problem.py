@@ -12,16 +12,16 @@ hybrid zero dynamics without a zero dynamics: every step is fully actuated, and 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import casadi
 import numpy as np
 import numpy.typing as npt
 
-from atalante_control.gait import DEGREE, SIGN, SWAP, VELOCITY_JUMP, Gait, bezier, derivative
+from atalante_control.gait import DEGREE, SIGN, SWAP, Gait, bezier, derivative
 from atalante_control.generation.dynamics import Chain
 from atalante_control.generation.programme import Places, Programme, Rows
+from atalante_control.generation.rules import Rules
 from atalante_control.generation.solved import Residual
 from atalante_control.model import ExoskeletonParameters, Patient, links
 from atalante_hal.robot import JOINTS, Robot
@@ -47,43 +47,13 @@ _KNEES = [i for i, joint in enumerate(JOINTS) if joint.endswith("SK")]
 _MIRROR = casadi.DM([1.0, -1.0, 1.0])  # of a polar vector in the sagittal plane; an axial one takes the negative
 
 
-@dataclass(frozen=True)
-class Rules:
-    """What a gait has to keep, and what it is optimised for."""
-
-    nodes: int = 17  # over a step, both ends included
-    torque_share: float = 0.9  # of the joints' torque limits
-    joint_margin: float = math.radians(2.0)  # rad, to the joints' stops
-    knee_min: float = math.radians(11.0)  # rad, knees stay bent: a straight leg is singular
-    speed_share: float = 0.9  # of the joints' speed limits
-    friction: float = 0.5
-    force_min: float = 300.0  # N, vertical ground force
-    sole_share: float = 0.6  # of the sole, centre of pressure
-    cell_share: float = 0.8  # of the rectangle of the force cells where that is narrower
-    yaw_lever: float = 0.03  # m, yaw moment about the sole's centre over vertical force
-    clearance: float = 0.05  # m, swing sole over the ground at mid-swing, sine squared
-    corridor: tuple[float, float] = (0.17, 0.28)  # m, swing ankle to the side of the stance ankle
-    roll: float = math.radians(5.0)  # rad, pelvis
-    pitch: float = math.radians(6.0)
-    yaw: float = math.radians(6.0)
-    landing_speed: tuple[float, float] = (-0.03, -0.003)  # m/s, vertical
-    landing_slide: float = 0.035  # m/s, along and across
-    landing_turn: float = 0.2  # rad/s, about each axis
-    impact_jump: float = 0.6 * VELOCITY_JUMP  # rad/s, of every joint's speed; the rest is the network's
-    sinking: float = 0.01  # m/s, downward speed of the foot that leaves, after the impact
-    # Weights against (100 Nm)^2. Without the last two the swing leg's motion is nearly free: it changes wildly from subject to
-    # subject, and no network fits it.
-    acceleration_weight: float = 3e-3  # of (rad/s2)^2
-    tilt_weight: float = 5.0  # of (rad)^2, swing sole off the level
-    pressure_weight: float = 20.0  # of (1500 N times m)^2, pressure moment about the sole's centre
-
-
 class StepProblem:
     """The programme of one kind of step, for any subject, step length and duration.
 
     Attributes:
         programme: rows and bounds.
         phases: of the nodes, shape (nodes,).
+        symbols: the parameters.
     """
 
     def __init__(self, kind: Kind, robot: Robot, rules: Rules) -> None:
@@ -96,9 +66,9 @@ class StepProblem:
         self._bases = [bezier(points, self.phases) for points in (identity, derivative(identity))]
         self._bases.append(bezier(derivative(derivative(identity)), self.phases))
         self._duration, self._length = casadi.SX.sym("T"), casadi.SX.sym("L")
-        self._p = casadi.vertcat(self.chain.symbols, self._duration, self._length)
+        self.symbols = casadi.vertcat(self.chain.symbols, self._duration, self._length)
         self._yaw = casadi.DM(_about_z(self.chain.stance_yaw))  # stance foot to walking direction
-        self.programme = Programme(_POINTS + rules.nodes * _NODE, self._p)
+        self.programme = Programme(_POINTS + rules.nodes * _NODE, self.symbols)
         self._build()
         #: Unit of each group of constraints, and how many of it count as much.
         self.units = {group.name: (group.unit, group.size) for group in self.programme.groups} | _BOUND_UNITS
@@ -108,11 +78,16 @@ class StepProblem:
         numbers = self.chain.values(links(self.exoskeleton, patient))
         return np.concatenate([numbers, [duration, step_length if self.kind == "periodic" else 0.0]])
 
+    def joint_range(self) -> tuple[Vector, Vector]:
+        """Lowest and highest angles a gait may use, shape (12,) [rad]."""
+        low = self.robot.position_min + self.rules.joint_margin
+        low[_KNEES] = np.maximum(low[_KNEES], self.rules.knee_min)
+        return low, self.robot.position_max - self.rules.joint_margin
+
     def bounds(self, duration: float) -> tuple[Vector, Vector]:
         """Lower and upper bounds of the unknowns: joint, speed and torque limits, vertical force."""
         rules, robot = self.rules, self.robot
-        low, high = robot.position_min + rules.joint_margin, robot.position_max - rules.joint_margin
-        low[_KNEES] = np.maximum(low[_KNEES], rules.knee_min)
+        low, high = self.joint_range()
         speed = rules.speed_share * robot.velocity_max * duration
         torque = rules.torque_share * robot.torque_max / _TORQUE
         free = np.full(_N, np.inf)
@@ -176,16 +151,16 @@ class StepProblem:
         up = casadi.DM([0.0, 0.0, GRAVITY])
         torques, ground = self.chain.inverse_dynamics(q, rate, acceleration, up, casadi.SX(3, 1))
         loads = casadi.vertcat(torques / _TORQUE, ground.force / _FORCE, ground.moment / _MOMENT)
-        self._loads = casadi.Function("loads", [casadi.vertcat(q, v, a), self._p], [loads])
+        self._loads = casadi.Function("loads", [casadi.vertcat(q, v, a), self.symbols], [loads])
         self.reach = self._reach_function(q)
 
         programme.add_linear("trajectory", "rad", self._trajectory_rows(), np.zeros(3 * _N * rules.nodes))
         self._add_boundary()
-        everywhere = [*self._dynamics(loads, torque, wrench), *self._ground(wrench), *self._attitude(q, rate)]
+        everywhere = [*self._dynamics(loads, torque, wrench), *self._ground(wrench), *self.attitude(q)]
         swing = self._swing(q, rate)
         programme.add(everywhere, z, [self.node(0), self.node(last)])
         programme.add([*everywhere, *swing], z, [self.node(n) for n in range(1, last)])
-        pose = self._pose(q, rate)
+        pose = self.landing(q)
         if self.kind == "periodic":
             programme.add([*pose, *self._touchdown(q, rate)], z, [self.node(last)])
             self._add_impact()
@@ -214,7 +189,7 @@ class StepProblem:
             self._yaw @ foot.position - target[3:],
             _tilt(self._yaw @ self._yaw @ foot.rotation),
         )
-        return casadi.Function("reach", [q, target, self._p], [error, casadi.jacobian(error, q)])
+        return casadi.Function("reach", [q, target, self.symbols], [error, casadi.jacobian(error, q)])
 
     def _trajectory_rows(self) -> Vector:
         """Nodes follow from the control points: q, dq/ds, d2q/ds2 minus basis times points is zero."""
@@ -292,9 +267,10 @@ class StepProblem:
             _positive("yaw moment of the stance foot", "N", _FORCE, within(moment[2], rules.yaw_lever)),
         ]
 
-    def _attitude(self, q: Symbol, rate: Symbol) -> list[Rows]:
+    def attitude(self, q: Symbol) -> list[Rows]:
+        """The pelvis upright and forward."""
         rules = self.rules
-        tilt = _tilt(self._yaw @ self.chain.frames(q, rate)[self.chain.pelvis].rotation)
+        tilt = _tilt(self._yaw @ self.chain.frames(q, casadi.SX(_N, 1))[self.chain.pelvis].rotation)
         limit = np.sin([rules.roll, rules.pitch, rules.yaw])
         return [Rows("pelvis attitude", "rad", 0.1, tilt, -limit, limit)]
 
@@ -314,9 +290,9 @@ class StepProblem:
             Rows("swing corridor", "m", 0.1, side, np.array([rules.corridor[0]]), np.array([rules.corridor[1]])),
         ]
 
-    def _pose(self, q: Symbol, rate: Symbol) -> list[Rows]:
+    def landing(self, q: Symbol) -> list[Rows]:
         """Swing foot flat on the ground, toes out as the stance foot's, step length ahead."""
-        foot = self.chain.frames(q, rate)[self.chain.swing_foot]
+        foot = self.chain.frames(q, casadi.SX(_N, 1))[self.chain.swing_foot]
         position = self._yaw @ foot.position
         tilt = _tilt(self._yaw @ self._yaw @ foot.rotation)  # the stance foot's toe-out, mirrored
         zero, rules = np.zeros(3), self.rules

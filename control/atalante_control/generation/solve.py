@@ -21,9 +21,11 @@ import numpy.typing as npt
 from atalante_control.gait import Gait
 from atalante_control.generation.compiled import compiled
 from atalante_control.generation.guess import guess
-from atalante_control.generation.problem import TRANSITION, Kind, Rules, StepProblem
+from atalante_control.generation.problem import TRANSITION, Kind, StepProblem
 from atalante_control.generation.programme import Functions
 from atalante_control.generation.progress import Progress, Watch
+from atalante_control.generation.reach import Reach
+from atalante_control.generation.rules import Rules
 from atalante_control.generation.solved import SOLVED, Residual, SolvedGait
 from atalante_control.stance_dynamics import stance_dynamics
 from atalante_control.subject import Subject
@@ -34,7 +36,7 @@ Vector = npt.NDArray[np.float64]
 RESIDUAL = 1e-6  # SI unit of each constraint, the largest a solved gait may have
 _OPTIONS: dict[str, Any] = {
     "ipopt.nlp_scaling_method": "none",  # rows and unknowns have their sizes already
-    "ipopt.max_iter": 200,
+    "ipopt.max_iter": 150,
     "ipopt.tol": 1e-8,
     "ipopt.constr_viol_tol": 1e-10,
     "ipopt.bound_relax_factor": 0.0,
@@ -49,7 +51,7 @@ _OPTIONS: dict[str, Any] = {
 _WARM: dict[str, Any] = {"ipopt.mu_init": 1e-3, "ipopt.bound_mult_init_method": "mu-based"}
 #: Everything that decides a gait.
 _SOURCES = (
-    *(f"generation/{module}.py" for module in ("dynamics", "guess", "problem", "programme", "solve")),
+    *(f"generation/{module}.py" for module in ("dynamics", "guess", "problem", "programme", "rules", "solve")),
     *("gait.py", "idealization.py", "stance_dynamics.py", "model/*.py"),
 )
 
@@ -84,25 +86,30 @@ def solve(
     lower, upper = problem.bounds(duration)
     low, high = problem.constraint_bounds(None if around is None else around.gait)
     coefficients = guess(problem, parameters, subject) if warm_start is None else warm_start.coefficients
-    if progress is None:
-        solver = _silent_solver(kind, machine_code, warm_start is not None)
-    else:
-        watch = Watch(problem.programme.unknowns, (low, high), progress)
-        solver = _solver(kind, machine_code, warm_start is not None, {"iteration_callback": watch})
+    refusal = _reach().refusal(parameters, subject.step_length) if kind == "periodic" else None
+    ending, iterations = "not begun", 0
     started = time.perf_counter()
-    x0 = problem.unknowns(coefficients, parameters)
-    solution = solver(x0=x0, p=parameters, lbx=lower, ubx=upper, lbg=low, ubg=high)
-    statistics = solver.stats()
+    if refusal is None:
+        if progress is None:
+            solver = _silent_solver(kind, machine_code, warm_start is not None)
+        else:
+            watch = Watch(problem.programme.unknowns, (low, high), progress)
+            solver = _solver(kind, machine_code, warm_start is not None, {"iteration_callback": watch})
+        x0 = problem.unknowns(coefficients, parameters)
+        solution = solver(x0=x0, p=parameters, lbx=lower, ubx=upper, lbg=low, ubg=high)
+        ending, iterations = solver.stats()["return_status"], int(solver.stats()["iter_count"])
+        coefficients = problem.coefficients(np.array(solution["x"]).ravel())
+    seconds = time.perf_counter() - started
 
-    coefficients = problem.coefficients(np.array(solution["x"]).ravel())
     x = problem.unknowns(coefficients, parameters)
     residuals = problem.residuals(x, np.array(functions.constraints(x, parameters)).ravel(), (low, high), duration)
     worst = max(residuals.values(), key=lambda residual: residual.value).value
-    solved = bool(statistics["success"]) and worst <= RESIDUAL
-    status = SOLVED if solved else _why_not(subject, problem, residuals)
-    iterations, seconds = int(statistics["iter_count"]), time.perf_counter() - started
+    if ending == "Solve_Succeeded" and worst <= RESIDUAL:
+        status = SOLVED
+    else:
+        status = f"no such gait for {subject}: {refusal or _unmet(problem, residuals)}"
     record = {
-        "method": f"{kind} step, IPOPT: {statistics['return_status']}",
+        "method": f"{kind} step, IPOPT: {ending}",
         "status": status,
         "max_residual": worst,
         "iterations": iterations,
@@ -126,18 +133,25 @@ def code_version() -> str:
     return f"{version('atalante-hal')}+{digest.hexdigest()[:12]}"
 
 
-def _why_not(subject: Subject, problem: StepProblem, residuals: Mapping[str, Residual]) -> str:
+def _unmet(problem: StepProblem, residuals: Mapping[str, Residual]) -> str:
     """The constraint that is furthest from holding, against what counts as one of it."""
     name = max(residuals, key=lambda group: residuals[group].value / problem.units[group][1])
     value, unit = residuals[name]
-    return f"no such gait for {subject}: the {name} cannot hold, {value:.3g} {unit} are missing"
+    return f"the {name} cannot hold, {value:.3g} {unit} are missing"
+
+
+@cache
+def _reach() -> Reach:
+    return Reach(_built("periodic", False)[0])
 
 
 @cache
 def _built(kind: Kind, machine_code: bool) -> tuple[StepProblem, Functions]:
+    if machine_code:
+        problem, interpreted = _built(kind, False)
+        return problem, compiled(interpreted) or interpreted
     problem = StepProblem(kind, load_robot(), Rules())
-    functions = problem.programme.functions()
-    return problem, (compiled(functions) or functions) if machine_code else functions
+    return problem, problem.programme.functions()
 
 
 @cache

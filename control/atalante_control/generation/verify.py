@@ -25,7 +25,7 @@ _LEFT, _RIGHT = (f"{side}_{LEG_LINKS['HA']}" for side in SIDES)
 _SAMPLES = 201  # over a step
 _LOCAL = pinocchio.ReferenceFrame.LOCAL
 _EXACT = 1e-6  # SI units, for what an optimiser claims to have met exactly
-_SLIDING = 0.5  # Ns, that friction need not hold at the impact: with all the mass behind it some millimetres a second
+_SLIDING = 1.0  # Ns, that friction need not hold at the impact: with all the mass behind it some millimetres a second
 _SINKING = 1e-3  # m, of the foot that leaves, in its first moments
 
 

@@ -1,0 +1,43 @@
+"""Whether a landing pose exists: the paper's subjects and steps have one; a leg that is too short is named by its joint."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import pytest
+
+from atalante_control.generation.problem import StepProblem
+from atalante_control.generation.reach import Reach
+from atalante_control.generation.rules import Rules
+from atalante_control.model import Patient
+from atalante_hal.robot import load_robot
+
+
+@pytest.fixture(scope="module")
+def problem() -> StepProblem:
+    return StepProblem("periodic", load_robot(), Rules())
+
+
+@pytest.fixture(scope="module")
+def reach(problem: StepProblem) -> Reach:
+    return Reach(problem)
+
+
+@pytest.mark.parametrize(("height", "length"), list(product((1.62, 1.75, 1.93), (0.10, 0.20))))
+def test_steps_of_the_library_are_in_reach(problem: StepProblem, reach: Reach, height: float, length: float) -> None:
+    assert reach.refusal(problem.parameters(Patient(75.0, height), 0.8, length), length) is None
+
+
+def test_what_is_out_of_reach_is_said_by_joint_and_angle(problem: StepProblem, reach: Reach) -> None:
+    refusal = reach.refusal(problem.parameters(Patient(110.0, 1.5), 0.8, 0.4), 0.4)
+    assert refusal is not None
+    assert "0.4 m apart right_SA would be at -15" in refusal
+    assert "-14.0 degrees at most" in refusal
+
+
+def test_further_is_worse(problem: StepProblem, reach: Reach) -> None:
+    refusals = [
+        reach.refusal(problem.parameters(Patient(75.0, 1.5), 0.8, length), length) for length in (0.3, 0.4, 0.5)
+    ]
+    assert refusals[0] is None
+    assert refusals[2] is not None
