@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from binascii import crc_hqx
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,6 +17,10 @@ from atalante_hal.image import NEVER, ReceiveImage, TransmitImage
 NETWORK = load()
 CYCLIC = [m for m in NETWORK.received_by("HAL") if m.cycle_ms == 1]
 ROWS = len(CYCLIC)
+
+
+def protection(protected: bytes, data_id: int) -> int:
+    return crc_hqx(protected + data_id.to_bytes(2, "little"), 0xFFFF)
 
 
 def pair() -> tuple[TransmitImage, ReceiveImage, np.ndarray]:
@@ -183,3 +190,218 @@ def test_a_single_row_can_be_sealed_alone():
     tx.seal_row(2)
     assert tx.frames[2]["data"][2] == 3
     assert tx.frames[4]["data"][2] == 0
+
+
+def answer(tx: TransmitImage, rx: ReceiveImage, buffer: np.ndarray, cycle: int, delays: dict[int, int]) -> None:
+    """All rows answer SYNC `cycle`, those of `delays` an earlier one instead; a delay of -1 says nothing."""
+    count = 0
+    for row in range(ROWS):
+        delay = delays.get(row, 0)
+        if delay >= 0:
+            buffer[count] = tx.seal((cycle - delay) & 0xFF)[row]
+            count += 1
+    rx.accept(buffer, count, cycle & 0xFF)
+
+
+class TestCycleTag:
+    """A frame tells which SYNC it answers."""
+
+    def test_answers_to_this_sync_are_perfect_over_the_turn_of_the_counter(self):
+        tx, rx, buffer = pair()
+        for cycle in range(250, 262):
+            answer(tx, rx, buffer, cycle, {})
+            assert rx.all_fresh == (cycle > 250)
+            assert (rx.check == Check.OK).all()
+            assert (rx.age == 0).all()
+
+    def test_all_answers_a_cycle_late_are_in_sequence_and_a_cycle_old(self):
+        tx, rx, buffer = pair()
+        for cycle in range(5):
+            answer(tx, rx, buffer, cycle, dict.fromkeys(range(ROWS), 1))
+            assert not rx.all_fresh
+            assert (rx.check == Check.OK).all()
+            assert (rx.age == 1).all()
+
+    def test_a_late_answer_is_used_and_is_as_old_as_the_sync_it_answers(self):
+        tx, rx, buffer = pair()
+        for cycle, delay, check, age in (
+            (100, 0, Check.OK, 0),
+            (101, -1, Check.NO_DATA, 1),
+            (102, 1, Check.OK, 1),
+            (103, 1, Check.OK, 1),
+            (104, 0, Check.SOME_LOST, 0),
+            (105, 1, Check.REPEATED, 1),
+            (106, 3, Check.WRONG_SEQUENCE, 2),
+            (107, 0, Check.SOME_LOST, 0),
+        ):
+            answer(tx, rx, buffer, cycle, {7: delay})
+            assert (rx.check[7], rx.age[7]) == (check, age), cycle
+            assert (np.delete(rx.age, 7) == 0).all()
+
+    def test_the_first_frame_may_be_fifteen_cycles_late_and_not_sixteen(self):
+        for delay, check in ((15, Check.OK), (16, Check.WRONG_SEQUENCE), (200, Check.WRONG_SEQUENCE)):
+            tx, rx, buffer = pair()
+            answer(tx, rx, buffer, 300, {7: delay})
+            assert rx.check[7] == check
+            assert rx.age[7] == (delay if check is Check.OK else NEVER + 1)
+            # What was refused says nothing about what comes next.
+            answer(tx, rx, buffer, 301, {7: 0})
+            assert rx.check[7] == (Check.OK if check is not Check.OK else Check.WRONG_SEQUENCE)
+
+    def test_half_a_turn_ahead_is_behind(self):
+        for ahead, check in ((127, Check.WRONG_SEQUENCE), (128, Check.WRONG_SEQUENCE)):
+            tx, rx, buffer = pair()
+            answer(tx, rx, buffer, 50, {})
+            answer(tx, rx, buffer, 50 + ahead, {})
+            assert (rx.check == check).all()
+            # From 127 ahead the image goes on, from 128 it does not believe that time went by.
+            answer(tx, rx, buffer, 51 + ahead, {})
+            assert (rx.check == (Check.OK if ahead == 127 else Check.WRONG_SEQUENCE)).all()
+
+
+def test_what_began_anew_is_taken_where_senders_may():
+    status = [m for m in NETWORK.received_by("HAL") if m.name == "LEFT_FH_STATUS"]
+    tx, buffer = TransmitImage(status), new_frames(4)
+    rx = ReceiveImage(status, restarts=True)
+    for counter, check in (
+        (0, Check.OK),
+        (1, Check.OK),
+        (200, Check.SOME_LOST),
+        (200, Check.REPEATED),
+        (0, Check.SOME_LOST),
+    ):
+        buffer[:1] = tx.seal(counter)
+        rx.accept(buffer, 1)
+        assert rx.check[0] == check, counter
+
+
+def test_what_is_refused_later_keeps_its_values_and_ages_on():
+    tx, rx, buffer = pair()
+    mine = rx.codec.row_of == 3
+    tx.values[mine[: tx.codec.size]] = 1.0
+    deliver(tx, rx, buffer)
+    deliver(tx, rx, buffer)
+    assert rx.all_fresh
+    kept = rx.values.copy()
+    for age in range(1, 4):
+        tx.values[mine] = 2.0
+        deliver(tx, rx, buffer)
+        assert not np.array_equal(rx.values[mine], kept[mine])
+        rx.refuse(3)
+        assert not rx.all_fresh
+        assert (rx.check[3], rx.age[3]) == (Check.IMPLAUSIBLE, age)
+        assert np.array_equal(rx.values[mine], kept[mine])
+        assert (np.delete(rx.check, 3) == Check.OK).all()
+    deliver(tx, rx, buffer, [r for r in range(ROWS) if r != 3])
+    assert (rx.check[3], rx.age[3]) == (Check.NO_DATA, 4)
+    deliver(tx, rx, buffer)
+    assert (rx.check[3], rx.age[3]) == (Check.SOME_LOST, 0)
+    deliver(tx, rx, buffer)
+    rx.refuse(3)
+    assert rx.age[3] == 1
+
+
+def test_what_was_not_committed_is_listed_with_its_reason():
+    tx, rx, buffer = pair()
+    deliver(tx, rx, buffer)
+    deliver(tx, rx, buffer)
+    assert rx.refused == []
+    tx.values[tx.codec.index("IMU_PELVIS_STATE", "GyroX")] = np.nan
+    frames = tx.seal()
+    buffer[:ROWS] = frames
+    buffer[0]["len"] += 4
+    buffer[1]["data"][9] ^= 1
+    buffer[2]["flags"] = 0
+    buffer[ROWS] = frames[4]
+    rx.accept(buffer, ROWS + 1)
+    pelvis = rx.codec.rows["IMU_PELVIS_STATE"]
+    expected = [(0, Check.LENGTH), (1, Check.CRC), (2, Check.LENGTH), (pelvis, Check.INVALID), (4, Check.REPEATED)]
+    assert rx.refused == expected
+    assert rx.check[4] == Check.OK  # it came once as it should
+    assert rx.crc_errors == 1
+    tx.values[tx.codec.index("IMU_PELVIS_STATE", "GyroX")] = 0.0
+    deliver(tx, rx, buffer)
+    assert rx.refused == []
+    deliver(tx, rx, buffer, [])
+    assert rx.refused == []
+
+
+def test_a_good_frame_counts_whatever_comes_before_or_after_it():
+    tx, rx, buffer = pair()
+    deliver(tx, rx, buffer)
+    for first, second in ((0, 1), (1, 0)):
+        frame = tx.seal()[5]
+        bad = frame.copy()
+        bad["data"][8] ^= 1
+        both = [frame, bad]
+        buffer[0], buffer[1] = both[first], both[second]
+        rx.accept(buffer, 2)
+        assert (rx.check[5], rx.age[5]) == (Check.OK, 0)
+        assert rx.refused == [(5, Check.CRC)]
+
+
+def test_a_raw_code_out_of_range_that_is_not_the_invalid_one_is_out_of_range():
+    tx, rx, buffer = pair()
+    row, signal = rx.codec.rows["LEFT_FH_STATE"], tx.codec.index("LEFT_FH_STATE", "DriveState")
+    message, drive_state = tx.codec.signals[signal]
+    for code, check in ((64, Check.OK), (65, Check.RANGE), (drive_state.invalid_raw, Check.INVALID)):
+        frames = tx.seal()
+        frames[row]["data"][drive_state.start // 8] = code
+        payload = frames[row]["data"][: message.length].tobytes()
+        crc = protection(payload[2:], message.data_id)
+        frames[row]["data"][:2] = np.frombuffer(crc.to_bytes(2, "little"), np.uint8)
+        buffer[:ROWS] = frames
+        rx.accept(buffer, ROWS)
+        assert rx.check[row] == check
+    assert rx.values[signal] == 64
+
+
+def test_a_cycle_is_complete_when_all_messages_stand_first_and_in_order():
+    tx, rx, buffer = pair()
+    buffer[:ROWS] = tx.seal()
+    assert rx.begins(buffer, ROWS)
+    assert rx.begins(buffer, ROWS + 1)
+    assert not rx.begins(buffer, ROWS - 1)
+    buffer[[0, 1]] = buffer[[1, 0]]
+    assert not rx.begins(buffer, ROWS)
+    other = new_frames(64)
+    other[:ROWS] = tx.frames
+    assert rx.begins(other, ROWS)
+
+
+def test_who_was_heard_within_the_timeout_is_awaited():
+    tx, rx, buffer = pair()
+    assert rx.awaited() == set()
+    deliver(tx, rx, buffer)
+    everybody = {m.frame_id for m in CYCLIC}
+    assert rx.awaited() == everybody
+    timeout = CYCLIC[3].timeout_ms
+    for _ in range(timeout):
+        deliver(tx, rx, buffer, [r for r in range(ROWS) if r != 3])
+    assert rx.awaited() == everybody
+    deliver(tx, rx, buffer, [r for r in range(ROWS) if r != 3])
+    assert rx.awaited() == everybody - {CYCLIC[3].frame_id}
+
+
+def test_a_sender_goes_on_after_another():
+    tx = TransmitImage(CYCLIC)
+    assert (tx.seal()["data"][:, 2] == 0).all()
+    tx.resume(2, 9)
+    counters = tx.seal()["data"][:, 2]
+    assert counters[2] == 10
+    assert (np.delete(counters, 2) == 1).all()
+
+
+def test_messages_of_64_bytes_are_protected_too():
+    """No bytes behind the payload are left for the Data ID."""
+    longest = [replace(m, length=64) for m in CYCLIC[:2]]
+    tx, rx, buffer = TransmitImage(longest), ReceiveImage(longest), new_frames(4)
+    for _ in range(3):
+        frames = tx.seal()
+        for frame, message in zip(frames, longest, strict=True):
+            payload = frame["data"][:64].tobytes()
+            assert int.from_bytes(payload[:2], "little") == protection(payload[2:], message.data_id)
+        buffer[:2] = frames
+        rx.accept(buffer, 2)
+        assert (rx.check == Check.OK).all()
+    assert rx.all_fresh
