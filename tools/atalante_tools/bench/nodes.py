@@ -33,9 +33,10 @@ from atalante_tools.bench.measure import require
 
 Vector = npt.NDArray[np.float64]
 
-#: Cycles of the recording: one turn of the alive counters, and how many poses it has.
+#: Cycles of the recording: one turn of the alive counters, and how many poses it has: odd, so that whoever looks at every 16th
+#: cycle sees another one.
 TURN = 256
-POSES = 16
+POSES = 15
 #: Tracking error of the recorded walk [rad], and its speed [rad/s]: inside the guide, so that nothing saturates.
 ERROR = 0.01
 ERROR_RATE = 0.05
@@ -98,9 +99,7 @@ class Recording:
         error = rng.uniform(-ERROR, ERROR, len(JOINTS))
         self.values[:, codec.slice("Position")] = (walk.tables.q[0] + error + swing) * motor
         self.values[:, codec.slice("Velocity")] = ERROR_RATE * np.cos(phase) * motor
-        turn = np.where(np.arange(POSES) < POSES // 2, 1.0, -1.0)[
-            :, None
-        ]  # no two of a slow look at the sensors are alike
+        turn = np.where(np.arange(POSES) % 2, 1.0, -1.0)[:, None]  # no two looks at a sensor are alike
         for name, noise in (("Torque", 0.05), ("Gyro", 0.01), ("Accel", 0.05), ("Force", 1.0)):
             places = codec.slice(name)
             self.values[:, places] += turn * rng.uniform(0.5 * noise, noise, (POSES, places.stop - places.start))
