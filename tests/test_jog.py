@@ -128,16 +128,15 @@ def test_the_sentence_names_the_angle_reached() -> None:
 
 
 def test_a_joint_that_does_not_get_there_fails(prepared: Callable[[Callable[[Rig], None]], list[Rig]]) -> None:
-    def jam(rig: Rig) -> None:
+    def stand_in_its_way(rig: Rig) -> None:
         assert rig.emulator is not None
-        place = rig.emulator.signals.index("LEFT_SK_STATE", "Position")
-        rig.emulator.before_send.append(lambda now, values: values.__setitem__(place, 0.0))
+        rig.emulator.drives.motors.push(JOINTS.index("left_SK"), -150.0)
 
-    prepared(jam)
-    result = jog("left_SK", "--to", "2", "--speed", "60", "--json")
+    prepared(stand_in_its_way)
+    result = jog("left_SK", "--to", "20", "--speed", "60", "--json")
     assert result.exit_code == 1
-    assert "left_SK did not reach 2 degrees: something is in its way" in result.stderr
-    assert json.loads(result.stdout)["reached_deg"] == 0.0
+    assert "left_SK did not reach 20 degrees: something is in its way" in result.stderr
+    assert 10.0 < json.loads(result.stdout)["reached_deg"] < 19.0
 
 
 def test_a_drive_fault_ends_it_with_code_4(prepared: Callable[[Callable[[Rig], None]], list[Rig]]) -> None:
