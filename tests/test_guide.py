@@ -283,13 +283,39 @@ def test_a_ringing_loop_counts_the_worst_signal_not_the_two_extremes():
     [
         {"disturbance": ((1.0, 2.0), (-1.0, 1.0))},
         {"disturbance": ((-1.0, float("inf")), (-1.0, 1.0))},
+        {"disturbance": ((-1.0, 1.0), (-float("inf"), 1.0))},
+        {"disturbance": ((-1.0, 1.0), (-2.0, -1.0))},
         {"points": 1},
         {"zeta": -1.0},
+        {"zeta": float("nan")},
+        {"overlap": -1e-9},
+        {"overlap": float("inf")},
+        {"derivative_time": -1e-9},
+        {"reserve": -1e-9},
+        {"reserve": 1.0},
+        {"reserve": float("nan")},
     ],
 )
 def test_refuses_a_configuration_that_is_none(bad: dict[str, object]):
-    with pytest.raises(ValueError, match=r"not "):
+    (name,) = bad
+    with pytest.raises(ValueError, match=rf"{name}.* not "):
         replace(CONFIG, **bad)
+
+
+@pytest.mark.parametrize(
+    "good",
+    [
+        {"disturbance": ((0.0, 0.0), (-1.0, 0.0))},
+        {"points": 2},
+        {"zeta": 0.0},
+        {"overlap": 0.0},
+        {"derivative_time": 0.0},
+        {"reserve": 0.0},
+    ],
+)
+def test_accepts_what_is_just_valid(good: dict[str, object]):
+    (name,) = good
+    assert getattr(replace(CONFIG, **good), name) == good[name]
 
 
 # -- invariance ------------------------------------------------------------------------------------------------------
