@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from atalante_control.gait import HANG_GAIT, Gait, load_gait
+from atalante_control.generation import library as library_module
 from atalante_control.generation.library import Grid, Library, LibraryError
 from atalante_control.generation.solved import SOLVED, SolvedGait
 from atalante_control.subject import Subject
@@ -144,3 +145,20 @@ def test_the_default_grid_encloses_the_paper_s_subjects() -> None:
     assert (grid.mass[0], grid.mass[-1]) == (58.0, 91.0)
     assert (grid.height[0], grid.height[-1]) == (1.62, 1.93)
     np.testing.assert_allclose(grid.subject((0, 0, 0, 0)).patient.length("thigh"), 0.245 * 1.62)
+
+
+def test_what_pinocchio_does_not_agree_with_is_no_gait(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gait drawn for the air asks the ground for what it cannot give."""
+    monkeypatch.setattr(library_module, "solve", lambda subject, machine_code=False: drawn(subject))
+    subject = GRID.subject((1, 1, 1, 1))
+    for solve in (library_module.solve_subject, library_module.solve_compiled):
+        judged = solve(subject)
+        assert not judged.solved
+        assert judged.status.startswith(f"{subject}: ")
+        assert " when verified, over " in judged.status
+
+
+def test_what_failed_is_not_verified() -> None:
+    subject = GRID.subject((0, 3, 0, 0))
+    failed = stubborn(subject)
+    assert library_module.verified(subject, failed) is failed

@@ -13,6 +13,7 @@ from atalante_hal.robot import Robot
 from atalante_tools.outcome import Failed
 
 if TYPE_CHECKING:
+    from atalante_control.model import ExoskeletonParameters
     from atalante_emulator.body import PyBulletBody
 
 
@@ -22,22 +23,24 @@ def require_engine() -> None:
         raise Failed("the emulated robot needs PyBullet: type `pip install 'atalante-hal[emulator]'`")
 
 
-def describe(robot: Robot) -> str:
-    """Its URDF."""
+def describe(robot: Robot, exoskeleton: ExoskeletonParameters | None = None) -> str:
+    """Its URDF; the legs as they come from the factory unless an exoskeleton is given."""
     from atalante_control.model import ExoskeletonParameters, urdf
 
-    return urdf(ExoskeletonParameters(), robot)
+    return urdf(exoskeleton or ExoskeletonParameters(), robot)
 
 
 @contextmanager
-def open_body(robot: Robot, pose: Sequence[float] | None = None) -> Iterator[PyBulletBody]:
+def open_body(
+    robot: Robot, pose: Sequence[float] | None = None, exoskeleton: ExoskeletonParameters | None = None
+) -> Iterator[PyBulletBody]:
     """The body of a robot. `pose` shape (12,) [rad].
 
     Raises:
         Failed: PyBullet is not installed.
     """
     require_engine()
-    with open_described(describe(robot), pose) as body:
+    with open_described(describe(robot, exoskeleton), pose) as body:
         yield body
 
 

@@ -28,6 +28,7 @@ COMMANDS = {
     "faults": "The fault matrix, and runs of the walking robot that prove it.",
     "dbc": "Check, print and compare network descriptions, and make C code of one.",
     "model": "The patient-exoskeleton model: its links, checks, URDF and picture.",
+    "gait": "Solve gaits, collect them in a library, fit the network that walks them.",
     "bench": "How fast the stack is, with the baseline beside each figure.",
 }
 

@@ -20,20 +20,21 @@ EMBEDDED: Final = "embedded"
 json_option = click.option("--json", "as_json", is_flag=True, help="JSON objects on stdout, one a line.")
 
 
-class Length(click.ParamType):
-    """A length of a body or a step, as people write it: 1.75 or 175 for the same height, in metres inside."""
-
-    name = "length"
-    #: From here on a number means centimetres: nobody is 3 m tall, and no thigh or step is under 3 cm.
-    CENTIMETRES: Final = 3.0
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Metres."""
-        metres = float(click.FLOAT.convert(value, param, ctx))
-        return metres / 100.0 if metres >= self.CENTIMETRES else metres
+#: From here on a length means centimetres: nobody is 3 m tall, and no thigh or step is under 3 cm.
+_CENTIMETRES: Final = 3.0
 
 
-LENGTH: Final = Length()
+#: Length [m] and duration [s] of a step when a patient is given and his step is not.
+DEFAULT_STEP: Final = (0.15, 0.9)
+
+
+def length(text: str) -> float:
+    """A length of a body or a step as people write it, 1.75 or 175 for the same height: an option's type, in metres."""
+    try:
+        metres = float(text)
+    except ValueError:
+        raise click.BadParameter(f"{text!r} is no length; write metres (1.75) or centimetres (175)") from None
+    return metres / 100.0 if metres >= _CENTIMETRES else metres
 
 
 def patient_options(*, legs: bool) -> Callable[[_Command], _Command]:
@@ -44,13 +45,13 @@ def patient_options(*, legs: bool) -> Callable[[_Command], _Command]:
     """
     options = [
         click.option("--mass", type=float, metavar="KG", help="Of the patient, kg."),
-        click.option("--height", type=LENGTH, metavar="M", help="Of the patient, m (1.75) or cm (175)."),
+        click.option("--height", type=length, metavar="M", help="Of the patient, m (1.75) or cm (175)."),
     ]
     if legs:
         options += [
-            click.option("--thigh", type=LENGTH, metavar="M", help="Hip to knee.  [default: Winter's for the height]"),
+            click.option("--thigh", type=length, metavar="M", help="Hip to knee.  [default: Winter's for the height]"),
             click.option(
-                "--shank", type=LENGTH, metavar="M", help="Knee to ankle.  [default: Winter's for the height]"
+                "--shank", type=length, metavar="M", help="Knee to ankle.  [default: Winter's for the height]"
             ),
         ]
 
@@ -72,6 +73,40 @@ def patient_options(*, legs: bool) -> Callable[[_Command], _Command]:
         return decorated
 
     return decorate
+
+
+def subject_options(command: _Command) -> _Command:
+    """Give a command `--mass`, `--height`, `--step-length` and `--step-duration`, handed over as `subject`; None without."""
+    default_length, default_duration = DEFAULT_STEP
+
+    @functools.wraps(command)
+    def with_subject(
+        patient: Patient | None, step_length: float | None, step_duration: float | None, **arguments: Any
+    ) -> Any:
+        subject = None
+        if patient is not None:
+            from atalante_control.subject import Subject
+
+            try:
+                subject = Subject(patient, step_length or default_length, step_duration or default_duration)
+            except ValueError as error:
+                raise click.UsageError(str(error)) from error
+        elif step_length is not None or step_duration is not None:
+            raise click.UsageError("a step of one's own needs a patient: --mass and --height")
+        return command(subject=subject, **arguments)
+
+    wrapped: Any = with_subject
+    step_duration = click.option(
+        "--step-duration", type=float, metavar="S", help=f"Of the patient's gait, s.  [default: {default_duration:g}]"
+    )
+    step_length = click.option(
+        "--step-length",
+        type=length,
+        metavar="M",
+        help=f"Of the patient's gait, m or cm.  [default: {default_length:g}]",
+    )
+    decorated: _Command = patient_options(legs=False)(step_length(step_duration(wrapped)))
+    return decorated
 
 
 def _patient(mass: float | None, height: float | None, thigh: float | None, shank: float | None) -> Patient | None:

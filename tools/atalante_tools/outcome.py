@@ -60,6 +60,8 @@ KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_hal.telemetry.ring", "RingError", Failed),
     ("atalante_hal.telemetry.sink", "SinkError", Failed),
     ("atalante_control.gait", "GaitError", Failed),
+    ("atalante_control.gait_network", "NetworkError", Failed),
+    ("atalante_control.generation.library", "LibraryError", Failed),
     ("atalante_tools.validate.log", "LogError", Failed),
     ("atalante_tools.validate.project", "ProjectError", Misused),
 )

@@ -30,6 +30,7 @@ from atalante_tools.signals import StopRequest
 from atalante_tools.terminal import Progress, say
 
 if TYPE_CHECKING:
+    from atalante_control.model import ExoskeletonParameters
     from atalante_emulator.emulator import Emulator
     from atalante_emulator.faults import Fault
     from atalante_emulator.pendant import Operator
@@ -74,6 +75,7 @@ def open_hal(
     tap: FrameTap | None = None,
     faults: Sequence[Fault] = (),
     apart: EmbeddedRobot | None = None,
+    exoskeleton: ExoskeletonParameters | None = None,
 ) -> Iterator[Rig]:
     """Assemble a HAL for a command and take it apart in order.
 
@@ -86,6 +88,7 @@ def open_hal(
         faults: of the embedded robot.
         apart: a process that is to be the embedded robot, with an operator who starts as soon as the HAL is ready; closed in
             the end. None: this process is.
+        exoskeleton: the embedded robot's legs; as they come from the factory unless given.
 
     Raises:
         ValueError: an operator of this process for a robot in another.
@@ -101,12 +104,12 @@ def open_hal(
             stack.enter_context(apart)
             if operator is not None:
                 raise ValueError("the operator of a robot in a process of its own is there, too: leave `operator` out")
-            apart.begin(Order(network, robot, describe(robot), pose, seed, faults))
+            apart.begin(Order(network, robot, describe(robot, exoskeleton), pose, seed, faults))
             bus: Bus = apart.bus
         elif target.embedded:
             ours, theirs = lockstep_pair()
             bus = ours
-            body = stack.enter_context(open_body(robot, pose))
+            body = stack.enter_context(open_body(robot, pose, exoskeleton))
             from atalante_emulator.emulator import Emulator
             from atalante_emulator.pendant import Operator
 

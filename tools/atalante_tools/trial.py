@@ -18,12 +18,16 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from atalante_tools.names import find
-from atalante_tools.options import Target, json_option
+from atalante_tools.options import Target, json_option, subject_options
 from atalante_tools.signals import stop_requested
 from atalante_tools.terminal import say, show_json, table
 
 if TYPE_CHECKING:
     from atalante_control.controller import HangController
+    from atalante_control.gait import Gait
+    from atalante_control.guide_shapes import GuideShape
+    from atalante_control.model import ExoskeletonParameters
+    from atalante_control.subject import Subject
     from atalante_dbc import Network
     from atalante_hal.hal import Hal
     from atalante_hal.loop import Statistics
@@ -49,6 +53,7 @@ class Options:
     record_rate: int  # Hz
     can_log: Path | None
     telemetry: Path | None  # telemetry file: endpoint, TLS, users
+    subject: Subject | None = None  # whose gait of the network; None: the gait drawn for the air
 
 
 @dataclass(frozen=True)
@@ -95,11 +100,12 @@ def trial_options(steps: int, out: str) -> Callable[[_Command], _Command]:
             record_rate: int,
             can_log: Path | None,
             telemetry: Path | None,
+            subject: Subject | None,
             **others: Any,
         ) -> Any:
-            return command(options=Options(steps, xi, seed, out, record_rate, can_log, telemetry), **others)
+            return command(options=Options(steps, xi, seed, out, record_rate, can_log, telemetry, subject), **others)
 
-        wrapped: Any = with_options
+        wrapped: Any = subject_options(with_options)
         for option in reversed([*options, json_option]):
             wrapped = option(wrapped)
         decorated: _Command = wrapped
@@ -116,8 +122,6 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
         SystemExit: a signal ended it.
     """
     import atalante_dbc
-    from atalante_control.controller import HangController
-    from atalante_control.gait import HANG_GAIT, load_gait
     from atalante_control.guide_shapes import SHAPES
     from atalante_hal.robot import load_robot
     from atalante_hal.telemetry.access import load_telemetry_file
@@ -129,15 +133,16 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
         with ExitStack() as stack:
             apart = _start_robot(target, stack)  # it loads what it needs while the controllers are made
             network, robot = atalante_dbc.load(), load_robot()
-            gait = load_gait(HANG_GAIT, robot)
-            controllers = {name: HangController(robot, gait, SHAPES[name]) for name in shapes}
+            exoskeleton, gait, controllers = _controllers(
+                options.subject, robot, {name: SHAPES[name] for name in shapes}
+            )
             certified = {name: _announce(controller, options.xi) for name, controller in controllers.items()}
             options.out.mkdir(parents=True, exist_ok=True)
             stop = stack.enter_context(stop_requested())
             telemetry: TelemetryProcess | None = None
             last = [*controllers][-1]
             for name, controller in controllers.items():
-                with _open(target, options, network, robot, controller, gait.hash32, apart) as rig:
+                with _open(target, options, network, robot, controller, gait.hash32, apart, exoskeleton) as rig:
                     apart = _start_robot(target, stack) if name != last else None
                     if telemetry is None:
                         telemetry = _telemetry(target, options, outlet, rig.hal, network, gait.hash32)
@@ -208,6 +213,28 @@ class _Walk:
         )
 
 
+def _controllers(
+    subject: Subject | None, robot: Robot, shapes: Mapping[str, GuideShape]
+) -> tuple[ExoskeletonParameters, Gait, dict[str, HangController]]:
+    """The exoskeleton adjusted to the subject, his gait, and a controller of each shape that walks it in the air."""
+    from atalante_control.controller import HangConfig, HangController
+    from atalante_control.gait import HANG_GAIT, load_gait
+    from atalante_control.gait_network import load_network
+    from atalante_control.hanging import hung
+    from atalante_control.model import ExoskeletonParameters
+
+    exoskeleton = ExoskeletonParameters()
+    if subject is None:
+        gait, config = load_gait(HANG_GAIT, robot), HangConfig()
+    else:
+        exoskeleton = exoskeleton.fitted(subject.patient)
+        gait = hung(load_network().gait(subject, robot), exoskeleton, robot)
+        config = HangConfig(feedforward=True)
+        say(f"gait of the network: {subject}; nobody is in the exoskeleton")
+    made = {name: HangController(robot, gait, shape, config, exoskeleton) for name, shape in shapes.items()}
+    return exoskeleton, gait, made
+
+
 def _announce(controller: HangController, xi: float) -> bool:
     """Say before the run what the guide promises."""
     certificate = controller.certificate(xi)
@@ -234,6 +261,7 @@ def _open(
     controller: HangController,
     gait_hash: int,
     apart: EmbeddedRobot | None,
+    exoskeleton: ExoskeletonParameters,
 ) -> Any:
     from atalante_tools.rig import open_hal
 
@@ -246,6 +274,7 @@ def _open(
         controller_fields=controller.telemetry_fields,
         gait_hash=gait_hash,
         apart=apart,
+        exoskeleton=exoskeleton,
     )
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from atalante_tools.bench import motion, startup, wire
+from atalante_tools.bench import gait_solve, gaits, motion, startup, wire
 from atalante_tools.bench.measure import Effort, Measurement
 from atalante_tools.validate import benchmark
 
@@ -96,6 +96,53 @@ BENCHMARKS: Final = (
         benchmark.judge_against_mdf,
         "us",
         "asammdf decoding the same frames from MF4, a frame",
+        1.0,
+    ),
+    Benchmark(
+        "model_build",
+        gaits.model_build,
+        "us",
+        "Pinocchio parsing the same URDF",
+    ),
+    Benchmark(
+        "inverse_dynamics",
+        gaits.inverse_dynamics,
+        "us",
+        "one recursive Newton-Euler pass of Pinocchio over the floating model",
+    ),
+    Benchmark(
+        "network_evaluation",
+        gaits.network_evaluation,
+        "us",
+        "50 us, a twentieth of a cycle",
+        1.0,
+    ),
+    Benchmark(
+        "gait_solve_cold",
+        gait_solve.gait_solve_cold,
+        "s",
+        "3 s, a gait on one core",
+        1.0,
+    ),
+    Benchmark(
+        "gait_solve_warm",
+        gait_solve.gait_solve_warm,
+        "s",
+        "1 s, what a gait from its neighbour should take",
+        1.0,
+    ),
+    Benchmark(
+        "library_one_process",
+        gaits.library_one_process,
+        "s",
+        "3 s, a gait of a library on one core",
+        1.0,
+    ),
+    Benchmark(
+        "library_two_processes",
+        gaits.library_two_processes,
+        "s",
+        "3 s a core, a gait of a library on two",
         1.0,
     ),
     Benchmark(

@@ -1,0 +1,184 @@
+"""The fit and the report on it, with a family of gaits drawn by arithmetic: smooth, periodic, and known everywhere."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from atalante_control.gait import HANG_GAIT, Gait, load_gait
+from atalante_control.gait_network import load_network, periodicity
+from atalante_control.generation import fit as fit_module
+from atalante_control.generation import library as library_module
+from atalante_control.generation.deviation import Deviation, deviation, findings, random_subjects
+from atalante_control.generation.fit import fit, inputs
+from atalante_control.generation.library import Grid, Library
+from atalante_control.generation.solved import SOLVED, SolvedGait
+from atalante_control.model import Patient
+from atalante_control.stance_dynamics import stance_dynamics
+from atalante_control.subject import Subject
+from atalante_hal.robot import load_robot
+from atalante_tools.cli import cli
+
+ROBOT = load_robot()
+HANG = load_gait(HANG_GAIT, ROBOT)
+GRID = Grid((58.0, 75.0, 91.0), (1.62, 1.78, 1.93), (0.1, 0.15, 0.2), (0.8, 0.95, 1.1))
+LOW, HIGH = (np.array([axis[end] for axis in GRID.axes()]) for end in (0, -1))
+_, _, _RIGHT = np.linalg.svd(periodicity())
+#: Directions in which the drawn gaits differ, periodic ones.
+WAYS = np.random.default_rng(8).normal(size=(5, 72)) @ _RIGHT[24:] * 0.004
+
+
+def drawn(subject: Subject) -> SolvedGait:
+    mass, height, length, duration = (2.0 * (inputs_of(subject) - LOW) / (HIGH - LOW) - 1.0).tolist()
+    share = np.array([mass, height + 0.3 * height * length, length, duration + 0.2 * mass**2, math.sin(duration)])
+    coefficients = HANG.coefficients + (share @ WAYS).reshape(12, 8)
+    feedforward = stance_dynamics(ROBOT, subject.patient).feedforward(coefficients, subject.step_duration)
+    gait = Gait(
+        str(subject), subject.step_duration, coefficients, feedforward * 0.1, subject.parameters(), {"status": SOLVED}
+    )
+    return SolvedGait(gait, SOLVED, 1e-9, 0.01, 10)
+
+
+def inputs_of(subject: Subject) -> np.ndarray:
+    return np.array([subject.patient.mass, subject.patient.height, subject.step_length, subject.step_duration])
+
+
+@pytest.fixture(scope="module")
+def gaits() -> list[Gait]:
+    return [drawn(GRID.subject(index)).gait for index in GRID.points()]
+
+
+def test_the_fit_knows_gaits_it_never_saw(gaits: list[Gait]) -> None:
+    fitted = fit(gaits, GRID, hidden=(16,), iterations=1500)
+    assert fitted.directions <= len(WAYS) + 1
+    assert np.degrees(fitted.rms) < 0.01
+    assert fitted.worst >= fitted.rms
+    for subject in random_subjects(LOW, HIGH, 30, seed=1):
+        error = fitted.network.coefficients(inputs_of(subject)) - drawn(subject).gait.coefficients
+        assert np.degrees(np.abs(error).max()) < 0.2
+
+
+def test_the_same_library_gives_the_same_network_whatever_its_order(gaits: list[Gait]) -> None:
+    first = fit(gaits, GRID, hidden=(6,), iterations=40).network
+    again = fit(gaits, GRID, hidden=(6,), iterations=40).network
+    for one, other in zip(first.layers, again.layers, strict=True):
+        np.testing.assert_array_equal(one.weights, other.weights)
+        np.testing.assert_array_equal(one.bias, other.bias)
+    np.testing.assert_array_equal(first.low, LOW)
+    np.testing.assert_array_equal(first.high, HIGH)
+
+
+def test_what_a_gait_tells_of_its_subject() -> None:
+    gait = drawn(Subject(Patient(70.0, 1.7), 0.12, 0.9)).gait
+    np.testing.assert_array_equal(inputs(gait), [70.0, 1.7, 0.12, 0.9])
+
+
+def test_a_gait_does_not_deviate_from_itself() -> None:
+    subject = Subject(Patient(70.0, 1.7), 0.12, 0.9)
+    gait = drawn(subject).gait
+    found = deviation(subject, gait, gait, ROBOT)
+    assert found.angles.shape == (901, 12)
+    assert not found.angles.any()
+    assert (found.landing_position, found.feedforward) == (0.0, 0.0)
+    assert found.landing_attitude < 1e-9
+    assert found.speed_defect < 0.01
+    assert found.within_limits
+
+
+def test_a_deviation_is_what_was_put_in() -> None:
+    """A bent swing ankle lands turned by as much; a bent knee lands elsewhere."""
+    subject = Subject(Patient(70.0, 1.7), 0.12, 0.9)
+    gait = drawn(subject).gait
+    for joint, turned, moved in ((4, 0.01, 0.0), (3, 0.01, 0.01 * subject.patient.length("shank"))):
+        bent = gait.coefficients.copy()
+        bent[joint] += 0.01
+        found = deviation(subject, replace(gait, coefficients=bent), gait, ROBOT)
+        assert found.angles.max() == pytest.approx(0.01)
+        assert found.landing_attitude == pytest.approx(turned, rel=1e-6)
+        assert found.landing_position == pytest.approx(moved, rel=0.1, abs=1e-12)
+        assert found.position_defect == pytest.approx(0.01, rel=1e-6)
+    assert not deviation(subject, replace(gait, coefficients=gait.coefficients + 0.5), gait, ROBOT).within_limits
+
+
+def test_findings_are_the_worst_of_all_in_degrees_and_millimetres() -> None:
+    good = Deviation(np.zeros((100, 12)), 0.0, 0.0, 0.0, 0.0, 0.0, True)
+    bad = Deviation(
+        np.full((100, 12), math.radians(2.0)), 0.004, math.radians(0.4), math.radians(0.2), 0.03, 0.06, False
+    )
+    assert all(finding.ok for finding in findings([good, good]))
+    found = findings([good, bad])
+    assert not any(finding.ok for finding in found)
+    assert [finding.value for finding in found] == pytest.approx([2.0, 2.0, 4.0, 0.4, 0.2, 0.03, 6.0, 1.0])
+
+
+def test_subjects_are_off_the_grid_and_the_same_for_a_seed() -> None:
+    subjects = list(random_subjects(LOW, HIGH, 20, seed=3))
+    assert subjects == list(random_subjects(LOW, HIGH, 20, seed=3))
+    assert all(subject.patient.mass not in GRID.mass for subject in subjects)
+
+
+class TestCommand:
+    """`atalante gait library`, `fit` and `check`, one after the other."""
+
+    @staticmethod
+    def run(*arguments: str) -> Any:
+        return CliRunner().invoke(cli, ["gait", *arguments])
+
+    def test_from_library_to_report(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+        monkeypatch.setattr(library_module, "solve_subject", drawn)
+        monkeypatch.setattr(fit_module, "fit", partial(fit, hidden=(8,), iterations=800))
+        folder, file = tmp_path / "library", tmp_path / "network.npz"
+        levels = [
+            f"--{name.replace('_', '-')}={','.join(map(str, axis))}"
+            for name, axis in zip(GRID.names(), GRID.axes(), strict=True)
+        ]
+        made = self.run("library", "--out", str(folder), "--json", *levels)
+        assert made.exit_code == 0, made.output
+        assert len(made.stdout.splitlines()) == 81
+        assert "81 of 81 gaits solved" in made.stderr
+        again = self.run("library", "--out", str(folder), *levels)
+        assert "81 of them solved before" in again.stderr
+        fitted = self.run("fit", "--library", str(folder), "--out", str(file), "--json")
+        assert fitted.exit_code == 0, fitted.output
+        assert load_network(file).low.tolist() == LOW.tolist()
+        checked = self.run("check", "--network", str(file), "--count", "5")
+        # The drawn gaits are of the air: their feedforward is scaled, and what the ground asks for is beyond the drives.
+        assert checked.exit_code == 1
+        assert [line.split()[-1] for line in checked.stdout.splitlines()[1:]] == ["ok"] * 6 + ["FAIL"] * 2
+
+    def test_failures_are_listed_and_end_in_1(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+        def fails(subject: Subject) -> SolvedGait:
+            done = drawn(subject)
+            return replace(done, status="the swing clearance cannot hold") if subject.step_length == 0.2 else done
+
+        monkeypatch.setattr(library_module, "solve_subject", fails)
+        result = self.run("library", "--out", str(tmp_path), "--step-length", "0.1,0.15,0.2", "--mass", "60,70,80",
+                          "--height", "1.6,1.7,1.8", "--step-duration", "0.8,0.9,1.0")  # fmt: skip
+        assert result.exit_code == 1
+        assert result.stderr.count("failed: ") == 27
+        assert "the swing clearance cannot hold" in result.stderr
+        assert len(Library(tmp_path).failures()) == 27
+
+    @pytest.mark.parametrize(
+        ("arguments", "sentence"),
+        [
+            (["library", "--out", "x", "--mass", "60,70"], "mass has at least 3 levels that rise"),
+            (["library", "--out", "x", "--mass", "60,a"], "'60,a' is no list of levels"),
+            (["fit", "--library", "nowhere", "--out", "x.npz"], "nowhere holds no library"),
+            (["check", "--network", "nowhere.npz"], "nowhere.npz"),
+        ],
+    )
+    def test_bad_input_is_one_sentence(
+        self, arguments: list[str], sentence: str, tmp_path: Any, monkeypatch: Any
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        result = self.run(*arguments)
+        assert result.exit_code in (1, 2)
+        assert sentence in result.stderr
+        assert "Traceback" not in result.stderr

@@ -1,0 +1,186 @@
+"""The network: its shape, its range, its file, its speed of change; what it knows about gaits is `atalante gait check`."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from atalante_control import gait_network
+from atalante_control.gait import SIGN, SWAP, Gait, check_gait, motion
+from atalante_control.gait_network import (
+    INPUTS,
+    OUTPUTS,
+    GaitNetwork,
+    Layer,
+    NetworkError,
+    load_network,
+    periodicity,
+    save_network,
+)
+from atalante_control.model import Patient
+from atalante_control.stance_dynamics import stance_dynamics
+from atalante_control.subject import Subject
+from atalante_hal.robot import load_robot
+
+ROBOT = load_robot()
+SHIPPED = load_network()
+
+
+def drawn(seed: int) -> GaitNetwork:
+    """A network nobody trained, with a last layer in the space of periodic gaits."""
+    rng = np.random.default_rng(seed)
+    _, _, right = np.linalg.svd(periodicity())
+    basis = right[len(periodicity()) :]
+    layers = (
+        Layer(rng.normal(size=(4, 5)), rng.normal(size=5)),
+        Layer(rng.normal(size=(5, len(basis))) @ basis * 0.05, rng.normal(size=len(basis)) @ basis * 0.05),
+    )
+    return GaitNetwork(np.array([50.0, 1.5, 0.1, 0.6]), np.array([90.0, 1.9, 0.2, 1.2]), layers, "drawn")
+
+
+def random_inputs(network: GaitNetwork, count: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(network.low, network.high, (count, len(INPUTS)))
+
+
+def subject(inputs: np.ndarray) -> Subject:
+    mass, height, length, duration = inputs.tolist()
+    return Subject(Patient(mass, height), length, round(duration, 3))
+
+
+@pytest.mark.parametrize("network", [SHIPPED, drawn(1)], ids=["shipped", "untrained"])
+def test_the_angles_of_every_gait_go_on_in_its_mirror_image(network: GaitNetwork) -> None:
+    for inputs in random_inputs(network, 50):
+        points = network.coefficients(inputs)
+        np.testing.assert_allclose(points[:, -1], SIGN * points[SWAP, 0], atol=1e-12)
+
+
+def test_speeds_go_on_but_for_what_an_impact_leaves() -> None:
+    for inputs in random_inputs(SHIPPED, 200):
+        _, qd, _ = motion(SHIPPED.coefficients(inputs), inputs[3], np.array([0.0, 1.0]))
+        assert np.abs(qd[1] - SIGN * qd[0][SWAP]).max() < 0.02
+
+
+def test_gaits_of_the_shipped_network_keep_the_robot_s_limits() -> None:
+    ends = np.array(np.meshgrid(*zip(SHIPPED.low, SHIPPED.high, strict=True))).reshape(len(INPUTS), -1).T
+    for inputs in [*random_inputs(SHIPPED, 10), *ends]:
+        check_gait(SHIPPED.gait(subject(inputs), ROBOT), ROBOT)
+
+
+def test_the_shipped_network_covers_the_subjects_of_the_paper() -> None:
+    assert dict(zip(INPUTS, SHIPPED.low, strict=True))["mass"] <= 58.0
+    assert dict(zip(INPUTS, SHIPPED.high, strict=True))["mass"] >= 91.0
+    assert SHIPPED.low[1] <= 1.62
+    assert SHIPPED.high[1] >= 1.93
+    assert gait_network.DEFAULT_NETWORK.stat().st_size < 100_000
+
+
+def test_output_is_continuous() -> None:
+    """A millionth of the range changes no angle by more than a ten-thousandth of a degree."""
+    for inputs in random_inputs(SHIPPED, 100):
+        for axis, step in enumerate(1e-6 * (SHIPPED.high - SHIPPED.low)):
+            nudged = inputs + step * (np.arange(len(INPUTS)) == axis)
+            change = SHIPPED.coefficients(nudged) - SHIPPED.coefficients(inputs)
+            assert np.degrees(np.abs(change).max()) < 1e-4
+
+
+def test_feedforward_is_the_inverse_dynamics_of_its_own_trajectory() -> None:
+    who = subject(random_inputs(SHIPPED, 1)[0])
+    gait = SHIPPED.gait(who, ROBOT)
+    expected = stance_dynamics(ROBOT, who.patient).feedforward(gait.coefficients, gait.duration)
+    assert gait.feedforward is not None
+    np.testing.assert_array_equal(gait.feedforward, expected)
+    assert gait.parameters == who.parameters()
+    assert gait.duration == who.step_duration
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (
+            lambda low, high: Subject(Patient(high[0] + 1.0, 1.75), 0.15, 0.9),
+            "knows a mass from 58 to 91 kg, not 92 kg",
+        ),
+        (lambda low, high: Subject(Patient(75.0, low[1] - 0.01), 0.15, 0.9), "knows a height from"),
+        (lambda low, high: Subject(Patient(75.0, 1.75), high[2] + 0.01, 0.9), "knows a step length from"),
+        (lambda low, high: Subject(Patient(75.0, 1.75), 0.15, high[3] + 0.1), "knows a step duration from"),
+        (lambda low, high: Subject(Patient(75.0, 1.75, 0.47), 0.15, 0.9), "knows legs of Winter's proportions"),
+    ],
+)
+def test_a_subject_it_was_not_fitted_for_is_refused_with_the_range(
+    change: Callable[[np.ndarray, np.ndarray], Subject], sentence: str
+) -> None:
+    with pytest.raises(NetworkError, match=sentence):
+        SHIPPED.gait(change(SHIPPED.low, SHIPPED.high), ROBOT)
+
+
+def test_the_ends_of_the_range_belong_to_it() -> None:
+    for inputs in (SHIPPED.low, SHIPPED.high):
+        SHIPPED.check(subject(inputs))
+
+
+def test_a_saved_network_is_read_back_to_the_bit(tmp_path: Path) -> None:
+    network = drawn(2)
+    save_network(network, tmp_path / "network.npz")
+    back = load_network(tmp_path / "network.npz")
+    assert back.version == "drawn"
+    for inputs in random_inputs(network, 5):
+        np.testing.assert_array_equal(back.coefficients(inputs), network.coefficients(inputs))
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"format": np.array("atalante-gait-network/9")}, "format is"),
+        ({"inputs": np.array(["mass"])}, "with the inputs mass, height, step_length, step_duration"),
+        ({"surprise": np.zeros(3)}, "surprise does not belong there"),
+        ({"bias_1": None}, "bias_1 does not belong there or is missing"),
+        ({"low": np.zeros(3)}, "low and high are 4 numbers"),
+        ({"weights_0": np.full((4, 5), np.nan)}, "weights_0 is an array of finite 64-bit numbers"),
+        ({"weights_0": np.zeros((3, 5))}, "weights_0 has 4 rows"),
+        ({"bias_0": np.zeros(4)}, "weights_0 has 4 rows and as many columns as bias_0"),
+        ({"weights_1": np.zeros((5, 8)), "bias_1": np.zeros(8)}, f"last layer has {OUTPUTS} columns"),
+        ({"bias_1": np.arange(96.0)}, "the angles of a gait continue in the next step"),
+    ],
+)
+def test_a_file_that_is_no_network_is_refused(
+    tmp_path: Path, change: dict[str, np.ndarray | None], sentence: str
+) -> None:
+    path = tmp_path / "network.npz"
+    save_network(drawn(3), path)
+    with np.load(path) as file:
+        arrays = {**dict(file), **change}
+    np.savez(path, allow_pickle=False, **{name: array for name, array in arrays.items() if array is not None})
+    with pytest.raises(NetworkError, match=re.escape(str(path)) + ".*" + sentence):
+        load_network(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 nothing", b"not a network"])
+def test_a_broken_file_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "network.npz"
+    path.write_bytes(content)
+    with pytest.raises(NetworkError, match=re.escape(str(path))):
+        load_network(path)
+    with pytest.raises(NetworkError, match="nowhere"):
+        load_network(tmp_path / "nowhere.npz")
+
+
+def test_walking_needs_none_of_the_training_stack() -> None:
+    program = (
+        "import sys; from atalante_control.gait_network import load_network; load_network(); "
+        "print([m for m in ('casadi', 'joblib', 'sklearn', 'scipy') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert ast.literal_eval(done.stdout) == []
+
+
+def test_the_other_leg_s_step_is_the_mirror_image() -> None:
+    gait = SHIPPED.gait(subject(random_inputs(SHIPPED, 1)[0]), ROBOT)
+    twice: Gait = gait.mirrored().mirrored()
+    np.testing.assert_array_equal(twice.coefficients, gait.coefficients)

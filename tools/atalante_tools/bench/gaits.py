@@ -1,0 +1,98 @@
+"""Benchmarks of the model and its gaits: what a session waits for before it walks, and what a library costs."""
+
+from __future__ import annotations
+
+import time
+from itertools import cycle
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+import numpy as np
+import pinocchio
+
+from atalante_control.gait_network import load_network
+from atalante_control.model import ExoskeletonParameters, Patient, pinocchio_model, urdf
+from atalante_control.stance_dynamics import stance_dynamics
+from atalante_hal.robot import load_robot
+from atalante_tools.bench.measure import Effort, Measurement, require, timed
+
+_PATIENT: Final = Patient(75.0, 1.75)
+#: What an evaluation of the network may take [s].
+_BUDGET: Final = 50e-6
+#: What a gait of a library may take on a core [s].
+_GAIT: Final = 3.0
+_BUILDS: Final = 3
+_EVALUATIONS: Final = 100
+_DYNAMICS: Final = 100
+
+
+def model_build(effort: Effort) -> Measurement:
+    """From a patient's mass and height to the Pinocchio model."""
+    robot, parameters = load_robot(), ExoskeletonParameters()
+    text = urdf(parameters, robot, _PATIENT)
+    return effort.interleave(
+        timed(lambda: pinocchio_model(urdf(parameters, robot, _PATIENT)), _BUILDS),
+        timed(lambda: pinocchio.buildModelFromXML(text), _BUILDS),
+        share=0.25,
+    )
+
+
+def inverse_dynamics(effort: Effort) -> Measurement:
+    """Joint torques and ground wrench of one state on the stance foot."""
+    robot = load_robot()
+    dynamics = stance_dynamics(robot, _PATIENT)
+    model = pinocchio_model(urdf(ExoskeletonParameters(), robot, _PATIENT), fixed_base=False).model
+    data = model.createData()
+    rng = np.random.default_rng(0)
+    states = [(rng.uniform(robot.position_min, robot.position_max), *rng.normal(size=(2, 12))) for _ in range(64)]
+    floating = [(np.r_[np.zeros(6), 1.0, q], np.r_[np.zeros(6), v], np.r_[np.zeros(6), a]) for q, v, a in states]
+    weight = pinocchio.computeTotalMass(model) * 9.81
+    force = dynamics.forces(states[0][0], np.zeros(12), np.zeros(12)).force
+    require(abs(force[2] - weight) < 1e-6, f"the ground carries {force[2]:.1f} N of a weight of {weight:.1f} N")
+    ours, theirs = cycle(states), cycle(floating)
+    return effort.interleave(
+        timed(lambda: dynamics.forces(*next(ours)), _DYNAMICS),
+        timed(lambda: pinocchio.rnea(model, data, *next(theirs)), _DYNAMICS),
+    )
+
+
+def network_evaluation(effort: Effort) -> Measurement:
+    """Parameters in, twelve trajectories out."""
+    network = load_network()
+    inputs = np.random.default_rng(0).uniform(network.low, network.high, (64, len(network.low)))
+    spread = np.ptp([network.coefficients(row) for row in inputs], axis=0).max()
+    require(spread > 0.05, f"the gaits differ by {spread:.3f} rad only")
+    rows = cycle(inputs)
+    measured = effort.interleave(timed(lambda: network.coefficients(next(rows)), _EVALUATIONS), lambda: _BUDGET)
+    return Measurement(measured.value, _BUDGET)
+
+
+def library_one_process(effort: Effort) -> Measurement:
+    """Seconds a gait of a library, one process."""
+    return _library(effort, 1)
+
+
+def library_two_processes(effort: Effort) -> Measurement:
+    """Seconds a gait of a library, two processes."""
+    return _library(effort, 2)
+
+
+def _library(effort: Effort, jobs: int) -> Measurement:
+    """From the first gait that every process has made, when all have built their programme, to the last."""
+    from atalante_control.generation.library import Grid, Library, solve_subject
+
+    count = (2 if effort.quick else 12) * jobs
+    with TemporaryDirectory(prefix="atalante-") as folder:
+        library = Library(Path(folder), Grid())
+        results = library.generate(solve_subject, jobs=jobs)
+        for _ in range(jobs):
+            next(results)
+        began = time.perf_counter()
+        for done in range(count):
+            subject, solved = next(results)
+            require(solved.solved, f"{subject}: {solved.status}")
+            effort.progress(done + 1, count)
+        seconds = time.perf_counter() - began
+        results.close()  # type: ignore[attr-defined]
+    return Measurement(seconds / count, _GAIT / jobs, (f"{count / seconds * 60:.0f} gaits a minute",))
