@@ -222,6 +222,8 @@ class Hal:
             cycles = self._limiter.saturated
             self._report(Dtc.TORQUE_SATURATED, "the limiter cuts the torque", cycles > SATURATED_CYCLES, cycles)
         self._step = command.step
+        if command.outside:
+            self._report(Dtc.GUIDE_OUTSIDE, "a joint is outside the virtual guide")
         level, torque = self._parts.level_command, self._parts.torque_command
         np.maximum(command.vibration, self._no_level, out=level)  # the codec cuts at 1
         torque[:] = self._tx_torque[:] = self._limiter.last

@@ -154,3 +154,14 @@ def test_unknown_names_are_answered_with_the_valid_ones():
         codec.index("LEFT_KNEE", "Position")
     with pytest.raises(KeyError, match="TargetTorque"):
         codec.slice("Angle")
+
+
+def test_an_invalid_code_is_told_from_a_value_outside_its_range():
+    network = load()
+    message = network.message("IMU_PELVIS_STATE")
+    codec = Codec([message])
+    for signal in message.signals:
+        for code in (0, signal.invalid_raw):
+            payload = 0 if code is None else code << signal.start
+            expected = code is not None and code == signal.invalid_raw
+            assert codec.says_invalid(0, payload.to_bytes(message.length, "little")) is expected, signal.name

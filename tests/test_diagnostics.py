@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from atalante_hal.diagnostics import Dtc, Reaction, Severity, dtcs_of, emergency, event_code, worst
+from atalante_hal.diagnostics import (
+    Dtc,
+    Reaction,
+    Severity,
+    by_number,
+    dtcs_of,
+    emergency,
+    event_code,
+    number_of,
+    worst,
+)
 from atalante_hal.telemetry.events import SEVERITIES
 
 R = Reaction
@@ -87,3 +97,16 @@ def test_an_emergency_event_carries_its_error_code():
     assert event_code(Dtc.EMCY_CURRENT, 0x2310) == "EMCY_2310"
     assert event_code(Dtc.EMCY_OTHER, 0x00FF) == "EMCY_00FF"
     assert event_code(Dtc.OVER_TEMP, 0x4310) == "OVER_TEMP"
+
+
+def test_one_number_stands_for_the_worst_of_a_set():
+    assert number_of(0) == 0
+    assert by_number(0) is None
+    for place, dtc in enumerate(Dtc, start=1):
+        assert number_of(dtc.bit) == place
+        assert by_number(place) == f"{dtc}: {dtc.meaning}"
+    assert by_number(len(Dtc) + 1) is None
+    assert by_number(-1) is None
+    assert number_of(Dtc.FOOT_CELL.bit | Dtc.ENC_STUCK.bit | Dtc.OPERATOR_STOP.bit) == number_of(Dtc.ENC_STUCK.bit)
+    assert number_of(Dtc.E2E_SEQUENCE.bit | Dtc.OPERATOR_STOP.bit) == number_of(Dtc.OPERATOR_STOP.bit)
+    assert number_of(Dtc.E2E_SOME_LOST.bit) == 1

@@ -11,7 +11,9 @@ import pytest
 from atalante_dbc import DBC_FILE
 from atalante_hal.bus import BusDown, BusFull
 from atalante_hal.cia402 import Controlword, DriveState
-from atalante_hal.hal import Hal
+from atalante_hal.diagnostics import Dtc, dtcs_of, number_of
+from atalante_hal.hal import ENABLE_CYCLES, FINISH_STEP_CYCLES, FULL_ASSIST_RAMP, PERIOD, SATURATED_CYCLES, Hal
+from atalante_hal.limiter import Limited
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Command, SupervisorState
 
@@ -263,3 +265,319 @@ def test_every_frame_sent_decodes_with_cantools(rig):
             message.decode(frame["data"][: message.length].tobytes())
             seen.add(message.name)
     assert {"SYNC_LEFT_LEG", "SYNC_RIGHT_SENSE", "COMMAND_LEFT_LEG", "HAPTICS_COMMAND", "HAL_STATUS"} <= seen
+
+
+# -- reactions ---------------------------------------------------------------------------------------------------------
+
+
+def seen(rig, *codes: str) -> list[tuple[str, str]]:
+    return [(e.code, e.severity) for e in rig.hal.events if e.code in codes]
+
+
+def set_signal(rig, message: str, signal: str, value: float):
+    """Let a node say something else from now on."""
+    at = rig.emulator.signals.index(message, signal)
+    rig.emulator.before_send.append(lambda _, values: values.__setitem__(at, value))
+
+
+def hold_torque(rig, outside: bool = False, step: int | None = None) -> Command:
+    robot, state = rig.hal.robot, rig.hal.state
+    torque = robot.hold_kp * (rig._anchor - state.position) - robot.hold_kd * state.velocity
+    return Command(torque, np.zeros(8), step=step, outside=outside)
+
+
+def walk(rig, cycles: int, **command):
+    """A controller that holds its pose, for a while."""
+    for _ in range(cycles):
+        rig.hal.read()
+        rig.hal.write(hold_torque(rig, **command))
+    return rig.hal.state
+
+
+def test_a_torque_that_is_cut_for_long_leads_the_assistance_factor_to_one(make_rig):
+    rig = make_rig(assistance_factor=0.5)
+    rig.until(S.ACTIVE)
+    limiter, hal = rig.hal._limiter, rig.hal
+    limiter.saturated = 0
+    apply, cut = limiter.apply, Limited(finite=True, clamped=True)
+
+    def cut_a_little(torque, motion):
+        before = limiter.saturated
+        apply(torque, motion)
+        limiter.saturated = before + 1
+        return cut
+
+    limiter.apply = cut_a_little
+    assert walk(rig, SATURATED_CYCLES + 1).supervisor is S.ACTIVE
+    assert seen(rig, "TORQUE_SATURATED") == [("TORQUE_SATURATED", "warning")] * 2  # pending, then confirmed
+    assert rig.cycle().supervisor is S.FULL_ASSIST
+    assert hal.reason == "the limiter cuts the torque"
+
+
+def into_full_assist(rig):
+    rig.until(S.ACTIVE)
+    rig.hal._report(Dtc.FOOT_CELL, "a cell is stuck")
+    state = walk(rig, 1)
+    assert state.supervisor is S.FULL_ASSIST
+    return state
+
+
+def test_full_assist_ramps_in_its_time_and_the_operator_ramps_back(make_rig):
+    rig = make_rig(assistance_factor=0.5)
+    state = into_full_assist(rig)
+    cycles = round(FULL_ASSIST_RAMP / PERIOD / 2)
+    assert state.assistance_factor == pytest.approx(0.501)
+    before = state.assistance_factor
+    for _ in range(cycles - 1):
+        state = walk(rig, 1)
+        assert 0.0 < state.assistance_factor - before <= PERIOD / FULL_ASSIST_RAMP + 1e-12
+        before = state.assistance_factor
+    assert state.assistance_factor == 1.0
+    assert rig.hal.record[rig.hal.layout["assistance_factor"]] == 1.0
+    assert walk(rig, 10).assistance_factor == 1.0
+    rig.operator.start()
+    assert walk(rig, 2).supervisor is S.ACTIVE
+    assert 0.99 < rig.hal.state.assistance_factor < 1.0
+    assert walk(rig, cycles).assistance_factor == 0.5
+    rig.operator.assist(0.2)
+    assert walk(rig, 2).assistance_factor == 0.2  # the dial acts at once
+
+
+def test_the_dial_does_not_widen_the_guide_in_full_assist(make_rig):
+    rig = make_rig(assistance_factor=0.9)
+    into_full_assist(rig)
+    walk(rig, 150)
+    rig.operator.assist(0.1)
+    assert walk(rig, 5).assistance_factor == 1.0
+
+
+def finishing(rig, step: int | None):
+    rig.until(S.ACTIVE)
+    walk(rig, 5, step=step)
+    rig.hal._report(Dtc.SUPPLY_LOW, "the battery is nearly empty")
+    return walk(rig, 1, step=step)
+
+
+def test_finish_step_ends_in_hold_when_the_feet_change(rig):
+    assert finishing(rig, 7).supervisor is S.FINISH_STEP
+    assert walk(rig, 100, step=7).supervisor is S.FINISH_STEP
+    rig.hal.read()
+    rig.hal.write(hold_torque(rig, step=8))
+    assert rig.cycle().supervisor is S.HOLD
+
+
+def test_finish_step_of_a_controller_that_does_not_walk_is_hold(rig):
+    assert finishing(rig, None).supervisor is S.FINISH_STEP
+    assert rig.cycle().supervisor is S.HOLD
+
+
+def test_finish_step_does_not_go_on_for_ever(rig):
+    finishing(rig, 7)
+    assert walk(rig, FINISH_STEP_CYCLES - 1, step=7).supervisor is S.FINISH_STEP
+    assert walk(rig, 1, step=7).supervisor is S.HOLD
+
+
+def test_a_joint_that_cannot_hold_is_let_down_and_the_others_hold(rig):
+    rig.until(S.ACTIVE)
+    rig.hal._heartbeats.emergencies["LEFT_SK"] = Dtc.EMCY_ENCODER, 0x7305
+    rig.hal._heartbeats.quiet = False
+    rig.hal._steady = False
+    assert rig.cycle().supervisor is S.LOWER
+    commands = last_commands(rig)
+    words = {f"{side}_{k}": v for side, c in commands.items() for k, v in c.items() if k.endswith("Controlword")}
+    assert words.pop("left_SK_Controlword") == Controlword.DISABLE_VOLTAGE
+    assert set(words.values()) == {Controlword.QUICK_STOP}
+    state = rig.run(50)
+    assert state.supervisor is S.LOWER
+    assert state.drive_state[3] == DriveState.SWITCH_ON_DISABLED
+    assert (np.delete(state.drive_state, 3) == DriveState.QUICK_STOP_ACTIVE).all()
+    rig.operator.start()
+    assert rig.until(S.ACTIVE, 50).supervisor is S.ACTIVE
+    assert [c for c in rig.codes() if c in S.__members__][-3:] == ["LOWER", "HOLD", "ACTIVE"]
+
+
+def test_a_start_the_drives_do_not_follow_is_given_up_and_said(rig):
+    rig.operator._starts = False
+    rig.until(S.READY)
+    set_signal(rig, "LEFT_SK_STATE", "DriveState", DriveState.SWITCH_ON_DISABLED)
+    rig.operator.start()
+    rig.run(ENABLE_CYCLES)
+    assert "START_FAILED" not in rig.codes()
+    rig.run(3)
+    assert "START_FAILED" in rig.codes()
+    assert rig.hal.reason == "the drives were not enabled within 200 cycles"
+    assert controlwords(rig) == {Controlword.QUICK_STOP}
+
+
+def test_a_start_ends_when_the_dead_man_is_released(rig):
+    rig.operator._starts = False
+    rig.until(S.READY)
+    set_signal(rig, "LEFT_SK_STATE", "DriveState", DriveState.SWITCH_ON_DISABLED)
+    rig.operator.start()
+    rig.run(10)
+    assert Controlword.SHUTDOWN in controlwords(rig)
+    rig.operator.release()
+    rig.run(3)
+    assert controlwords(rig) == {Controlword.QUICK_STOP}
+    rig.operator.squeeze()
+    rig.run(ENABLE_CYCLES)
+    assert controlwords(rig) == {Controlword.QUICK_STOP}
+    assert "START_FAILED" not in rig.codes()
+
+
+def test_a_joint_outside_the_guide_is_told_and_nothing_else(rig):
+    rig.until(S.ACTIVE)
+    assert walk(rig, 5, outside=True).supervisor is S.ACTIVE
+    assert seen(rig, "GUIDE_OUTSIDE") == [("GUIDE_OUTSIDE", "info")]
+
+
+# -- what the world is told --------------------------------------------------------------------------------------------
+
+
+def test_active_diagnostics_are_in_the_record_and_the_worst_in_the_status(rig):
+    rig.until(S.ACTIVE)
+    diagnostics = rig.hal.layout["diagnostics"]
+    assert rig.hal.record[diagnostics] == 0
+    rig.bus.to_hal = drop(0x183)
+    rig.run(5)
+    assert dtcs_of(int(rig.hal.record[diagnostics][0])) == (Dtc.NODE_TIMEOUT,) or Dtc.NODE_TIMEOUT in dtcs_of(
+        int(rig.hal.record[diagnostics][0])
+    )
+    rig.run(100)
+    status = next(f for f in reversed(rig.sent) if f["can_id"][0] == 0x700)
+    said = ORACLE.decode_message(0x700, status["data"][0, :24].tobytes(), decode_choices=False)
+    assert said["DiagnosticCode"] == number_of(Dtc.NODE_TIMEOUT.bit)
+    assert said["HalState"] == S.HOLD
+    assert (said["DbcHash"], said["ConfigHash"]) == (rig.hal.network.hash32, rig.hal.robot.hash32)
+
+
+def test_the_status_carries_the_hash_of_the_gait_and_the_step(make_rig):
+    rig = make_rig(gait_hash=0xCAFE)
+    rig.until(S.ACTIVE)
+    walk(rig, 120, step=70000)
+    status = next(f for f in reversed(rig.sent) if f["can_id"][0] == 0x700)
+    said = ORACLE.decode_message(0x700, status["data"][0, :24].tobytes(), decode_choices=False)
+    assert (said["GaitHash"], said["Step"]) == (0xCAFE, 70000 & 0xFFFF)
+
+
+def test_a_change_of_state_says_why(rig):
+    rig.until(S.ACTIVE)
+    rig.operator.hold()
+    rig.until(S.HOLD, 5)
+    assert rig.hal.events[-1].text == "ACTIVE -> HOLD: the operator asked to stop"
+    assert rig.hal.reason == "the operator asked to stop"
+
+
+# -- when things go wrong ----------------------------------------------------------------------------------------------
+
+
+def test_an_exception_sends_the_prepared_hold_frame_under_the_next_counter(rig):
+    rig.until(S.ACTIVE)
+    rig.cycle(np.full(12, 10.0))
+    before = next(f for f in reversed(rig.sent) if f["can_id"][0] == 0x100)["data"][0, 2]
+    rig.hal.read()
+    with pytest.raises(ValueError, match="broadcast") as mistake:
+        rig.hal.write(Command(np.full(3, 10.0), np.zeros(8)))
+    rig.hal._tx_torque.fill(np.nan)  # whatever else was written before it raised
+    sent = rig.hal.fail(mistake.value)
+    assert not sent.any()
+    frames = next(f for f in reversed(rig.sent) if f["can_id"][0] == 0x100)
+    assert (frames["data"][:, 2] == (int(before) + 1) & 0xFF).all()
+    assert controlwords(rig) == {Controlword.QUICK_STOP}
+    assert not torques(rig).any()
+
+
+def test_the_cycle_after_an_exception_is_whole(rig):
+    rig.until(S.ACTIVE)
+    rig.hal.read()
+    rig.hal.fail(ValueError("a mistake"))
+    assert rig.cycle().supervisor is S.HOLD
+    state = rig.run(5)
+    assert (state.drive_state == DriveState.QUICK_STOP_ACTIVE).all()
+    assert state.valid.all()
+    assert not [e for e in rig.hal.events if e.code.startswith("E2E")]
+
+
+def test_a_gap_drops_what_piled_up_and_holds(rig):
+    rig.until(S.ACTIVE)
+    rig.hal.report(Dtc.CYCLE_GAP, "2000 ms went by without a cycle", value=2.0)
+    assert rig.cycle().supervisor is S.HOLD
+    event = next(e for e in rig.hal.events if e.code == "CYCLE_GAP")
+    assert (event.cycle, event.value, event.severity) == (rig.hal.state.cycle, 2.0, "error")
+
+
+def test_a_short_gap_is_noted(rig):
+    rig.until(S.ACTIVE)
+    rig.hal.report(Dtc.CYCLE_GAP, "4 ms went by without a cycle", confirmed=False, value=0.004)
+    assert rig.cycle().supervisor is S.ACTIVE
+    assert seen(rig, "CYCLE_GAP") == [("CYCLE_GAP", "warning")]
+
+
+def own_frame(frames):
+    alien = frames[:1].copy()
+    alien["can_id"] = 0x100
+    return np.concatenate([frames, alien])
+
+
+def test_another_hal_ends_a_running_one_in_hold_and_keeps_a_new_one_off(make_rig):
+    rig = make_rig()
+    rig.until(S.ACTIVE)
+    rig.bus.to_hal = own_frame
+    assert rig.cycle().supervisor is S.HOLD
+    assert seen(rig, "HAL_DUPLICATE") == [("HAL_DUPLICATE", "error")]
+    new = make_rig()
+    new.bus.to_hal = own_frame
+    new.cycle()
+    new.bus.to_hal = lambda frames: frames
+    assert new.run(500).supervisor is S.OFF
+    assert "another HAL was there first" in new.hal._memory.text_of(frozenset({Dtc.HAL_DUPLICATE})) or (
+        "HAL_DUPLICATE" in new.codes()
+    )
+
+
+def test_stopping_on_a_dead_bus_takes_a_bounded_time(network, robot, monkeypatch):
+    """A clock that the bus moves on: nobody ever answers, and every wait is waited to its end."""
+    import atalante_hal.hal as module
+    import atalante_hal.transceiver as transceiver
+
+    class Dead:
+        name, dropped, stamps, now = "dead", 0, np.zeros(128, np.int64), 0.0
+
+        def send(self, frames):
+            pass
+
+        def receive(self, frames, timeout=0.0):
+            self.now += timeout
+            return 0
+
+        def close(self):
+            pass
+
+    bus = Dead()
+    for one in (module, transceiver):
+        monkeypatch.setattr(one.time, "monotonic", lambda: bus.now)
+    hal = Hal(network, robot, bus, patience=2.0)
+    hal._image.age.fill(0)  # everybody was there a moment ago
+    hal.stop()
+    assert bus.now <= module.STOP_PATIENCE + 0.01
+    assert hal.patience == 2.0
+
+
+def test_listening_before_the_start_sends_nothing(rig):
+    rig.bus.to_hal = lambda frames: frames[:0]
+    rig.hal.listen()
+    assert rig.sent == []
+
+
+def test_the_bus_and_the_tap_can_be_changed(rig):
+    assert rig.hal.bus is rig.bus
+    tap = rig.hal.tap
+    rig.hal.tap = None
+    rig.cycle()
+    assert rig.sent == []
+    rig.hal.tap = tap
+    rig.cycle()
+    assert rig.sent
+    rig.hal.bus = rig.bus
+    assert rig.hal.bus is rig.bus
+    assert not rig.hal.silent

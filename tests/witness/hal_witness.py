@@ -1,7 +1,7 @@
 """Every HAL that runs in a test has a witness: it writes the frames it sends into a file of its own, for `command_limits`.
 
-It writes as soon as they are sent, so that a killed process leaves what it sent. `start` watches the HALs of this process and names the folder
-in the environment; every Python that a test starts finds `sitecustomize` beside this file and does the same.
+It writes as soon as they are sent, so that a killed process leaves what it sent. `start` watches the HALs of this process and
+names the folder in the environment; every Python that a test starts finds `sitecustomize` beside this file and does the same.
 """
 
 from __future__ import annotations

@@ -1,0 +1,300 @@
+"""Whether messages may be used: trust, age and what is raised, cycle by cycle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from atalante_dbc import load
+from atalante_hal.diagnostics import Dtc
+from atalante_hal.e2e import COUNTER_BYTE, Check
+from atalante_hal.fault_memory import FaultMemory
+from atalante_hal.frame import Frames, new_frames
+from atalante_hal.image import ReceiveImage, TransmitImage
+from atalante_hal.judgement import Judgement
+
+NETWORK = load()
+MESSAGES = [
+    NETWORK.message(name)
+    for name in ("LEFT_SK_STATE", "RIGHT_SK_STATE", "IMU_PELVIS_STATE", "FOOT_LEFT_STATE", "PENDANT_STATE")
+]
+KNEE, OTHER_KNEE, IMU, FOOT, PENDANT = range(5)
+Change = Callable[[Frames], Frames]
+
+
+class Bench:
+    """Nodes and the HAL's judgement; a cycle may lose, change or delay frames."""
+
+    def __init__(self) -> None:
+        self.tx, self.image = TransmitImage(MESSAGES), ReceiveImage(MESSAGES)
+        self.judgement, self.memory = Judgement(NETWORK, self.image), FaultMemory()
+        self.buffer, self.number = new_frames(64), 0
+
+    def cycle(self, change: Change = lambda frames: frames, times: int = 1) -> Bench:
+        for _ in range(times):
+            self.number += 1
+            frames = change(self.tx.seal(self.number & 0xFF).copy())
+            self.buffer[: len(frames)] = frames
+            self.image.accept(self.buffer, len(frames), self.number & 0xFF)
+            self.judgement.judge(self.number, self.memory)
+            self.memory.close_cycle(self.number)
+        return self
+
+    def well(self) -> Bench:
+        return self.cycle(times=16)
+
+    @property
+    def active(self) -> dict[tuple[str, str], bool]:
+        return {(dtc.value, node): entry.confirmed for (dtc, node), entry in self.memory.active.items()}
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def lose(*rows: int) -> Change:
+    return lambda frames: np.delete(frames, rows)
+
+
+def flip(row: int) -> Change:
+    def change(frames: Frames) -> Frames:
+        frames["data"][row, 5] ^= 1
+        return frames
+
+    return change
+
+
+def test_a_sender_is_trusted_after_sixteen_good_cycles(bench: Bench):
+    assert not bench.cycle(times=15).judgement.nodes_well
+    assert not bench.judgement.valid.any()
+    assert bench.judgement.missing() == {"LEFT_SK", "RIGHT_SK", "IMU_PELVIS", "FOOT_LEFT"}
+    assert not bench.judgement.settled
+    bench.cycle()
+    assert bench.judgement.nodes_well
+    assert bench.judgement.trusts(KNEE)
+    assert bench.judgement.valid.all()
+    assert bench.judgement.joints_valid
+    assert bench.judgement.missing() == set()
+    assert bench.judgement.settled
+    assert bench.active == {}
+
+
+def test_who_was_never_heard_has_no_timeout(bench: Bench):
+    bench.cycle(lose(IMU), times=40)
+    assert bench.active == {}
+    assert not bench.judgement.nodes_well
+    assert bench.judgement.missing() == {"IMU_PELVIS"}
+    assert bench.judgement.joints_valid
+
+
+@pytest.mark.parametrize(
+    ("row", "node", "timeout"), [(KNEE, "LEFT_SK", 5), (IMU, "IMU_PELVIS", 10), (FOOT, "FOOT_LEFT", 10)]
+)
+def test_a_silent_node_times_out_at_its_timeout_exactly(bench: Bench, row: int, node: str, timeout: int):
+    bench.well().cycle(lose(row), times=timeout - 1)
+    assert bench.active == {}
+    assert bench.judgement.nodes_well
+    assert not bench.judgement.valid[row]
+    assert bench.judgement.joints_valid is (row != KNEE)
+    bench.cycle(lose(row))
+    assert bench.active == {("NODE_TIMEOUT", node): True}
+    assert not bench.judgement.nodes_well
+    event = bench.memory.events[-1]
+    assert (event.code, event.node, event.value, event.cycle) == ("NODE_TIMEOUT", node, timeout, 16 + timeout)
+    assert event.text == f"{node}: a node is silent; its data is {timeout} cycles old"
+
+
+def test_a_frame_after_lost_ones_is_used_and_told(bench: Bench):
+    bench.well().cycle(lose(KNEE), times=4).cycle()
+    assert bench.active == {("E2E_SOME_LOST", "LEFT_SK"): False}
+    assert bench.judgement.valid.all()
+    assert not bench.judgement.settled
+    bench.cycle()
+    assert bench.active == {}
+    assert not bench.judgement.settled
+    bench.cycle(times=14)
+    assert bench.judgement.settled
+
+
+def test_after_a_timeout_trust_takes_sixteen_good_cycles(bench: Bench):
+    bench.well().cycle(lose(KNEE), times=5).cycle()
+    assert bench.active == {("E2E_SEQUENCE", "LEFT_SK"): True}  # more than four are missing
+    bench.cycle(times=15)
+    assert not bench.judgement.nodes_well
+    assert not bench.judgement.valid[KNEE]
+    assert bench.judgement.valid[OTHER_KNEE]
+    bench.cycle(times=2)
+    assert bench.judgement.nodes_well
+
+
+def repeat(frames: Frames) -> Frames:
+    return np.concatenate([frames, frames[[KNEE]]])
+
+
+def test_a_repeated_frame_is_told_and_changes_nothing(bench: Bench):
+    bench.well().cycle(repeat)
+    assert bench.active == {("E2E_REPEATED", "LEFT_SK"): False}
+    assert bench.image.age[KNEE] == 0
+    assert bench.judgement.valid.all()
+
+
+def frozen(bench: Bench) -> Change:
+    last = bench.tx.frames[[KNEE]].copy()
+
+    def change(frames: Frames) -> Frames:
+        frames[[KNEE]] = last
+        return frames
+
+    return change
+
+
+def test_a_counter_that_stands_still_is_as_bad_as_silence(bench: Bench):
+    bench.well()
+    stuck = frozen(bench)
+    bench.cycle(stuck, times=4)
+    assert bench.active == {("E2E_REPEATED", "LEFT_SK"): False}
+    bench.cycle(stuck)
+    assert bench.active == {("E2E_REPEATED", "LEFT_SK"): False, ("E2E_FROZEN", "LEFT_SK"): True}
+
+
+def test_damage_is_told_at_once_and_confirmed_when_the_data_is_too_old(bench: Bench):
+    bench.well().cycle(flip(KNEE), times=4)
+    assert bench.active == {("E2E_CRC", "LEFT_SK"): False}
+    bench.cycle(flip(KNEE))
+    assert bench.active == {("E2E_CRC", "LEFT_SK"): True}
+
+
+def test_another_length_is_told_at_once(bench: Bench):
+    def shorten(frames: Frames) -> Frames:
+        frames["len"][KNEE] = 8
+        return frames
+
+    bench.well().cycle(shorten, times=4)
+    assert bench.active == {("FRAME_LENGTH", "LEFT_SK"): False}
+    bench.cycle(shorten)
+    assert bench.active == {("FRAME_LENGTH", "LEFT_SK"): True}
+
+
+@pytest.mark.parametrize(
+    ("row", "message", "signal", "value", "code"),
+    [
+        (KNEE, "LEFT_SK_STATE", "Torque", np.nan, "SIGNAL_RANGE"),
+        (IMU, "IMU_PELVIS_STATE", "GyroX", np.nan, "IMU_INVALID"),
+    ],
+)
+def test_an_invalid_code_is_the_imus_own_diagnostic(row, message, signal, value, code):
+    bench = Bench()
+    bench.well()
+    bench.tx.values[bench.tx.codec.index(message, signal)] = value
+    timeout, node = MESSAGES[row].timeout_ms, MESSAGES[row].sender
+    bench.cycle(times=timeout - 1)
+    assert bench.active == {(code, node): False}
+    assert not bench.judgement.valid[row]
+    bench.cycle()
+    assert bench.active == {(code, node): True}
+
+
+def test_what_a_right_frame_says_does_not_fill_the_bucket(bench: Bench):
+    bench.well()
+    place = bench.tx.codec.index("IMU_PELVIS_STATE", "GyroX")
+    for _ in range(20):  # two bad of three
+        bench.tx.values[place] = np.nan
+        bench.cycle(times=2)
+        bench.tx.values[place] = 0.0
+        bench.cycle()
+    assert not any(event.code == "E2E_LOSS_RATE" for event in bench.memory.events)
+    assert bench.judgement.nodes_well
+
+
+def late(bench: Bench, row: int, by: int) -> Change:
+    """A node that answers each SYNC `by` cycles late."""
+    waiting: list[Frames] = []
+
+    def change(frames: Frames) -> Frames:
+        waiting.append(frames[[row]].copy())
+        kept = np.delete(frames, row)
+        return np.concatenate([kept, waiting.pop(0)]) if len(waiting) > by else kept
+
+    return change
+
+
+@pytest.mark.parametrize("by", [1, 2, 3, 4])
+def test_a_late_answer_is_used_with_its_age(bench: Bench, by: int):
+    bench.well().cycle(late(bench, KNEE, by), times=40)
+    assert bench.active == {("NODE_LATE", "LEFT_SK"): False}
+    assert bench.memory.active[Dtc.NODE_LATE, "LEFT_SK"].value == by
+    assert bench.image.age[KNEE] == by
+    assert bench.judgement.valid[KNEE]
+    assert bench.judgement.nodes_well
+
+
+@pytest.mark.parametrize("by", [5, 6])
+def test_an_answer_later_than_the_timeout_is_no_answer(bench: Bench, by: int):
+    bench.well().cycle(late(bench, KNEE, by), times=5)
+    assert bench.active == {("NODE_TIMEOUT", "LEFT_SK"): True}
+    bench.cycle(times=0)
+    change = late(bench, KNEE, by)
+    bench.well()
+    for _ in range(3):
+        bench.cycle(change, times=10)
+    assert bench.memory.active[Dtc.NODE_LATE, "LEFT_SK"].confirmed
+    assert bench.memory.active[Dtc.NODE_LATE, "LEFT_SK"].value == by
+    assert not bench.judgement.nodes_well
+
+
+def test_steady_loss_trips_the_bucket_and_the_pendants_is_not_the_nodes(bench: Bench):
+    bench.well()
+    loss = lose(KNEE, PENDANT)
+    for _ in range(5):
+        bench.cycle(loss, times=3).cycle()  # 55 in the bucket in the end
+    bench.cycle(loss, times=2)
+    assert bench.judgement.trusts(KNEE)
+    bench.cycle(loss)
+    assert bench.active == {("E2E_LOSS_RATE", "LEFT_SK"): True}
+    assert bench.memory.active[Dtc.E2E_LOSS_RATE, "LEFT_SK"].value == 64
+    assert not bench.judgement.nodes_well
+    assert not bench.judgement.trusts(PENDANT)
+
+
+def test_a_lost_pendant_is_no_lost_node(bench: Bench):
+    bench.well().cycle(lose(PENDANT), times=20)
+    assert bench.active == {}
+    assert bench.judgement.nodes_well
+    assert not bench.judgement.trusts(PENDANT)
+
+
+def test_what_is_implausible_is_not_valid_and_is_told_by_who_found_it(bench: Bench):
+    bench.well()
+    for age in range(1, 7):
+        bench.number += 1
+        frames = bench.tx.seal(bench.number & 0xFF)
+        bench.buffer[: len(frames)] = frames
+        bench.image.accept(bench.buffer, len(frames), bench.number & 0xFF)
+        bench.image.refuse(KNEE)
+        bench.judgement.judge(bench.number, bench.memory)
+        bench.memory.close_cycle(bench.number)
+        assert bench.image.check[KNEE] == Check.IMPLAUSIBLE
+        assert bench.image.age[KNEE] == age
+        assert not bench.judgement.valid[KNEE]
+        assert bench.judgement.trusts(KNEE) is (age < 5)
+    assert bench.active == {}
+
+
+def test_a_replayed_answer_does_not_disturb_the_next_one(bench: Bench):
+    bench.well()
+    old = bench.tx.frames[[KNEE]].copy()
+    bench.cycle(times=30)
+    bench.cycle(lambda frames: np.concatenate([old, frames]))
+    assert bench.active == {("E2E_SEQUENCE", "LEFT_SK"): False}
+    assert bench.judgement.valid[KNEE]
+    assert old["data"][0, COUNTER_BYTE] == 16
+
+
+def test_values_of_what_was_never_committed_have_no_age(bench: Bench):
+    bench.cycle(flip(KNEE))
+    assert bench.memory.events[0].value == 0
+    bench.well().cycle(flip(KNEE), times=2)
+    assert bench.memory.active[Dtc.E2E_CRC, "LEFT_SK"].value == 2
