@@ -15,6 +15,7 @@ from atalante_hal.diagnostics import Dtc
 from atalante_hal.types import SupervisorState
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.matrix import COLUMNS, SCENARIO, MatrixError, load_matrix
+from atalante_tools.faults.tasks import REPRESENTATIVES
 from atalante_tools.faults.verdict import Expectation
 
 TESTS = Path(__file__).parents[1]
@@ -69,6 +70,12 @@ def test_cases_are_told_apart_and_have_a_bound(scenario) -> None:
         assert Expectation.of(case, MATRIX[scenario.id]).reacted > 0
     if scenario.lasting is not None:
         assert scenario.lasting.ends is None
+
+
+def test_representatives_are_cases_of_a_dozen_faults() -> None:
+    assert len({id_ for id_, _ in REPRESENTATIVES}) == len(REPRESENTATIVES) >= 12
+    for id_, name in REPRESENTATIVES:
+        assert name in [case.name for case in SCENARIOS[id_].cases]
 
 
 def test_what_is_not_a_table_is_refused(tmp_path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 from atalante_hal.types import SupervisorState
@@ -30,6 +31,31 @@ SCENARIOS: Final = (
         lasting=Case("down", (Host("bus_down", 0, None),)),
     ),
     Scenario(
+        "F17",
+        (
+            Case("for 1 cycle", (Host("bus_full", 0, 1),), state=_ACTIVE),
+            Case("for 5 cycles", (Host("bus_full", 0, 5),)),
+            Case("for 200 cycles", (Host("bus_full", 0, 200),)),
+        ),
+        lasting=Case("full", (Host("bus_full", 0, None),)),
+    ),
+    Scenario(
+        "F37",
+        (
+            *(Case(f"{value} Nm", (Host("ask", 0, 3, value),)) for value in (math.nan, math.inf, -math.inf)),
+            *(Case(f"{value:g} Nm", (Host("ask", 0, 3, value),), state=_ACTIVE, dtc="") for value in (1e3, -1e300)),
+        ),
+    ),
+    Scenario(
+        "F43",
+        (
+            Case("4 ms", (Host("late", 0, 1, 4e-3),), state=_ACTIVE, noticed=1),
+            Case("6 ms", (Host("late", 0, 1, 6e-3),), reacted=1, noticed=1),
+            Case("2 s", (Host("late", 0, 1, 2.0),), reacted=1, noticed=1),
+        ),
+        lasting=None,
+    ),
+    Scenario(
         "F44",
         (
             Case("2 cycles", (Host("late", 0, 2, 1.5e-3),), state=_ACTIVE, dtc=""),
@@ -46,6 +72,7 @@ SCENARIOS: Final = (
                 for phase in (0.0, 0.5, 0.999, 1.0)
             ),
             *(Case(error, (Host("raise", value=error),)) for error in _ERRORS),
+            *(Case(f"asks for {count} torques", (Host("shape", value=count),)) for count in (0, 3, 13)),
         ),
     ),
 )

@@ -85,7 +85,7 @@ def observe(case: Case, bound: int, *, recovery: bool = True) -> Observation:
         recovery: whether the operator presses START when all is over.
     """
     moment = 1 if case.phase is None else walk_begins() + round(case.phase * stage().gait.duration / PERIOD)
-    quiet = moment + max(bound, case.ends or 0) + case.watched
+    quiet = moment + max(case.begins + bound, case.ends or 0) + case.watched
     case_run = _Run(case, moment)
     if recovery:
         case_run.presses[quiet].append("start")
@@ -166,7 +166,7 @@ class _Run:
         return Observation(
             network=shared.network,
             robot=shared.robot,
-            first=self._moment.struck or self._begins,
+            first=self._moment.struck or self._begins + self._case.begins,
             over=None if ends is None else self._begins + ends,
             pressed=pressed,
             states=tuple(self.states),

@@ -57,6 +57,7 @@ class Case:
     name: str  # what sets it apart from the other cases of its scenario
     happens: tuple[Happening, ...]  # `start` counts from the moment of the case
     phase: float | None = MID_SWING  # of the first step; None: from switching on
+    begins: int = 0  # first faulty cycle, counted from the moment of the case
     state: SupervisorState | None = None  # None: the row's, as for the three below
     dtc: str | None = None  # "": nothing to notice
     noticed: int | None = None  # cycles

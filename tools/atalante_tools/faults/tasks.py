@@ -26,8 +26,20 @@ HORIZON: Final = 1000
 APART: Final = 3
 #: One case of each kind of fault for the pairs: ID and name of the case.
 REPRESENTATIVES: Final = (
+    ("F03", "4 frames"),
+    ("F04", "LEFT_SK"),
+    ("F11", "several"),
+    ("F13", "one leg"),
+    ("F18", "back after 2 cycles"),
+    ("F25", "5 frames"),
+    ("F28", "100 mrad for good"),
+    ("F30", "IMU_LEFT_TIBIA"),
+    ("F36", "250 cycles"),
+    ("F38", "100 degC"),
+    ("F39", "130 degC"),
     ("F44", "3 cycles"),
     ("F45", "ValueError"),
+    ("F56", "dead-man released"),
 )
 
 

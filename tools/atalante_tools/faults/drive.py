@@ -1,0 +1,144 @@
+"""Faults of the drives and of what they are told: states, emergencies, heat, supply, commands that do not arrive."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from atalante_emulator.faults import Fault
+from atalante_hal.types import SupervisorState
+from atalante_tools.faults.checks import left_leg_holds_by_itself, limit_follows_the_heat
+from atalante_tools.faults.scenario import Case, Host, Scenario
+
+_S = SupervisorState
+_KNEE: Final = "LEFT_SK"
+_COMMAND: Final = "COMMAND_LEFT_LEG"
+#: Cycles in which a knee that its drive lets down has come to rest: not before can the drive be enabled again.
+_SUNK: Final = 4500
+
+SCENARIOS: Final = (
+    Scenario(
+        "F21",
+        tuple(
+            Case(
+                f"{what}, {code:#06x}",
+                (Fault("emergency", _KNEE, 0, 100, code=code),),
+                state=state,
+                dtc=dtc,
+                node=_KNEE,
+                watched=watched,
+            )
+            for what, code, state, dtc, watched in (
+                ("current", 0x2310, _S.FAULT, "EMCY_2310", _SUNK),
+                ("voltage", 0x3210, _S.HOLD, "EMCY_3210", 60),
+                ("temperature", 0x4210, _S.LOWER, "OVER_TEMP", _SUNK),
+                ("encoder", 0x7305, _S.LOWER, "EMCY_7305", _SUNK),
+                ("communication", 0x8100, _S.HOLD, "EMCY_8100", 60),
+                ("software", 0x6100, _S.FAULT, "EMCY_6100", 60),
+            )
+        ),
+    ),
+    Scenario(
+        "F22",
+        (
+            *(
+                Case(state, (Fault("leave_operation", _KNEE, 0, 1, state=state),), node=_KNEE)
+                for state in (
+                    "NOT_READY_TO_SWITCH_ON",
+                    "SWITCH_ON_DISABLED",
+                    "READY_TO_SWITCH_ON",
+                    "SWITCHED_ON",
+                    "QUICK_STOP_ACTIVE",
+                )
+            ),
+            *(
+                Case(
+                    state,
+                    (Fault("leave_operation", _KNEE, 0, 1, state=state),),
+                    state=_S.FAULT,
+                    dtc="DRIVE_FAULT",
+                    node=_KNEE,
+                )
+                for state in ("FAULT_REACTION_ACTIVE", "FAULT")
+            ),
+        ),
+    ),
+    Scenario(
+        "F23",
+        (
+            Case("of one leg", (Fault("drop", "SYNC_LEFT_LEG", 0, 50),), checks=(left_leg_holds_by_itself,)),
+            Case(
+                "of all",
+                tuple(
+                    Fault("drop", f"SYNC_{side}_{part}", 0, 50)
+                    for side in ("LEFT", "RIGHT")
+                    for part in ("LEG", "SENSE")
+                ),
+                checks=(left_leg_holds_by_itself,),
+            ),
+        ),
+        lasting=Case("of one leg", (Fault("drop", "SYNC_LEFT_LEG"),)),
+    ),
+    # The next frame that comes tells that some are missing.
+    Scenario("F24", tuple(Case(f"{n} frames", (Fault("drop", _COMMAND, 0, n),), noticed=n + 1) for n in range(1, 5))),
+    Scenario(
+        "F25",
+        (
+            Case("5 frames", (Fault("drop", _COMMAND, 0, 5),), checks=(left_leg_holds_by_itself,)),
+            Case("200 frames", (Fault("drop", _COMMAND, 0, 200),), checks=(left_leg_holds_by_itself,)),
+            Case("for good", (Fault("drop", _COMMAND),), recovers=False, checks=(left_leg_holds_by_itself,)),
+        ),
+        lasting=Case("left leg", (Fault("drop", _COMMAND),)),
+    ),
+    Scenario(
+        "F26",
+        (
+            *(Case(f"{bits} bits, 4 frames", (Fault("flip", _COMMAND, 0, 4, bits=bits),)) for bits in (1, 2, 16)),
+            Case("one in ten", (Fault("flip", _COMMAND, 0, 300, p=0.1),), noticed=60),
+        ),
+        lasting=Case("every frame", (Fault("flip", _COMMAND),)),
+    ),
+    Scenario(
+        "F36",
+        (
+            Case("250 cycles", (Host("shake", 0, 250, 1000.0),)),
+            Case("100 cycles", (Host("shake", 0, 100, 1000.0),), state=_S.ACTIVE),
+        ),
+        lasting=Case("shaken by 1000 Nm", (Host("shake", 0, None, 1000.0),)),
+    ),
+    Scenario(
+        "F38",
+        (
+            Case(
+                "100 degC",
+                (Fault("over_temperature", _KNEE, 0, 400, degrees=100.0),),
+                node=_KNEE,
+                checks=(limit_follows_the_heat,),
+            ),
+            Case(
+                "up to 105 degC, 1 K a cycle",  # 90 degC are reached in cycle 65
+                (Fault("heat_ramp", _KNEE, 0, 400, rate=1000.0, up_to=105.0),),
+                node=_KNEE,
+                noticed=70,
+                checks=(limit_follows_the_heat,),
+            ),
+        ),
+    ),
+    Scenario(
+        "F39",
+        (Case("130 degC", (Fault("over_temperature", _KNEE, 0, 200, degrees=130.0),), node=_KNEE, recovers=False),),
+    ),
+    Scenario(
+        "F40",
+        (
+            Case("30 V", (Fault("under_voltage", "battery", 0, 200, volts=30.0),)),
+            Case("one drive", (Fault("under_voltage", _KNEE, 0, 200, volts=30.0),), node=_KNEE),
+            Case(
+                "battery removed",
+                (Fault("battery_removed", "battery", 0, 300),),
+                dtc="SUPPLY_LOW|UNDER_VOLTAGE",
+                noticed=150,
+                reacted=200,
+            ),
+        ),
+    ),
+)

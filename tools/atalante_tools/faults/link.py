@@ -1,0 +1,204 @@
+"""Faults of the wire: frames that are lost, come twice, late, damaged or from somebody else."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from atalante_emulator.faults import Fault
+from atalante_hal.robot import JOINTS
+from atalante_hal.types import SupervisorState
+from atalante_tools.faults.checks import data_stays_fresh, guide_kept, left_leg_holds_by_itself
+from atalante_tools.faults.scenario import Case, Scenario
+
+_HOLD: Final = SupervisorState.HOLD
+_ACTIVE: Final = SupervisorState.ACTIVE
+_OFF: Final = SupervisorState.OFF
+_BUSES: Final = ("left_leg", "right_leg", "left_sense", "right_sense")
+#: The node and message at which faults of one message are shown.
+_KNEE: Final = "LEFT_SK"
+_STATE: Final = "LEFT_SK_STATE"
+_COMMAND: Final = "COMMAND_LEFT_LEG"
+_DRIVES: Final = tuple(joint.upper() for joint in JOINTS)
+
+
+def _lost(name: str, message: str, frames: int | None, *, node: str, recovers: bool = True) -> Case:
+    return Case(name, (Fault("drop", message, 0, frames),), node=node, recovers=recovers)
+
+
+SCENARIOS: Final = (
+    Scenario(
+        "F01",
+        (
+            _lost("one frame", _STATE, 1, node=_KNEE),
+            *(
+                Case(
+                    f"1 % of all, seed {seed}",
+                    tuple(Fault("drop", bus, 0, 1500, p=0.01) for bus in _BUSES),
+                    noticed=1500,
+                    seed=seed,
+                    checks=(guide_kept,),
+                )
+                for seed in range(3)
+            ),
+        ),
+    ),
+    Scenario(
+        "F02",
+        (
+            Case(
+                "10 %",
+                (Fault("drop", _KNEE, 0, 1000, p=0.1),),
+                state=_ACTIVE,
+                dtc="",
+                noticed=1,
+                reacted=1,
+                checks=(guide_kept,),
+            ),
+            *(
+                Case(
+                    f"{p:.0%}, seed {seed}",
+                    (Fault("drop", _KNEE, 0, within, p=p),),
+                    dtc="E2E_LOSS_RATE|NODE_TIMEOUT",
+                    node=_KNEE,
+                    noticed=within,
+                    reacted=within,
+                    seed=seed,
+                    checks=(guide_kept,),
+                )
+                for p, within in ((0.2, 3000), (0.3, 400), (0.4, 200), (0.5, 150))
+                for seed in range(2)
+            ),
+        ),
+    ),
+    Scenario("F03", tuple(_lost(f"{n} frames", _STATE, n, node=_KNEE) for n in range(1, 5))),
+    Scenario(
+        "F04",
+        tuple(_lost(drive, f"{drive}_STATE", 5, node=drive) for drive in _DRIVES),
+        lasting=_lost("for good", _STATE, None, node=_KNEE, recovers=False),
+    ),
+    Scenario(
+        "F05",
+        (Case(_KNEE, (Fault("duplicate", _STATE, 0, 50),), node=_KNEE, checks=(data_stays_fresh,)),),
+        lasting=Case("for good", (Fault("duplicate", _STATE),)),
+    ),
+    Scenario(
+        "F06",
+        (
+            Case("0 cycles", (), dtc="", state=_ACTIVE, watched=200),
+            # Silence at first; the first frame that comes says that it is late.
+            *(
+                Case(f"{k} cycles", (Fault("delay", _STATE, 0, 200, by=k),), node=_KNEE, noticed=k + 1, state=_ACTIVE)
+                for k in range(1, 5)
+            ),
+            *(Case(f"{k} cycles", (Fault("delay", _STATE, 0, 200, by=k),), node=_KNEE, noticed=k + 1) for k in (5, 6)),
+        ),
+        lasting=Case("by 4 cycles, for good", (Fault("delay", _STATE, 0, None, by=4),)),
+    ),
+    # The counter of the first of these frames is right.
+    Scenario(
+        "F07",
+        (
+            Case(
+                "4 cycles",
+                (Fault("freeze_counter", _STATE, 0, 5),),
+                begins=1,
+                dtc="E2E_REPEATED",
+                noticed=1,
+                state=_ACTIVE,
+            ),
+            Case("50 cycles", (Fault("freeze_counter", _STATE, 0, 51),), begins=1, node=_KNEE),
+        ),
+        lasting=Case("for good", (Fault("freeze_counter", _STATE),)),
+    ),
+    Scenario(
+        "F08",
+        (
+            *(
+                Case(f"{bits} bits", (Fault("flip", _STATE, 0, 4, bits=bits),), node=_KNEE)
+                for bits in (1, 2, 3, 4, 8, 64)
+            ),
+            Case("5 cycles", (Fault("flip", _STATE, 0, 5),), state=_HOLD, reacted=5, node=_KNEE),
+        ),
+        lasting=Case("for good", (Fault("flip", _STATE),)),
+    ),
+    Scenario(
+        "F09",
+        (Case("another knee", (Fault("masquerade", _STATE, 0, 4, like="RIGHT_SK_STATE"),), node=_KNEE),),
+        lasting=Case("for good", (Fault("masquerade", _STATE, like="RIGHT_SK_STATE"),)),
+    ),
+    Scenario(
+        "F10",
+        (
+            *(Case(f"{n} bytes", (Fault("length", _STATE, 0, 4, bytes=n),), node=_KNEE) for n in (0, 8, 16, 64)),
+            Case("classic CAN", (Fault("flags", _STATE, 0, 4, flags=0),), node=_KNEE),
+        ),
+        lasting=Case("for good", (Fault("length", _STATE, bytes=8),)),
+    ),
+    Scenario(
+        "F11",
+        tuple(
+            Case(name, (Fault("foreign", "left_leg", 0, 200, can_id=can_id, count=count),))
+            for name, can_id, count in (
+                ("lowest priority", 0x7FF, 1),
+                ("several", 0x500, 8),
+                ("extended", 0x1234567, 1),
+            )
+        ),
+        lasting=Case("for good", (Fault("foreign", "left_leg", can_id=0x7FF),)),
+    ),
+    Scenario(
+        "F12",
+        (
+            Case("no such drive state", (Fault("raw", _STATE, 0, 4, DriveState=255),), node=_KNEE),
+            Case("invalid position", (Fault("raw", _STATE, 0, 4, Position=1 << 23),), node=_KNEE),
+        ),
+        lasting=Case("for good", (Fault("raw", _STATE, Position=1 << 23),)),
+    ),
+    Scenario(
+        "F13",
+        (
+            Case("one leg", (Fault("flood", "left_leg", 0, 100),), checks=(left_leg_holds_by_itself,)),
+            Case("a sensor bus", (Fault("flood", "right_sense", 0, 100),), reacted=10),
+            Case("a leg for good", (Fault("flood", "left_leg"),), recovers=False, checks=(left_leg_holds_by_itself,)),
+        ),
+        lasting=Case("one leg", (Fault("flood", "left_leg"),)),
+    ),
+    Scenario(
+        "F14",
+        (
+            Case("another HAL's SYNC", (Fault("inject", "SYNC_LEFT_LEG", 0, 20),)),
+            Case(
+                "there before it starts",
+                (Fault("inject", "SYNC_LEFT_LEG", 2),),
+                None,
+                reacted=1,
+                noticed=300,
+                state=_OFF,
+                recovers=False,
+                watched=300,
+            ),
+        ),
+        lasting=Case("another HAL's SYNC", (Fault("inject", "SYNC_LEFT_LEG"),)),
+    ),
+    Scenario(
+        "F15",
+        (
+            Case("for good", (Fault("bus_off", "left_leg"),), recovers=False),
+            Case("for 100 cycles", (Fault("bus_off", "left_leg", 0, 100),)),
+        ),
+        lasting=Case("one bus", (Fault("bus_off", "left_leg"),)),
+    ),
+    Scenario(
+        "F51",
+        (
+            Case(
+                "right counter, 200 Nm",
+                (Fault("inject", _COMMAND, 0, 20, SK_TargetTorque=200.0),),
+                checks=(left_leg_holds_by_itself,),
+            ),
+            Case("counter 5 ahead", (Fault("inject", _COMMAND, 0, 20, ahead=5, SK_TargetTorque=-200.0),)),
+            Case("one frame", (Fault("inject", _COMMAND, 0, 1, SK_TargetTorque=200.0),)),
+        ),
+        lasting=Case("for good", (Fault("inject", _COMMAND, SK_TargetTorque=200.0),)),
+    ),
+)

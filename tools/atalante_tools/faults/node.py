@@ -1,0 +1,89 @@
+"""Faults of whole nodes: off, silent, begun anew, with another DBC."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from atalante_emulator.faults import Fault
+from atalante_hal.robot import FEET, IMUS, JOINTS
+from atalante_hal.types import SupervisorState
+from atalante_tools.faults.checks import not_enabled_in_motion
+from atalante_tools.faults.scenario import Case, Press, Scenario
+
+_KNEE: Final = "LEFT_SK"
+_ACTIVE: Final = SupervisorState.ACTIVE
+_HOLD: Final = SupervisorState.HOLD
+_DRIVES: Final = tuple(joint.upper() for joint in JOINTS)
+_SENSORS: Final = (*(f"IMU_{name.upper()}" for name in IMUS), *(f"FOOT_{name.upper()}" for name in FEET))
+#: Cycles: timeout of IMUs and feet; status period and the heartbeat timeout.
+_SENSOR_TIMEOUT: Final = 10
+_HEARTBEAT: Final = 250
+
+SCENARIOS: Final = (
+    Scenario(
+        "F18",
+        (
+            *(
+                Case(
+                    f"at {phase / 10:.0%} of a step",
+                    (Fault("reset", _KNEE, 0, 30),),
+                    phase / 10,
+                    node=_KNEE,
+                    noticed=32,
+                    checks=(not_enabled_in_motion,),
+                )
+                for phase in range(10)
+            ),
+            Case("back after 2 cycles", (Fault("reset", _KNEE, 0, 2),), node=_KNEE, checks=(not_enabled_in_motion,)),
+        ),
+    ),
+    Scenario(
+        "F19",
+        (
+            *(Case(drive, (Fault("silence", drive),), node=drive, recovers=False) for drive in _DRIVES),
+            *(
+                Case(
+                    sensor,
+                    (Fault("silence", sensor),),
+                    noticed=_SENSOR_TIMEOUT,
+                    reacted=_SENSOR_TIMEOUT,
+                    node=sensor,
+                    recovers=False,
+                )
+                for sensor in _SENSORS
+            ),
+        ),
+        lasting=Case("IMU_TORSO", (Fault("silence", "IMU_TORSO"),)),
+    ),
+    Scenario(
+        "F20",
+        (
+            Case("of a drive", (Fault("heartbeat_lost", _KNEE),), node=_KNEE, watched=300),
+            Case("of a foot", (Fault("heartbeat_lost", "FOOT_LEFT"),), node="FOOT_LEFT", watched=300),
+            Case(
+                "no start without it",
+                (Fault("heartbeat_lost", _KNEE), Press("stop", 400)),
+                state=_HOLD,
+                reacted=401,
+                node=_KNEE,
+                recovers=False,
+            ),
+            Case(
+                "a start when it is back",
+                (Fault("heartbeat_lost", _KNEE, 0, 420), Press("stop", 400)),
+                state=_HOLD,
+                reacted=401,
+                node=_KNEE,
+                watched=150,
+            ),
+        ),
+        lasting=Case("for good", (Fault("heartbeat_lost", _KNEE),)),
+    ),
+    Scenario(
+        "F53",
+        tuple(
+            Case(node, (Fault("dbc_hash", node),), None, noticed=300, reacted=1, node=node, recovers=False, watched=300)
+            for node in (_KNEE, "IMU_PELVIS", "FOOT_RIGHT", "HAPTICS", "PENDANT")
+        ),
+    ),
+)
