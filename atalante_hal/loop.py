@@ -57,7 +57,9 @@ class WallClock:
         now = self._now()
         if now < self._next:
             self._sleep(self._next - now)
-            return max(0.0, self._now() - self._next)
+            now = self._now()
+            if now <= self._next + self._period:
+                return max(0.0, now - self._next)
         late = now - self._next
         self._next = now
         return late

@@ -18,7 +18,7 @@ from atalante_hal.image import ReceiveImage, TransmitImage
 from atalante_hal.types import SupervisorState
 
 NETWORK = atalante_dbc.load()
-IMAGES = images(NETWORK)
+IMAGES = {name: messages for name, (messages, _) in images(NETWORK).items()}
 
 
 @pytest.mark.parametrize("name", IMAGES)

@@ -131,3 +131,24 @@ def test_deadlines_are_absolute_and_a_missed_one_is_not_made_up_for():
     now[0] += 0.2e-3
     clock.wait()
     assert slept[-1] == pytest.approx(0.8e-3)
+
+
+def test_who_oversleeps_makes_no_cycle_up_either():
+    """As a process that was stopped in its sleep."""
+    now, oversleeps = [0.0], [0.0]
+
+    def sleep(seconds: float) -> None:
+        now[0] += seconds + oversleeps[0]
+
+    clock = WallClock(1e-3, now=lambda: now[0], sleep=sleep)
+    oversleeps[0] = 20e-3
+    assert clock.wait() == pytest.approx(20e-3)
+    oversleeps[0] = 0.0
+    for cycle in range(3):
+        assert clock.wait() == pytest.approx(0.0, abs=1e-12), cycle
+    assert now[0] == pytest.approx(24e-3)
+    oversleeps[0] = 0.5e-3  # less than a period: the deadlines stay where they are
+    assert clock.wait() == pytest.approx(0.5e-3)
+    oversleeps[0] = 0.0
+    assert clock.wait() == pytest.approx(0.0, abs=1e-12)
+    assert now[0] == pytest.approx(26e-3)

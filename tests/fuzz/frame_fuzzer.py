@@ -38,6 +38,8 @@ from atalante_tools.terminal import Progress, say
 SWEEP = 2048 * 65 * 8  # identifiers, lengths, flags (BRS, ESI, FDF)
 #: Frames one `receive` of HAL and emulator can take.
 RECEIVE_BUDGET = 128
+#: Of the frames at each end, those that go to the whole HAL and the whole robot; the others go to their process images.
+ROBOT_SHARE = 0.1
 SHARES = (0.2, 0.2, 0.45, 0.15)  # sweep, anything, damaged, sealed again
 
 
@@ -303,13 +305,14 @@ def fuzzed_robot(seed: int) -> Iterator[FuzzedRobot]:
         body.close()
 
 
-def images(network: Network) -> dict[str, list[Message]]:
-    """Every process image of the stack: its name and its messages."""
+def images(network: Network) -> dict[str, tuple[list[Message], float]]:
+    """Every process image of the stack: its messages, and its share of the frames of its end."""
     heard = network.received_by("HAL")
+    whole = 1.0 - ROBOT_SHARE
     return {
-        "HAL, every cycle": [m for m in heard if m.cycle_ms == 1],
-        "HAL, slow": [m for m in heard if m.cycle_ms != 1],
-        "nodes": [m for m in network.sent_by("HAL") if m.cycle_ms == 1],
+        "HAL, every cycle": ([m for m in heard if m.cycle_ms == 1], 0.5 * whole),
+        "HAL, slow": ([m for m in heard if m.cycle_ms != 1], 0.5 * whole),
+        "nodes": ([m for m in network.sent_by("HAL") if m.cycle_ms == 1], whole),
     }
 
 
@@ -322,23 +325,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     progress = Progress()
     begun = time.monotonic()
 
-    def show(what: str, tally: Tally) -> None:
+    def show(what: str, tally: Tally, frames: int) -> None:
         if progress.due():
-            progress.show(f"{what}: {tally.frames:,} of {wanted.frames:,} frames, {time.monotonic() - begun:.0f} s")
+            progress.show(f"{what}: {tally.frames:,} of {frames:,} frames, {time.monotonic() - begun:.0f} s")
 
     def tell(what: str, tally: Tally, more: str = "") -> None:
         progress.clear()
         say(f"{what}: {tally.frames:,} frames in {tally.cycles:,} cycles, {time.monotonic() - begun:.0f} s{more}")
 
     try:
-        for name, messages in images(atalante_dbc.load()).items():
-            for tally in fuzz_image(messages, wanted.frames, wanted.seed, _room(messages)):
-                show(f"image {name}", tally)
+        for name, (messages, share) in images(atalante_dbc.load()).items():
+            frames = round(share * wanted.frames)
+            for tally in fuzz_image(messages, frames, wanted.seed, min(100, RECEIVE_BUDGET - len(messages))):
+                show(f"image {name}", tally, frames)
             tell(f"image {name}", tally, f", {tally.intact:,} of them intact")
         with fuzzed_robot(wanted.seed) as robot:
-            while robot.tally.frames < wanted.frames:
+            while robot.tally.frames < ROBOT_SHARE * wanted.frames:
                 robot.cycle(100)
-                show("HAL and nodes", robot.tally)
+                show("HAL and nodes", robot.tally, round(ROBOT_SHARE * wanted.frames))
             seen = ", ".join(state.name for state in sorted(robot.states_seen))
             tell("HAL and nodes, at each end", robot.tally, f"; the HAL was in {seen}")
     except Finding as finding:
@@ -346,10 +350,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         say(str(finding))
         return 1
     return 0
-
-
-def _room(messages: Sequence[Message]) -> int:
-    return min(100, RECEIVE_BUDGET - len(messages))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,342 @@
+"""The HAL as a process that is killed, stopped or paused: F41, F42, F43. The robot is emulated in the test, at the other end of
+a bus in shared memory, and its drives own the last line.
+
+What the HAL takes for the wall clock is a number in shared memory that the test moves on: a stopped process misses exactly the
+milliseconds it is meant to miss, however busy the machine is.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import mmap
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import atalante_dbc
+from atalante_emulator.body import PyBulletBody
+from atalante_emulator.drive import WATCHDOG
+from atalante_emulator.emulator import Emulator
+from atalante_emulator.pendant import Operator
+from atalante_hal.bus import BusDown
+from atalante_hal.bus.shared import SharedBus, descriptors
+from atalante_hal.cia402 import DriveState
+from atalante_hal.loop import GAP_TO_HOLD, OVERRUNS_TO_HOLD, WallClock, run
+from atalante_hal.memory import anonymous_file
+from atalante_hal.robot import Robot
+from atalante_hal.types import Command, State, SupervisorState
+
+#: Loads everything once; for each line `memory bell`, a child drives that bus until it is told to end, and says how it went.
+DRIVER = """
+import json, mmap, os, signal, sys, time
+import atalante_dbc
+from atalante_control.controller import HangController
+from atalante_control.gait import HANG_GAIT, load_gait
+from atalante_control.guide_shapes import SHAPES
+from atalante_hal.bus.shared import SharedBus
+from atalante_hal.hal import Hal
+from atalante_hal.loop import LockStep, WallClock, run
+from atalante_hal.robot import load_robot
+
+network, robot = atalante_dbc.load(), load_robot()
+controller = HangController(robot, load_gait(HANG_GAIT, robot), SHAPES["constant"])
+signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+wall = None if sys.argv[1] == "-1" else memoryview(mmap.mmap(int(sys.argv[1]), 8)).cast("d")
+
+class Time:
+    def now(self):
+        self.last = wall[0]
+        return self.last
+
+    def sleep(self, seconds):  # from when the clock was read: it may have moved on since
+        while wall[0] < self.last + seconds - 1e-9:
+            time.sleep(1e-4)
+
+def drive(memory, bell):
+    over = []
+    signal.signal(signal.SIGTERM, lambda *_: over.append(1))
+    bus = SharedBus("shared", memory, bell, 0)
+    bus.patience = 30.0 if wall is None else 0.0
+    told = Time()
+    clock = LockStep() if wall is None else WallClock(now=told.now, sleep=told.sleep)
+    hal = Hal(network, robot, bus, patience=2.0, controller_fields=controller.telemetry_fields)
+    at_end = []
+    def until(state):
+        at_end[:] = [state.supervisor.name]
+        return bool(over)
+    run(hal, controller, clock, until=until)
+    print(json.dumps({"state": at_end[0], "events": [[e.code, e.cycle, e.value] for e in hal.events]}), flush=True)
+
+print("ready", flush=True)
+for line in sys.stdin:
+    memory, bell = map(int, line.split())
+    if not (child := os.fork()):
+        drive(memory, bell)
+        os._exit(0)
+    os.close(memory)
+    os.close(bell)
+    print(child, flush=True)
+"""
+
+
+class Driver:
+    """The process that starts HALs, one for each of so many buses made beforehand."""
+
+    def __init__(self, buses: int, wall: int) -> None:
+        self._pairs = [descriptors() for _ in range(buses)]
+        fds = [fd for memory, ours, _ in self._pairs for fd in (memory, ours)]
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", DRIVER, str(wall)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            bufsize=1,
+            pass_fds=[*fds, wall][: len(fds) + (wall >= 0)],
+        )
+        assert self.said() == "ready"
+
+    def said(self) -> str:
+        assert self._process.stdout is not None
+        return self._process.stdout.readline().strip()
+
+    def start(self) -> tuple[int, SharedBus]:
+        """A HAL that drives; its process and the robot's end of its bus."""
+        memory, ours, theirs = self._pairs.pop(0)
+        bus = SharedBus("the robot's bus", os.dup(memory), theirs, 1)
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{memory} {ours}\n")
+        pid = int(self.said())
+        os.close(memory)
+        os.close(ours)
+        return pid, bus
+
+    def close(self) -> None:
+        for pair in self._pairs:
+            for fd in pair:
+                os.close(fd)
+        self._process.kill()
+        for pipe in (self._process.stdin, self._process.stdout):
+            assert pipe is not None
+            pipe.close()
+        self._process.wait()
+
+
+@contextmanager
+def driver(buses: int = 1, wall: int = -1) -> Iterator[Driver]:
+    """HALs in lock-step, or on the clock in the memory of the descriptor `wall`."""
+    made = Driver(buses, wall)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+@contextmanager
+def robot_on(bus: SharedBus, robot: Robot, urdf_text: str) -> Iterator[Emulator]:
+    body = PyBulletBody(urdf_text)
+    try:
+        yield Emulator(atalante_dbc.load(), robot, body, bus, operator=Listener())
+    finally:
+        body.close()
+        bus.close()
+
+
+class Listener(Operator):
+    """Knows what state the HAL says it is in, and is quick to start it."""
+
+    REACTION = 5
+    hal_state = SupervisorState.OFF
+
+    def hear(self, hal_state: int) -> None:
+        self.hal_state = SupervisorState(hal_state)
+        super().hear(hal_state)
+
+
+def enabled(emulator: Emulator) -> bool:
+    return set(emulator.drives.state) == {DriveState.OPERATION_ENABLED}
+
+
+def test_f41_killed_at_twenty_phases_of_the_gait_every_drive_holds_within_five_cycles(
+    robot: Robot, urdf_text: str
+) -> None:
+    with driver(buses=20) as hals:
+        for phase in range(20):
+            pid, bus = hals.start()
+            with robot_on(bus, robot, urdf_text) as emulator:
+                _kill_in_the_air(emulator, bus, pid, cycles=40 * phase + 1)
+                moving_at = emulator.body.velocity.copy()
+                for _ in range(WATCHDOG):
+                    assert enabled(emulator), phase
+                    emulator._alone()  # a millisecond without SYNC
+                assert set(emulator.drives.state) == {DriveState.QUICK_STOP_ACTIVE}, phase
+                assert all(emulator.drives.latched), phase
+                held = emulator.body.position.copy()
+                for _ in range(300):
+                    emulator.idle()
+                assert set(emulator.drives.state) == {DriveState.QUICK_STOP_ACTIVE}, phase
+                # No joint sags: it stops where it was, but for the way it needs to stop.
+                assert (abs(emulator.body.position - held) < 0.02 + 0.05 * abs(moving_at)).all(), phase
+                assert abs(emulator.body.velocity).max() < 0.1, phase
+
+
+def _kill_in_the_air(emulator: Emulator, bus: SharedBus, pid: int, cycles: int) -> None:
+    """Drive until that many cycles after the drives are enabled, then SIGKILL."""
+    counted = 0
+
+    def step() -> None:
+        nonlocal counted
+        emulator.poll()
+        counted += enabled(emulator)
+        if counted == cycles:
+            os.kill(pid, signal.SIGKILL)
+
+    with suppress(BusDown):
+        bus.serve(step)
+    assert counted >= cycles
+
+
+class World:
+    """The robot and the HAL's clock: time goes by when the test says so."""
+
+    def __init__(self, emulator: Emulator, clock: memoryview) -> None:
+        self.emulator, self._clock = emulator, clock
+
+    def millisecond(self) -> None:
+        """One cycle of HAL and robot."""
+        self._clock[0] += 1e-3
+        assert self.synced(60.0), "the HAL sent no SYNC"
+
+    def synced(self, timeout: float) -> bool:
+        """Answer the next SYNC; before it come the commands of the cycle before."""
+        give_up = time.monotonic() + timeout
+        while time.monotonic() < give_up:
+            if self.emulator.poll(give_up - time.monotonic()):
+                return True
+        return False
+
+    def alone(self, milliseconds: int) -> None:
+        """Time goes by and the HAL does nothing."""
+        self._clock[0] += milliseconds * 1e-3
+        for _ in range(milliseconds):
+            self.emulator._alone()
+
+
+@pytest.mark.parametrize("milliseconds", [3, 20, 2000])
+def test_f42_stopped_and_continued_there_is_no_burst_and_a_gap_over_five_milliseconds_ends_in_hold(
+    milliseconds: int, robot: Robot, urdf_text: str
+) -> None:
+    wall = anonymous_file("clock", 8)
+    clock = memoryview(mmap.mmap(wall, 8)).cast("d")
+    with driver(wall=wall) as hals:
+        pid, bus = hals.start()
+        with robot_on(bus, robot, urdf_text) as emulator:
+            operator, world = emulator.operator, World(emulator, clock)
+            assert isinstance(operator, Listener)
+            while operator.hal_state is not SupervisorState.ACTIVE:
+                world.millisecond()
+            for _ in range(50):
+                world.millisecond()
+            os.kill(pid, signal.SIGSTOP)
+            _wait_until_stopped(pid)
+            world.alone(milliseconds)
+            holds = milliseconds >= WATCHDOG
+            assert set(emulator.drives.state) == {
+                DriveState.QUICK_STOP_ACTIVE if holds else DriveState.OPERATION_ENABLED
+            }
+            os.kill(pid, signal.SIGCONT)
+            # It wakes, makes the cycle it owes, and waits for the next: none of the others is made up for.
+            assert world.synced(60.0)
+            assert not world.synced(0.2)
+            for _ in range(50):
+                world.millisecond()
+            assert operator.hal_state is (SupervisorState.HOLD if holds else SupervisorState.ACTIVE)
+            assert enabled(emulator) is not holds
+            os.kill(pid, signal.SIGTERM)
+            with suppress(BusDown):
+                while True:
+                    world.millisecond()
+        told = json.loads(hals.said())
+    gaps = [value for code, _, value in told["events"] if code == "CYCLE_GAP"]
+    assert gaps == [pytest.approx((milliseconds - 1) * 1e-3)]  # the deadline was a millisecond ahead
+    os.close(wall)
+
+
+def _wait_until_stopped(pid: int) -> None:
+    while Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "T":
+        time.sleep(0.001)
+
+
+class Pausing:
+    """Holds the pose; once it does something else first."""
+
+    telemetry, telemetry_fields = np.zeros(0), ()
+
+    def __init__(self, pause: Callable[[], Any]) -> None:
+        self._pause, self._updates = pause, 0
+
+    def reset(self, state: State) -> None:
+        self._pose = state.position.copy()
+
+    def update(self, state: State) -> Command:
+        self._updates += 1
+        if self._updates == 20:
+            self._pause()
+        return Command(2000.0 * (self._pose - state.position) - 80.0 * state.velocity, np.zeros(8))
+
+    @property
+    def done(self) -> bool:
+        return self._updates > 20
+
+    @property
+    def quiet_for(self) -> int:
+        """Updates since it did something else."""
+        return self._updates - 20
+
+
+def collect_garbage() -> None:
+    """A collection that takes long: many objects that live."""
+    many = [[number] for number in range(400_000)]
+    begun = time.perf_counter()
+    while time.perf_counter() < begun + 0.01:
+        gc.collect()
+    many.clear()
+
+
+@pytest.mark.parametrize(
+    ("pause", "ends_in_hold"),
+    [(lambda: time.sleep(0.004), False), (lambda: time.sleep(0.0075), True), (collect_garbage, True)],
+    ids=["4 ms", "6.5 ms late", "garbage collection"],
+)
+def test_f43_a_pause_of_over_five_milliseconds_ends_in_hold_a_shorter_one_is_noted(
+    make_rig: Callable[..., Any], pause: Callable[[], Any], ends_in_hold: bool
+) -> None:
+    rig = make_rig()
+    rig.until(SupervisorState.READY)
+    controller, seen = Pausing(pause), []
+    rig.operator.start()
+
+    def until(state: State) -> bool:
+        seen.append(state.supervisor)
+        if not controller.done and state.supervisor is SupervisorState.HOLD:
+            rig.operator.start()  # a busy machine
+        return controller.done and (seen[-1] is SupervisorState.HOLD or controller.quiet_for > 50)
+
+    statistics = run(rig.hal, controller, WallClock(), until=until)
+    gaps = [event.value for event in rig.hal.events if event.code == "CYCLE_GAP"]
+    assert gaps
+    assert statistics.overruns >= 1
+    if ends_in_hold:
+        assert max(gaps) > GAP_TO_HOLD
+        assert seen[-1] is SupervisorState.HOLD
+    elif seen[-1] is SupervisorState.HOLD:  # the machine made it longer, or there were three in a row
+        assert max(gaps) > GAP_TO_HOLD or statistics.overruns >= OVERRUNS_TO_HOLD
