@@ -28,6 +28,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
         "atalante_hal/robot.toml",
         "atalante_hal/telemetry/messages.binpb",
         "atalante_control/gaits/hang.json",
+        "atalante_control/gaits/network.npz",
         "atalante_emulator/emulator.py",
         "atalante_tools/cli.py",
         *(f"atalante_{package}/py.typed" for package in ("dbc", "hal", "control", "emulator", "tools")),

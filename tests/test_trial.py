@@ -191,3 +191,32 @@ def test_a_signal_ends_in_hold_with_its_code_and_keeps_what_was_walked(number, c
         ]
     assert states[-1] == "HOLD"
     assert json.loads((tmp_path / "summary.json").read_text())["shapes"][0]["shape"] == "constant"
+
+
+def test_a_patient_s_gait_of_the_network_is_walked_inside_a_certified_guide(tmp_path: Path):
+    done = atalante("demo", "--shape", "pinched", "--steps", "2", "--mass", "75", "--height", "175", "--step-length", "0.16",
+                    "--step-duration", "0.8", "--out", str(tmp_path), "--json")  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "gait of the network: 75 kg, 1.75 m, step 0.16 m in 0.8 s" in done.stderr
+    result = json.loads(done.stdout)
+    assert result["certified"]
+    assert result["max_ratio"] < 1.0
+    assert result["inside"] == 1.0
+    assert json.loads((tmp_path / "summary.json").read_text())["subject"]["step_length"] == 0.16
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (["--mass", "110", "--height", "175"], 1, "the gait network knows a mass from 58 to 91 kg, not 110 kg"),
+        (["--mass", "75", "--height", "175", "--step-length", "0.35"], 1, "a step length from 0.1 to 0.2 m"),
+        (["--mass", "75"], 2, "a patient needs --mass and --height"),
+        (["--step-length", "0.15"], 2, "needs a patient"),
+        (["--mass", "75", "--height", "175", "--step-duration", "0.85123"], 2, "a whole number of milliseconds"),
+    ],
+)
+def test_a_subject_out_of_range_gets_the_range(arguments, code, says, tmp_path: Path):
+    done = atalante("hang", "--out", str(tmp_path), *arguments)
+    assert done.returncode == code, done.stderr
+    assert says in done.stderr
+    assert "Traceback" not in done.stderr
