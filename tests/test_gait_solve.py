@@ -1,0 +1,106 @@
+"""`atalante gait solve`: what it prints, writes and refuses."""
+
+from __future__ import annotations
+
+import builtins
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+from PIL import Image
+
+from atalante_control.gait import load_gait
+from atalante_hal.robot import JOINTS, load_robot
+from atalante_tools.cli import cli
+from atalante_tools.gait.figures import draw_animation
+
+PATIENT = ["--mass", "75", "--height", "175"]
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, ["gait", "solve", *arguments])
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:
+    folder = tmp_path_factory.mktemp("gait")
+    files = ["--out", str(folder / "gait.json"), "--plot", str(folder / "gait.png")]
+    return run(*PATIENT, "--step-length", "0.16", "--step-duration", "0.8", "--json", *files), folder
+
+
+def test_json_is_one_object_with_the_keys_scripts_rely_on(result: tuple[Result, Path]) -> None:
+    outcome, _ = result
+    assert outcome.exit_code == 0, outcome.output
+    [line] = map(json.loads, outcome.stdout.splitlines())
+    assert list(line)[:6] == ["status", "solve_s", "max_residual", "step_length", "step_duration", "peak_torque"]
+    assert line["status"] == "solved"
+    assert 0.0 <= line["max_residual"] < 1e-6
+    assert (line["step_length"], line["step_duration"]) == (0.16, 0.8)
+    assert line["peak_torque"] == max(line["peak_torques"].values())
+    assert list(line["peak_torques"]) == list(JOINTS)
+    assert "iterations" in outcome.stderr
+
+
+def test_the_gait_is_one_the_controller_reads(result: tuple[Result, Path]) -> None:
+    gait = load_gait(result[1] / "gait.json", load_robot())
+    assert gait.duration == 0.8
+    assert gait.parameters["patient_mass"] == 75.0
+    assert gait.feedforward is not None
+
+
+def test_pictures(result: tuple[Result, Path], tmp_path: Path) -> None:
+    from atalante_control.model import Patient
+
+    with Image.open(result[1] / "gait.png") as picture:
+        assert picture.width > 800
+    gait = load_gait(result[1] / "gait.json", load_robot())
+    draw_animation(gait, Patient(75.0, 1.75), tmp_path / "gait.gif")
+    with Image.open(tmp_path / "gait.gif") as animation:
+        assert animation.n_frames == 21  # 25 a second over 0.8 s, both ends included
+
+
+def test_people_get_torques_residuals_and_pinocchios_judgement() -> None:
+    outcome = run(*PATIENT, "--kind", "stop")
+    assert outcome.exit_code == 0, outcome.output
+    for text in ("stance Nm", "centre of pressure across the sole", "by Pinocchio", "speed at rest"):
+        assert text in outcome.stdout
+    assert "FAIL" not in outcome.stdout
+
+
+def test_what_cannot_be_walked_ends_in_one_sentence() -> None:
+    outcome = run(*PATIENT, "--step-length", "0.4", "--step-duration", "0.8", "--json")
+    assert outcome.exit_code == 1
+    assert json.loads(outcome.stdout)["status"] != "solved"
+    assert outcome.stderr.strip().splitlines()[-1].startswith("atalante: no such gait for 75 kg, 1.75 m")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ([], "--mass and --height"),
+        (["--mass", "75"], "--mass and --height"),
+        ([*PATIENT, "--step-length", "3"], "step length is from 0.05 to 0.4 m"),
+        ([*PATIENT, "--step-duration", "0.8005"], "whole number of milliseconds"),
+        ([*PATIENT, "--kind", "hop"], "periodic"),
+    ],
+)
+def test_usage(arguments: list[str], sentence: str) -> None:
+    outcome = run(*arguments)
+    assert outcome.exit_code == 2
+    assert sentence in outcome.stderr
+
+
+def test_without_casadi_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def absent(name: str, *arguments: Any, **keywords: Any) -> Any:
+        if name.startswith("atalante_control.generation.solve"):
+            raise ModuleNotFoundError("No module named 'casadi'", name="casadi")
+        return real(name, *arguments, **keywords)
+
+    monkeypatch.setattr(builtins, "__import__", absent)
+    outcome = run(*PATIENT)
+    assert outcome.exit_code == 1
+    assert "pip install 'atalante-hal[gaits]'" in outcome.stderr
