@@ -104,6 +104,32 @@ def test_a_torque_inside_all_limits_keeps_its_bits(command: np.ndarray, motion: 
     assert not (touched & allowed).any()
 
 
+class NeverCuts(Limiter):
+    """Fails when a command is looked at twice."""
+
+    def _cut(self) -> Limited:
+        raise AssertionError("one product and one comparison should have been enough")
+
+
+shares = arrays(np.float64, 12, elements=st.floats(-1.0, 1.0))
+
+
+@given(shares, shares, shares, shares, arrays(np.float64, 12, elements=st.floats(0.1, 1.0)))
+def test_a_command_inside_every_limit_is_looked_at_once(
+    torque: np.ndarray, step: np.ndarray, velocity: np.ndarray, position: np.ndarray, derated: np.ndarray
+):
+    limiter = NeverCuts(ROBOT, PERIOD)
+    limiter.derate(derated * ROBOT.torque_max)
+    asked = torque * limiter.limit
+    limiter.restart(asked + 0.99 * step * STEP)
+    speed = velocity * ROBOT.velocity_max
+    half = (ROBOT.position_max - ROBOT.position_min) / 2.0
+    ahead = MIDDLE + 0.99 * position * half
+    assert limiter.apply(asked, np.array([ahead - LOOK * speed, speed])) == FREE
+    assert limiter.last.tobytes() == asked.tobytes()
+    assert limiter.cut.dtype == np.bool_
+
+
 def test_a_command_inside_the_limits_keeps_its_bits_for_a_thousand_cycles():
     limiter = Limiter(ROBOT, PERIOD)
     rng = np.random.default_rng(0)

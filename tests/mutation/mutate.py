@@ -37,8 +37,11 @@ PACKAGES = (
 CORE = {
     "atalante_hal/e2e.py": ("test_e2e.py", "test_image.py"),
     "atalante_hal/image.py": ("test_image.py",),
-    "atalante_hal/cia402.py": ("test_cia402.py",),
+    "atalante_hal/judgement.py": ("test_judgement.py",),
+    "atalante_hal/diagnostics.py": ("test_diagnostics.py",),
+    "atalante_hal/fault_memory.py": ("test_fault_memory.py", "test_judgement.py"),
     "atalante_hal/supervisor.py": ("test_supervisor.py",),
+    "atalante_hal/cia402.py": ("test_cia402.py",),
     "atalante_hal/limiter.py": ("test_limiter.py",),
     "atalante_control/guide.py": ("test_guide.py",),
     "atalante_emulator/drive.py": ("test_drive.py",),
