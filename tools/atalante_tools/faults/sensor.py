@@ -113,4 +113,21 @@ SCENARIOS: Final = (
             )
         ),
     ),
+    Scenario(
+        "F57",
+        (
+            Case(
+                "0.3 rad/s, which may be the drive's filter",
+                (Fault("value", f"{_QUIET}_STATE", 0, 100, Velocity=30.0),),
+                dtc="",
+                state=_ACTIVE,
+            ),
+            *(
+                Case(
+                    f"{rate:g} rad/s", (Fault("value", f"{_QUIET}_STATE", 0, 100, Velocity=100.0 * rate),), node=_QUIET
+                )
+                for rate in (0.7, -0.7)
+            ),
+        ),
+    ),
 )
