@@ -84,6 +84,7 @@ def test_a_drive_obeys_its_own_controlword(bench: Bench) -> None:
     bench.word[4] = Controlword.QUICK_STOP
     bench.cycle()
     assert [i for i, s in enumerate(bench.drives.state) if s is DriveState.QUICK_STOP_ACTIVE] == [4]
+    assert bench.signals.state.tolist() == bench.drives.state
     assert not any(bench.drives.latched)
 
 
@@ -204,10 +205,36 @@ def test_hold_pulls_back_to_where_it_stopped(polarity: float) -> None:
     for _ in range(30):
         torque = bench.cycle()
     np.testing.assert_allclose(torque, -0.01 * robot.hold_kp, rtol=2e-3)
-    bench.position[:] = -3.0
-    for _ in range(60):
+    for end, sign in ((-3.0, 1.0), (3.0, -1.0)):
+        bench.position[:] = end
+        for _ in range(60):
+            torque = bench.cycle()
+        np.testing.assert_allclose(torque, sign * robot.torque_max, rtol=1e-6)
+
+
+def test_holds_where_it_stopped_and_not_where_it_was_enabled() -> None:
+    bench = Bench(SMOOTH)
+    bench.enable()
+    bench.position[:] = 0.2
+    bench.cycle()
+    bench.word[:] = Controlword.QUICK_STOP
+    for _ in range(30):
         torque = bench.cycle()
-    np.testing.assert_allclose(torque, robot.torque_max, rtol=1e-6)
+    np.testing.assert_allclose(torque, 0.0, atol=0.02)
+
+
+def test_before_the_first_command_there_is_none() -> None:
+    bench = Bench(SMOOTH)
+    bench.drives.sample(bench.position)
+    assert bench.drives.drive(bench.velocity) == [0.0] * 12
+
+
+def test_the_encoders_are_what_the_frames_say(bench: Bench) -> None:
+    bench.cycle()
+    bench.position[:] = 0.05
+    bench.cycle()
+    np.testing.assert_allclose(bench.signals.position, 0.05 * ROBOT.gear * ROBOT.polarity, atol=1e-4)
+    assert (bench.signals.velocity * ROBOT.polarity > 0.0).all()
 
 
 def test_hold_damps_motion() -> None:
@@ -270,6 +297,16 @@ class TestHeat:
             torque = bench.cycle()
         assert torque[3] == pytest.approx(ROBOT.derating.floor * ROBOT.torque_max[3])
         assert torque[2] == pytest.approx(ROBOT.torque_max[2])
+
+    def test_all_of_them_hot(self) -> None:
+        bench = Bench(SMOOTH)
+        bench.enable()
+        bench.target[:] = 1e4
+        for drive in range(12):
+            bench.drives.heat(drive, 110.0)
+        for _ in range(30):
+            torque = bench.cycle()
+        np.testing.assert_allclose(torque, ROBOT.torque_limit(np.full(12, 110.0)), rtol=1e-6)
 
     def test_a_drive_that_has_cooled_gives_all_again(self) -> None:
         bench = Bench(SMOOTH)
@@ -438,9 +475,15 @@ class TestErrors:
     def test_commands_of_a_leg_that_are_not_fresh_acknowledge_nothing(self, bench: Bench) -> None:
         bench.enable()
         bench.drives.fail(7, 0x8250)
+        bench.drives.fail(1, 0x8250)
         bench.word[:] = Controlword.QUICK_STOP
-        bench.cycle((True, False))
-        assert bench.drives.latched[7]
+        for fresh, other in (((True, False), 7), ((False, True), 1)):
+            bench.drives.fail(other, 0x8250)
+            for _ in range(3):
+                bench.cycle(fresh)
+            assert bench.drives.latched[other]
+            bench.cycle()
+            assert not bench.drives.latched[other]
         bench.cycle()
         assert not bench.drives.latched[7]
 
@@ -525,6 +568,14 @@ class TestSync:
         assert set(bench.drives.state[:6]) == {DriveState.OPERATION_ENABLED}
         assert set(bench.drives.state[6:]) == {DriveState.QUICK_STOP_ACTIVE}
         assert bench.drives.emergencies == [Emergency(node, 0x11, 0x8130) for node in NODES[6:]]
+
+    def test_the_first_cycle_counts_as_any_other(self, bench: Bench) -> None:
+        bench.enable()
+        for cycle in range(WATCHDOG - 1):
+            bench.drives.miss_sync(0, cycle)
+        assert states(bench) == {DriveState.OPERATION_ENABLED}
+        bench.drives.miss_sync(0, WATCHDOG - 1)
+        assert set(bench.drives.state[:6]) == {DriveState.QUICK_STOP_ACTIVE}
 
     def test_only_cycles_in_a_row_count(self, bench: Bench) -> None:
         bench.enable()

@@ -229,10 +229,9 @@ class Drives:
             (emergency.UNDER_VOLTAGE, self.parameters.hold_below),
             (emergency.NO_VOLTAGE, self.parameters.off_below),
         ):
-            low = voltage < least
-            if low and not self.errors.has(drive, code):
+            if voltage < least:
                 self.fail(drive, code, stands=True)
-            elif not low and self.errors.has(drive, code):
+            elif self.errors.has(drive, code):
                 self.recover(drive, code)
 
     # -- state -------------------------------------------------------------------------------------------------------
