@@ -24,6 +24,14 @@ def guide_kept(seen: Observation) -> str | None:
     return f"the guide was left by {exits:.2f} deg" if exits > 0.5 else None
 
 
+def guide_regained(seen: Observation) -> str | None:
+    """Both assisted joints are in their guide again in the end, and were out of it before."""
+    exits = seen.guide_exit[seen.first - 1 :]
+    if exits.max() <= 0.0:
+        return "the guide was never left"
+    return f"a joint is still {math.degrees(exits[-1]):.1f} deg outside its guide" if exits[-1] > 0.0 else None
+
+
 def data_stays_fresh(seen: Observation) -> str | None:
     """No data of the HAL is older than this cycle while it lasts."""
     ages = seen.age[seen.first - 1 : seen.over]

@@ -6,7 +6,7 @@ from typing import Final
 
 from atalante_emulator.faults import Fault
 from atalante_hal.types import SupervisorState
-from atalante_tools.faults.checks import left_leg_holds_by_itself, limit_follows_the_heat
+from atalante_tools.faults.checks import guide_regained, left_leg_holds_by_itself, limit_follows_the_heat
 from atalante_tools.faults.scenario import Case, Host, Scenario
 
 _S = SupervisorState
@@ -96,6 +96,20 @@ SCENARIOS: Final = (
             Case("one in ten", (Fault("flip", _COMMAND, 0, 300, p=0.1),), noticed=60),
         ),
         lasting=Case("every frame", (Fault("flip", _COMMAND),)),
+    ),
+    Scenario(
+        "F35",
+        tuple(
+            Case(
+                f"{node} pushed with {torque:g} Nm",
+                (Fault("push", node, 0, 60, torque=torque),),
+                noticed=60,
+                watched=400,
+                checks=(guide_regained,),
+            )
+            for node, torque in (("LEFT_SH", -80.0), ("LEFT_SH", 80.0), (_KNEE, -50.0), (_KNEE, 50.0))
+        ),
+        lasting=Case("the knee, by 40 Nm", (Fault("push", _KNEE, torque=40.0),)),
     ),
     Scenario(
         "F36",

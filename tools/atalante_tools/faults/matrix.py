@@ -16,9 +16,8 @@ from atalante_hal.types import SupervisorState
 
 MATRIX_FILE: Final = Path(__file__).with_name("FAULTS.md")
 COLUMNS: Final = ("ID", "Fault", "Noticed by", "Cycles", "What happens", "State", "DTC", "Proof")
-#: Proof by a run of the scenario of the row's ID, and what stands where nothing proves a row yet.
+#: Proof by a run of the scenario of the row's ID.
 SCENARIO: Final = "scenario"
-OPEN: Final = "open"
 _ID = re.compile(r"F\d\d")
 _BOUND = re.compile(r"(\d+)(?: / (\d+))?")
 
@@ -38,7 +37,7 @@ class Row:
     behaviour: str
     state: SupervisorState  # the supervisor's when it has reacted
     dtc: str  # empty: nothing to notice
-    proof: tuple[str, ...]  # SCENARIO, `path::test` below tests/ (* at its end: any), or OPEN
+    proof: tuple[str, ...]  # SCENARIO, `path::test` below tests/, * at its end: any
 
     @property
     def noticed(self) -> int | None:
@@ -55,7 +54,7 @@ class Row:
     @property
     def tests(self) -> tuple[str, ...]:
         """What proves it besides a scenario."""
-        return tuple(entry for entry in self.proof if entry not in (SCENARIO, OPEN))
+        return tuple(entry for entry in self.proof if entry != SCENARIO)
 
 
 @functools.cache
@@ -93,7 +92,7 @@ def _row(where: str, cells: list[str]) -> Row:
         raise MatrixError(f"{where}: no state {state!r}; there are {', '.join(SupervisorState.__members__)}")
     entries = tuple(entry.strip().strip("`") for entry in proof.split(","))
     for entry in entries:
-        if entry not in (SCENARIO, OPEN) and "::" not in entry:
-            raise MatrixError(f"{where}: proof {entry!r}; valid are {SCENARIO}, {OPEN} and file::test below tests/")
+        if entry != SCENARIO and "::" not in entry:
+            raise MatrixError(f"{where}: proof {entry!r}; valid are {SCENARIO} and file::test below tests/")
     dtc = "" if dtc == "-" else dtc
     return Row(id_, fault, noticed_by, cycles, behaviour, SupervisorState[state], dtc, entries)
