@@ -153,9 +153,10 @@ class TestTightThresholds:
         largest = ROBOT.torque_max[joint]
         at = only(joint, sign * largest)
         self.expect(limiter_at(at), at, AT_REST, None)
-        over = limiter_at(at)
-        self.expect(over, at * (1.0 + 1e-12), AT_REST, joint)
-        assert over.last[joint] == sign * largest
+        for factor, velocity in ((1.0 + 1e-12, 0.0), (1.001, -sign), (1.001, sign)):
+            over = limiter_at(at)
+            self.expect(over, at * factor, moving(joint, MIDDLE[joint], velocity), joint)
+            assert over.last[joint] == sign * largest
 
     def test_derated_torque(self, joint: int, sign: float):
         limiter = limiter_at(np.zeros(12))
@@ -171,9 +172,10 @@ class TestTightThresholds:
         step = STEP[joint]
         self.expect(limiter_at(np.zeros(12)), only(joint, sign * step), AT_REST, None)
         self.expect(limiter_at(only(joint, sign)), only(joint, sign * (1.0 - step)), AT_REST, None)
-        over = limiter_at(only(joint, sign))
-        self.expect(over, only(joint, sign * (1.001 + step)), AT_REST, joint)
-        assert over.last[joint] == sign * (1.0 + step)
+        for before, after in ((1.0, 1.001 + step), (-0.6 * step, 0.6 * step), (-1.5 * step, -0.25 * step)):
+            over = limiter_at(only(joint, sign * before))
+            self.expect(over, only(joint, sign * after), AT_REST, joint)
+            assert over.last[joint] == pytest.approx(sign * (before + step))
 
     def test_position(self, joint: int, sign: float):
         limit = (ROBOT.position_max if sign > 0 else ROBOT.position_min)[joint]
@@ -241,6 +243,7 @@ def test_where_the_derated_limit_falls_the_torque_follows_at_the_rate_limit():
 def test_no_limit_is_raised_above_the_robots_own():
     limiter = Limiter(ROBOT, PERIOD)
     assert limiter.limit.tobytes() == ROBOT.torque_max.tobytes()
+    assert limiter.cut.dtype == np.bool_
     limiter.derate(np.full(12, 1.0))
     limiter.derate(np.full(12, 1e6))
     assert limiter.limit.tobytes() == ROBOT.torque_max.tobytes()
