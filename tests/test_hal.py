@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import cantools
@@ -581,3 +582,47 @@ def test_the_bus_and_the_tap_can_be_changed(rig):
     rig.hal.bus = rig.bus
     assert rig.hal.bus is rig.bus
     assert not rig.hal.silent
+
+
+def hot(rig, **degrees: float):
+    for node, value in degrees.items():
+        set_signal(rig, f"{node}_STATE", "Temperature", value)
+
+
+def test_the_torque_limit_of_a_hot_drive_follows_within_a_cycle_and_is_told(rig):
+    rig.until(S.ACTIVE)
+    hot(rig, LEFT_SK=100.0, RIGHT_SK=100.0)
+    assert rig.cycle().supervisor is S.ACTIVE
+    limit = rig.hal.robot.torque_limit(rig.hal.state.temperature)
+    assert limit[3] < rig.hal.robot.torque_max[3]
+    commands = last_commands(rig)
+    assert commands["left"]["SK_MaxTorque"] == pytest.approx(limit[3], abs=0.0125)
+    assert commands["right"]["SH_MaxTorque"] == pytest.approx(rig.hal.robot.torque_max[8], abs=0.0125)
+    told = {e.node: e for e in rig.hal.events if e.code == "DERATED"}
+    assert set(told) == {"LEFT_SK", "RIGHT_SK"}
+    assert told["LEFT_SK"].value == pytest.approx(limit[3])
+    assert told["LEFT_SK"].severity == "warning"
+    assert rig.run(20).supervisor is S.ACTIVE
+
+
+@pytest.mark.parametrize("node", ["LEFT_SK", "RIGHT_SK"])
+def test_a_drive_far_hotter_than_its_twin_holds_the_robot(rig, node):
+    rig.until(S.ACTIVE)
+    hot(rig, **{node: 115.0})
+    assert rig.cycle().supervisor is S.HOLD
+    assert node in rig.hal.reason
+
+
+def test_reading_without_writing_goes_on_with_the_next_sync(rig):
+    for _ in range(3):
+        rig.hal.read()
+    syncs = [int(f["data"][0, 2]) for f in rig.sent if f["can_id"][0] == 0x10]
+    assert [b - a & 0xFF for a, b in itertools.pairwise(syncs)] == [1, 1]
+    assert rig.hal.state.valid.shape == (19,)
+
+
+def test_a_heartbeat_that_fails_to_come_is_noticed_while_all_else_is_well(rig):
+    rig.until(S.ACTIVE)
+    rig.bus.to_hal = drop(0x704)
+    assert rig.run(360).supervisor is S.ACTIVE
+    assert seen(rig, "HEARTBEAT_LOST") == [("HEARTBEAT_LOST", "warning")]
