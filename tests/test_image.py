@@ -405,3 +405,22 @@ def test_messages_of_64_bytes_are_protected_too():
         rx.accept(buffer, 2)
         assert (rx.check == Check.OK).all()
     assert rx.all_fresh
+
+
+def test_a_refusal_is_of_its_row_alone_and_ages_from_the_cycle_before():
+    tx, rx, buffer = pair()
+    deliver(tx, rx, buffer)
+    for _ in range(2):
+        deliver(tx, rx, buffer)
+        rx.refuse(3)
+    assert rx.age[3] == 2
+    deliver(tx, rx, buffer)
+    assert rx.all_fresh
+    tx.values[:] = 1.0
+    deliver(tx, rx, buffer)
+    new = rx.values.copy()
+    rx.refuse(3)
+    assert (rx.age[3], rx.all_fresh) == (1, False)
+    mine = rx.codec.row_of == 3
+    assert np.array_equal(rx.values[~mine], new[~mine])
+    assert not np.array_equal(rx.values[mine], new[mine])

@@ -9,7 +9,7 @@ import pytest
 
 from atalante_dbc import load
 from atalante_hal.diagnostics import Dtc
-from atalante_hal.e2e import COUNTER_BYTE, Check
+from atalante_hal.e2e import COUNTER_BYTE, SETTLED, Check, crc, data_id_bytes
 from atalante_hal.fault_memory import FaultMemory
 from atalante_hal.frame import Frames, new_frames
 from atalante_hal.image import ReceiveImage, TransmitImage
@@ -298,3 +298,31 @@ def test_values_of_what_was_never_committed_have_no_age(bench: Bench):
     assert bench.memory.events[0].value == 0
     bench.well().cycle(flip(KNEE), times=2)
     assert bench.memory.active[Dtc.E2E_CRC, "LEFT_SK"].value == 2
+
+
+def test_before_the_first_cycle_nothing_may_be_used(bench: Bench) -> None:
+    judgement = bench.judgement
+    assert judgement.valid.tolist() == [False] * len(MESSAGES)
+    assert judgement.valid.dtype == np.bool_
+    assert judgement.joints_valid is False
+    assert judgement.settled is False
+    assert not judgement.nodes_well
+    assert not any(judgement.trusts(row) for row in range(len(MESSAGES)))
+
+
+def test_what_says_the_impossible_came_well_and_fills_no_bucket(bench: Bench) -> None:
+    drive_state = MESSAGES[KNEE].signal("DriveState")
+
+    def impossible(frames: Frames) -> Frames:
+        data = frames[KNEE]["data"]
+        data[drive_state.start // 8] = 65  # one more than the largest
+        protected = data[2 : MESSAGES[KNEE].length].tobytes()
+        data[:2] = list(crc(protected, data_id_bytes(MESSAGES[KNEE].data_id)).to_bytes(2, "little"))
+        return frames
+
+    bench.well()
+    for _ in range(20):
+        bench.cycle(impossible)
+        assert bench.image.check[KNEE] == Check.RANGE
+        assert bench.judgement.qualification[KNEE] is SETTLED
+        bench.cycle()
