@@ -34,10 +34,10 @@ HIDDEN = (64, 64)
 ITERATIONS = 3000  # of L-BFGS in one of `ROUNDS`, each of which begins where the last one stopped
 ROUNDS = 2
 RESOLUTION = math.radians(0.003)  # rad, what is left of the library outside the directions that are learned
-JUMP_KEPT = 0.4  # of the speed jumps of the library
-END_WEIGHT = 12.0  # of a sample at either end against one between
-ACCELERATION_WEIGHT = 3e-2  # s2, rad of angle that 1 rad/s2 of acceleration counts as
-ALPHA = 1e-6  # weight of the squared weights: smooth between the points of the grid
+JUMP_KEPT = 0.45  # of the speed jumps of the library
+END_WEIGHT = 20.0  # of a sample at either end against one between
+ACCELERATION_WEIGHT = 5e-2  # s2, rad of angle that 1 rad/s2 of acceleration counts as
+ALPHA = 1e-7  # weight of the squared weights: smooth between the points of the grid
 SEED = 1
 _SAMPLES = 41  # phases
 
