@@ -45,6 +45,8 @@ CORE = {
     "atalante_hal/limiter.py": ("test_limiter.py",),
     "atalante_control/guide.py": ("test_guide.py",),
     "atalante_emulator/drive.py": ("test_drive.py",),
+    "atalante_emulator/emergency.py": ("test_emergency.py",),
+    "atalante_emulator/collision.py": ("test_collision.py",),
 }
 #: mutmut's exit codes of a mutant that lives: survived, and no test at all.
 LIVES = (0, 33)
