@@ -67,3 +67,10 @@ def test_every_kind_says_what_it_does() -> None:
         assert kind.does
         assert kind.targets
         assert all(parameter.valid for parameter in kind.parameters.values())
+
+
+def test_the_same_fault_from_another_cycle_on() -> None:
+    fault = Fault("value", "LEFT_SK_STATE", 10, 3, p=0.5, Position=0.3)
+    later = fault.starting(500)
+    assert later == Fault("value", "LEFT_SK_STATE", 500, 3, p=0.5, Position=0.3)
+    assert fault.start == 10
