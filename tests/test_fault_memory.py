@@ -18,6 +18,7 @@ def told(memory: FaultMemory) -> list[tuple[int, str, str, str, float]]:
 
 
 def test_nothing_is_active_at_first(memory: FaultMemory):
+    assert (memory.bits, memory.confirmed) == (0, frozenset())
     memory.close_cycle(1)
     assert (memory.active, memory.bits, memory.confirmed, memory.events) == ({}, 0, frozenset(), [])
 
@@ -108,3 +109,8 @@ def test_who_and_what_is_meant(memory: FaultMemory):
     assert memory.text_of(frozenset({Dtc.OVER_TEMP})) == "hot"
     assert memory.text_of(both) == "stuck"
     assert memory.text_of(frozenset({Dtc.BUS_OFF})) == ""
+
+
+def test_what_is_raised_without_a_value_has_none(memory: FaultMemory):
+    memory.raise_dtc(3, Dtc.NODE_RESET, "LEFT_SK")
+    assert told(memory) == [(3, "NODE_RESET", "LEFT_SK", "error", 0.0)]

@@ -326,3 +326,18 @@ def test_what_says_the_impossible_came_well_and_fills_no_bucket(bench: Bench) ->
         assert bench.image.check[KNEE] == Check.RANGE
         assert bench.judgement.qualification[KNEE] is SETTLED
         bench.cycle()
+
+
+def test_the_age_of_what_comes_late_after_a_loss_is_told_with_it(bench: Bench) -> None:
+    bench.well()
+    bench.cycle(lose(KNEE))
+    kept: list[Frames] = []
+
+    def keep(frames: Frames) -> Frames:
+        kept.append(frames[KNEE : KNEE + 1].copy())
+        return np.delete(frames, KNEE)
+
+    bench.cycle(keep)
+    bench.cycle(lambda frames: np.concatenate([kept[0], np.delete(frames, KNEE)]))
+    assert bench.image.check[KNEE] == Check.SOME_LOST
+    assert bench.memory.active[Dtc.E2E_SOME_LOST, "LEFT_SK"].value == 1
