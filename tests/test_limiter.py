@@ -200,6 +200,17 @@ class TestTightThresholds:
         self.expect(over, full, moving(joint, MIDDLE[joint], fastest + sign * 1e-4), joint)
         assert sign * over.last[joint] == pytest.approx(ROBOT.torque_max[joint] * (1.0 - 1e-4 / FASTER))
 
+    def test_the_torque_of_the_last_cycle_hides_no_velocity_and_no_position(self, joint: int, sign: float):
+        limit = (ROBOT.position_max if sign > 0 else ROBOT.position_min)[joint]
+        fastest = ROBOT.velocity_max[joint] + FASTER
+        for motion, before in (
+            (moving(joint, MIDDLE[joint], sign * fastest), fastest),
+            (moving(joint, limit + sign * PAST), abs(limit) + PAST),
+        ):
+            limiter = limiter_at(only(joint, -sign * before))
+            self.expect(limiter, only(joint, sign), motion, joint)
+            assert limiter.last[joint] == pytest.approx(0.0, abs=1e-9)
+
     @pytest.mark.parametrize("part", [0.25, 0.5, 1.0, 2.0])
     def test_nothing_drives_a_joint_on_past_the_margin(self, joint: int, sign: float, part: float):
         limit = (ROBOT.position_max if sign > 0 else ROBOT.position_min)[joint]
