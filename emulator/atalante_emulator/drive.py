@@ -141,8 +141,8 @@ class Drives:
         if self._slow_phase == SLOW_CYCLES:
             self._slow_turn()
         wanted = self.motors.wanted
-        np.minimum(self._target, self._upper, wanted)
-        np.maximum(wanted, self._lower, wanted)
+        np.minimum(self._target, self._upper, out=wanted)
+        np.maximum(wanted, self._lower, out=wanted)
         if not self._all_enabled:
             self._without_command(wanted)
         return self.motors.turn(velocity)
