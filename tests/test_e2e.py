@@ -218,3 +218,9 @@ def test_laws_of_qualification(history: str):
             assert history[place - REQUALIFY + 1 : place + 1] == "g" * REQUALIFY
         if before.trusted and not now.trusted:
             assert cycle in "tT" or now.bucket == FULL
+
+
+def test_a_cycle_is_in_time_unless_it_is_said_to_be_late():
+    before = Qualification(8, 3, True)
+    assert qualify(before, good=True) == Qualification(7, 4, True)
+    assert qualify(before, good=True, timed_out=True) == Qualification(8, 0, False)
