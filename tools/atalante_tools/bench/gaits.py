@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import time
 from itertools import cycle
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Final
 
 import numpy as np
@@ -79,20 +77,22 @@ def library_two_processes(effort: Effort) -> Measurement:
 
 
 def _library(effort: Effort, jobs: int) -> Measurement:
-    """From the first gait that every process has made, when all have built their programme, to the last."""
-    from atalante_control.generation.library import Grid, Library, solve_subject
+    """The fan-out of a library, from when every process has built its programme and made a gait, to the last gait."""
+    import joblib
+
+    from atalante_control.generation.deviation import random_subjects
+    from atalante_control.generation.library import solve_subject
 
     count = (2 if effort.quick else 12) * jobs
-    with TemporaryDirectory(prefix="atalante-") as folder:
-        library = Library(Path(folder), Grid())
-        results = library.generate(solve_subject, jobs=jobs)
-        for _ in range(jobs):
-            next(results)
-        began = time.perf_counter()
-        for done in range(count):
-            subject, solved = next(results)
-            require(solved.solved, f"{subject}: {solved.status}")
-            effort.progress(done + 1, count)
-        seconds = time.perf_counter() - began
-        results.close()  # type: ignore[attr-defined]
+    network = load_network()
+    subjects = random_subjects(network.low, network.high, count + jobs, seed=0)
+    parallel = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
+    began = 0.0
+    for done, solved in enumerate(parallel(joblib.delayed(solve_subject)(subject) for subject in subjects), 1 - jobs):
+        require(solved.solved, solved.status)
+        if done == 0:
+            began = time.perf_counter()
+        elif done > 0:
+            effort.progress(done, count)
+    seconds = time.perf_counter() - began
     return Measurement(seconds / count, _GAIT / jobs, (f"{count / seconds * 60:.0f} gaits a minute",))
