@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import numpy as np
-
-from atalante_emulator.drive import WATCHDOG
 from atalante_hal.cia402 import DriveState
 from atalante_hal.robot import JOINTS, LEG_JOINTS
 from atalante_hal.types import SupervisorState
 from atalante_tools.faults.observation import Observation
 
 _KNEE: Final = JOINTS.index("left_SK")
+#: Cycles without a command after which a drive has to hold; written a second time on purpose.
+_WATCHDOG: Final = 5
 _LEFT_LEG: Final = slice(0, len(LEG_JOINTS))
 
 
@@ -46,16 +45,16 @@ def not_enabled_in_motion(seen: Observation) -> str | None:
 
 def left_leg_holds_by_itself(seen: Observation) -> str | None:
     """Every drive of the left leg is in its own hold in the fifth cycle, and stays there until the operator starts again."""
-    fifth = seen.first + WATCHDOG - 1
+    fifth = seen.first + _WATCHDOG - 1
     held = (seen.drive_state[fifth - 1 : seen.quiet, _LEFT_LEG] == DriveState.QUICK_STOP_ACTIVE).all(axis=1)
     return None if held.all() else f"a drive of the left leg did not hold in cycle {fifth + int(held.argmin())}"
 
 
 def limit_follows_the_heat(seen: Observation) -> str | None:
-    """The left knee is never commanded more than the temperature it reported allows."""
-    cycles, torque = seen.commands.torque_of(_KNEE)
-    for cycle, asked in zip(cycles.tolist(), np.abs(torque).tolist(), strict=True):
+    """The torque limit sent to the left knee is never above what the temperature it reported allows."""
+    cycles, limit = seen.commands.limit_of(_KNEE)
+    for cycle, sent in zip(cycles.tolist(), limit.tolist(), strict=True):
         allowed = seen.robot.torque_limit(seen.temperature[cycle - 1])[_KNEE]
-        if asked > allowed + 0.02:
-            return f"{asked:.1f} Nm left in cycle {cycle}, and {allowed:.1f} Nm were allowed"
+        if cycle >= seen.first and sent > allowed + 0.02:
+            return f"a limit of {sent:.1f} Nm left in cycle {cycle}, and {allowed:.1f} Nm were allowed"
     return None

@@ -76,6 +76,11 @@ class Commands:
         leg = self._legs[joint // len(LEG_JOINTS)]
         return leg.cycle, leg.torque[:, joint % len(LEG_JOINTS)]
 
+    def limit_of(self, joint: int) -> tuple[npt.NDArray[np.int64], Vector]:
+        """As `torque_of`, the torque limit that was sent along."""
+        leg = self._legs[joint // len(LEG_JOINTS)]
+        return leg.cycle, leg.limit[:, joint % len(LEG_JOINTS)]
+
     def outside(self, robot: Robot) -> list[str]:
         """One sentence for each way in which a command left that must not: identifier, torque, its rate, torque while stopped."""
         found = [f"the HAL sent identifier {can_id:#x}, which is not its own" for can_id in self._strange.tolist()]
