@@ -17,10 +17,11 @@ from atalante_dbc import Network
 from atalante_hal.bus import Bus
 from atalante_hal.cia402 import Controlword, DriveState, controlword_towards_operation
 from atalante_hal.codec import Vector
+from atalante_hal.commands import Commands, StatusReport
 from atalante_hal.diagnostics import Dtc, Reaction, number_of, worst
 from atalante_hal.fault_memory import FaultMemory
 from atalante_hal.heartbeats import Heartbeats
-from atalante_hal.image import NEVER, ReceiveImage, TransmitImage
+from atalante_hal.image import NEVER, ReceiveImage
 from atalante_hal.judgement import Judgement
 from atalante_hal.limiter import Limiter
 from atalante_hal.pendant import Pendant
@@ -92,7 +93,8 @@ class Hal:
         self._build_images(controller_fields, assistance_factor)
         self._transceiver = Transceiver(network, "HAL", bus, len(self.messages), tap)
         self._limiter = Limiter(robot, PERIOD)
-        self._build_commands(gait_hash)
+        self._commands = Commands(network, self._transceiver, self._parts, self._limiter.limit)
+        self._status = StatusReport(network, self._transceiver, robot.hash32, gait_hash)
         self._steady = False  # a perfect cycle would change nothing
         #: What loop and controller did wrong since the last judgement: code, whether confirmed, value, sentence.
         self._reports: list[tuple[Dtc, bool, float, str]] = []
@@ -131,36 +133,6 @@ class Hal:
         # Torque is at the joint on the wire, in both directions.
         self._to_joint = np.concatenate([per_turn, per_turn, np.ones(len(JOINTS))])
 
-    def _build_commands(self, gait_hash: int) -> None:
-        sent = self.network.sent_by("HAL")
-        syncs = [m for m in sent if m.name.startswith("SYNC_")]
-        commands = [m for m in sent if m.cycle_ms == 1 and m not in syncs]
-        self._tx = TransmitImage([*commands, *syncs])
-        self._commands = self._transceiver.grant(self._tx.frames[: len(commands)])
-        self._syncs = self._transceiver.grant(self._tx.frames[len(commands) :])
-        values, codec = self._tx.values, self._tx.codec
-        self._tx_torque, self._tx_control, self._tx_level, self._tx_state, self._tx_cycle = (
-            values[codec.slice(s)] for s in ("TargetTorque", "Controlword", "Level", "HalState", "Cycle")
-        )
-        self._tx_limit = values[codec.slice("MaxTorque")]
-        self._tx_limit[:] = self._limiter.limit
-        self._holding = True  # the command values are not those of `write`
-        self._no_level = np.zeros_like(self._tx_level)
-        self._fill_hold()
-        #: Quick stop to every drive, no torque, motors still: encoded before anything can go wrong.
-        self._hold_frames = self._tx.prepare()
-        self._tx_cycle.fill(1.0)
-        self._tx.seal()
-        self._sealed = True  # SYNC of the next cycle
-        self._status = TransmitImage([self.network.message("HAL_STATUS")])
-        self._status_frames = self._transceiver.grant(self._status.frames)
-        codec = self._status.codec
-        self._status_index = {s.name: codec.index("HAL_STATUS", s.name) for _, s in codec.signals}
-        self._status_cycles = codec.messages[0].cycle_ms
-        hashes = {"DbcHash": self.network.hash32, "ConfigHash": self.robot.hash32, "GaitHash": gait_hash}
-        for name, value in hashes.items():
-            self._status.values[self._status_index[name]] = value
-
     # -- one cycle ---------------------------------------------------------------------------------------------------
 
     def listen(self) -> None:
@@ -176,14 +148,11 @@ class Hal:
 
         A bus that fails does not raise here: it ends in HOLD like any other fault.
         """
-        if not self._sealed:
-            self._seal()
-        self._sealed = False
         state, image, transceiver = self.state, self._image, self._transceiver
         state.cycle = cycle = state.cycle + 1
         state.time = cycle * PERIOD
         late = 0 if image.all_fresh else transceiver.receive()  # what the last cycle did not wait for
-        transceiver.send(self._syncs)
+        self._commands.synchronise(cycle)
         count = transceiver.receive(late, image, self.patience)
         foreign = image.accept(transceiver.scratch, count, cycle & 0xFF)
         if foreign:
@@ -217,26 +186,20 @@ class Hal:
         limited = self._limiter.apply(command.torque, self._parts.motion)
         if not limited.finite:
             self._report(Dtc.CMD_NONFINITE, "the controller asked for a torque that is not finite")
-            return self._send_hold()
+            return self._commands.send_prepared_hold(self.state.cycle)
         if limited.clamped:
             cycles = self._limiter.saturated
             self._report(Dtc.TORQUE_SATURATED, "the limiter cuts the torque", cycles > SATURATED_CYCLES, cycles)
         self._step = command.step
         if command.outside:
             self._report(Dtc.GUIDE_OUTSIDE, "a joint is outside the virtual guide")
-        level, torque = self._parts.level_command, self._parts.torque_command
-        np.maximum(command.vibration, self._no_level, out=level)  # the codec cuts at 1
-        torque[:] = self._tx_torque[:] = self._limiter.last
-        self._tx_level[:] = level
-        if self._holding:
-            self._tx_control.fill(Controlword.ENABLE_OPERATION)
-            self._holding = False
+        self._commands.drive(self._limiter.last, command.vibration)
         return self._send_command()
 
     def hold(self) -> Vector:
         """Send HOLD; drives being enabled for a start get the next step of their state machine instead."""
-        self._fill_hold()
-        state, control = self.state, self._tx_control
+        self._commands.hold()
+        state, control = self.state, self._commands.control
         if self._lowered:
             control[[node in self._lowered for node in _NODES]] = Controlword.DISABLE_VOLTAGE
         if self._start_wanted and state.supervisor in (_S.LOWER, _S.FAULT):
@@ -246,10 +209,9 @@ class Hal:
             control[:] = [controlword_towards_operation(int(s)) for s in state.drive_state.tolist()]
             # What the drive holds with now, so that nothing sags between its hold and the controller's first torque.
             self._follow_drives()
-            self._tx_torque[:] = self._limiter.last
+            self._commands.torque[:] = self._limiter.last
         else:
             self._enabling = False
-        self._parts.torque_command[:] = self._tx_torque
         return self._send_command()
 
     def _follow_drives(self) -> None:
@@ -263,7 +225,7 @@ class Hal:
     def fail(self, error: Exception) -> Vector:
         """The controller, or what was done with its command, raised: HOLD in this same cycle."""
         self._report(Dtc.CONTROLLER_ERROR, f"the controller raised {type(error).__name__}: {error}")
-        return self._send_hold()
+        return self._commands.send_prepared_hold(self.state.cycle)
 
     def report(self, dtc: Dtc, text: str, *, confirmed: bool = True, value: float = 0.0) -> None:
         """The loop noticed a fault of timing at the start of a cycle; judged in its `read`."""
@@ -314,49 +276,15 @@ class Hal:
         names = self._judgement.missing() | self._heartbeats.missing()
         return [node.name for node in self.network.nodes if node.name in names]
 
-    # -- sending -----------------------------------------------------------------------------------------------------
-
-    def _fill_hold(self) -> None:
-        self._holding = True
-        self._tx_torque.fill(0.0)
-        self._tx_control.fill(Controlword.QUICK_STOP)
-        self._tx_level.fill(0.0)
-        self._parts.level_command.fill(0.0)
-
-    def _seal(self) -> None:
-        self._tx_cycle.fill(float((self.state.cycle + 1) & 0xFFFFFFFF))
-        self._tx.seal()
-        self._sealed = True
-
     def _send_command(self) -> Vector:
-        self._seal()
-        self._transceiver.send(self._commands)
-        if self.state.cycle % self._status_cycles == 0:
-            self._send_status()
-        return self._parts.torque_command
-
-    def _send_hold(self) -> Vector:
-        """The prepared HOLD frame, in this cycle; its SYNC is not used."""
-        self._tx.seal_prepared(self._hold_frames)
-        self._transceiver.send(self._commands)
-        self._fill_hold()
-        self._parts.torque_command.fill(0.0)
-        self._tx_cycle.fill(float((self.state.cycle + 1) & 0xFFFFFFFF))
-        self._tx.seal(self._tx.counter)
-        self._sealed = True
-        return self._parts.torque_command
-
-    def _send_status(self) -> None:
-        values, at = self._status.values, self._status_index
-        values[at["HalState"]] = self.state.supervisor
-        values[at["AssistanceFactor"]] = self.state.assistance_factor
-        values[at["Overruns"]] = self._header[6]
-        values[at["DiagnosticCode"]] = number_of(self._memory.bits)
-        values[at["Step"]] = (self._step or 0) & 0xFFFF
-        self._status.seal()
-        self._transceiver.send(self._status_frames)
-        if self._heartbeats.overdue(self.state.cycle):
-            self._steady = False
+        state = self.state
+        sent = self._commands.send(state.cycle)
+        if state.cycle % self._status.cycles == 0:
+            worst_one = number_of(self._memory.bits)
+            self._status.send(state.supervisor, state.assistance_factor, self._header[6], worst_one, self._step)
+            if self._heartbeats.overdue(state.cycle):
+                self._steady = False
+        return sent
 
     # -- judging -----------------------------------------------------------------------------------------------------
 
@@ -430,7 +358,7 @@ class Hal:
         if said != self._drives_judged:
             self._drives_judged = said
             self._limiter.derate(self.robot.torque_limit(state.temperature))
-            self._tx_limit[:] = self._limiter.limit
+            self._commands.limit[:] = self._limiter.limit
         self._judge_derating()
         if state.drive_state.tobytes() == _ENABLED:
             return
@@ -476,7 +404,7 @@ class Hal:
         state, memory = self.state, self._memory
         state.supervisor = after
         self.moving = after in MOVING
-        self._tx_state.fill(after)
+        self._commands.announce(after)
         self._header[2] = after
         if Dtc.OPERATOR_STOP in reasons:
             text = "the program is ending" if self._ending else _WORDS[self._pendant.stop_requested]

@@ -479,7 +479,7 @@ def test_an_exception_sends_the_prepared_hold_frame_under_the_next_counter(rig):
     rig.hal.read()
     with pytest.raises(ValueError, match="broadcast") as mistake:
         rig.hal.write(Command(np.full(3, 10.0), np.zeros(8)))
-    rig.hal._tx_torque.fill(np.nan)  # whatever else was written before it raised
+    rig.hal._commands.torque.fill(np.nan)  # whatever else was written before it raised
     sent = rig.hal.fail(mistake.value)
     assert not sent.any()
     frames = next(f for f in reversed(rig.sent) if f["can_id"][0] == 0x100)
