@@ -60,6 +60,8 @@ class Time:
 
     def sleep(self, seconds):  # from when the clock was read: it may have moved on since
         while wall[0] < self.last + seconds - 1e-9:
+            if os.getppid() == 1:  # the test was killed, and nobody moves the clock on
+                os._exit(1)
             time.sleep(1e-4)
 
 def drive(memory, bell):
