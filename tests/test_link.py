@@ -18,10 +18,13 @@ FOREVER = None
 
 
 class Line:
-    """A HAL that sends SYNC and command, two drives that answer, and faults at their end of the bus."""
+    """A HAL that sends SYNC and command, two drives that answer, and faults at their end of the bus.
 
-    def __init__(self, network: Network, *faults: Fault, seed: int = 0) -> None:
-        self.cycle = 0
+    `ahead`: the nodes take up each command before its SYNC has come.
+    """
+
+    def __init__(self, network: Network, *faults: Fault, seed: int = 0, ahead: bool = False) -> None:
+        self.cycle, self.ahead = 0, ahead
         self.hal, wire = lockstep_pair()
         self.nodes = FaultyBus(wire, network, faults, lambda: self.cycle, seed=seed)
         self.commands = TransmitImage([network.message(COMMAND), network.message(SYNC)])
@@ -35,8 +38,12 @@ class Line:
         for _ in range(cycles):
             buffer = new_frames(room)
             self.commands.values[self.commands.codec.index(COMMAND, "SK_TargetTorque")] = self.cycle
-            self.hal.send(self.commands.seal())
-            count = self.nodes.receive(buffer)
+            sealed, count = self.commands.seal(), 0
+            if self.ahead:
+                self.hal.send(sealed[:1])
+                count = self.nodes.receive(buffer)
+            self.hal.send(sealed[self.ahead :])
+            count += self.nodes.receive(buffer[count:])
             self.to_nodes.append(buffer[:count].copy())
             self.states.values[self.states.codec.index(KNEE, "Position")] = 0.01 * self.cycle
             self.nodes.send(self.states.seal())
@@ -99,6 +106,10 @@ class TestDrop:
         run = line(Fault("drop", COMMAND, 3, 2)).run(7)
         assert run.command == [OK] * 3 + [NOTHING] * 2 + [LOST, OK]
         assert set(run.knee) == {OK}
+
+    def test_towards_the_nodes_ahead_of_the_sync(self, line: Make) -> None:
+        run = line(Fault("drop", COMMAND, 3, 2), Fault("drop", KNEE, 0, 3), ahead=True).run(7)
+        assert run.command == [OK] * 3 + [NOTHING] * 2 + [LOST, OK]
 
     def test_only_the_target(self, line: Make, network: Network) -> None:
         run = line(Fault("drop", KNEE, 0)).run(2)

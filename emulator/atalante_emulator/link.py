@@ -256,7 +256,8 @@ class FaultyBus:
         self.synced = not self._syncs.isdisjoint(frames["can_id"][:count].tolist())
         if self.synced:
             self._begin_cycle()
-        if self._active or not self.wire.idle:
+        # Commands may come ahead of their SYNC: they, too, are this cycle's.
+        if self._now() or not self.wire.idle:
             self._for_nodes += self._passed(frames[:count], from_hal=True)
         elif self._for_nodes:
             self._for_nodes.append(frames[:count].copy())

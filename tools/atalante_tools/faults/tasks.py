@@ -31,7 +31,7 @@ REPRESENTATIVES: Final = (
     ("F11", "several"),
     ("F13", "one leg"),
     ("F18", "back after 2 cycles"),
-    ("F25", "200 frames"),
+    ("F25", "5 frames"),
     ("F28", "100 mrad for good"),
     ("F30", "IMU_LEFT_TIBIA"),
     ("F36", "250 cycles"),
