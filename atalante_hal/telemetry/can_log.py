@@ -10,13 +10,12 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import can
 import numpy as np
 import numpy.typing as npt
 
+from atalante_hal.closing import Closing
 from atalante_hal.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE, Frames
 from atalante_hal.telemetry.sink import SinkError
 
@@ -42,7 +41,7 @@ def check_format(path: Path) -> str:
     )
 
 
-class CanLog:
+class CanLog(Closing):
     """Writes frames to a log file.
 
     Args:
@@ -117,11 +116,3 @@ class CanLog:
         with contextlib.suppress(OSError):  # what the buffer still holds does not fit either
             self._logger.stop()
         return SinkError("RECORD_STOPPED", f"the CAN log {self.path} stopped: {error.strerror}")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

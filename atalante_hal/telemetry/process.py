@@ -20,11 +20,11 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 
+from atalante_hal.closing import Closing
 from atalante_hal.telemetry.access import Access, AccessError
 from atalante_hal.telemetry.events import EVENT_BYTES, EVENT_SLOTS, Event, pack
 from atalante_hal.telemetry.frames import FRAME_RECORD, RingTap, Stamps
@@ -126,7 +126,7 @@ class TelemetrySummary:
     notices: tuple[str, ...] = field(default=())  # what went wrong, one sentence each
 
 
-class TelemetryProcess:
+class TelemetryProcess(Closing):
     """The telemetry of one session: rings to write, and the child that empties them.
 
     Use it as a context manager around every run of the session, or call `start` and `close`.
@@ -372,11 +372,6 @@ class TelemetryProcess:
     def __enter__(self) -> Self:
         self.start()
         return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def _numbered(path: Path | None, number: int) -> Path | None:

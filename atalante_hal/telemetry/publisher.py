@@ -14,12 +14,12 @@ import json
 import logging
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import zenoh
 import zenoh.ext
 
+from atalante_hal.closing import Closing
 from atalante_hal.telemetry.access import Access
 from atalante_hal.telemetry.schema import encoding
 from atalante_hal.telemetry.sink import EVENTS, SinkError
@@ -35,7 +35,7 @@ OPEN = Access()
 _log = logging.getLogger(__name__)
 
 
-class Publisher:
+class Publisher(Closing):
     """A Zenoh session that publishes one key a stream. Use it as a context manager: an unclosed session outlives its process.
 
     Args:
@@ -101,14 +101,6 @@ class Publisher:
             self._stack.close()
         except zenoh.ZError as error:
             raise SinkError("TELEMETRY_DOWN", f"Zenoh did not end its session: {error}") from error
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def configuration(robot: str, listen: str) -> dict[str, Any]:

@@ -9,11 +9,10 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from mcap.writer import CompressionType, Writer
 
+from atalante_hal.closing import Closing
 from atalante_hal.telemetry.schema import PACKAGE, descriptor_set
 from atalante_hal.telemetry.sink import EVENTS, SinkError
 
@@ -21,7 +20,7 @@ from atalante_hal.telemetry.sink import EVENTS, SinkError
 _CHUNK_BYTES = 1 << 18
 
 
-class Recorder:
+class Recorder(Closing):
     """Writes messages into an MCAP file.
 
     Args:
@@ -93,14 +92,6 @@ class Recorder:
         with contextlib.suppress(OSError):  # what the buffer still holds does not fit either
             self._file.close()
         return SinkError("RECORD_STOPPED", f"the recording {self.path} stopped: {error.strerror}")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def _texts(about: Mapping[str, object]) -> dict[str, str]:

@@ -22,12 +22,12 @@ import os
 import sys
 import time
 from collections.abc import Mapping
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from atalante_hal.closing import Closing
 from atalante_hal.memory import anonymous_file
 
 MAGIC = int.from_bytes(b"ATLRING\0", "little")
@@ -129,7 +129,7 @@ class _Ring:
         os.close(self.fd)
 
 
-class RingWriter(_Ring):
+class RingWriter(_Ring, Closing):
     """The writing end; makes the memory and owns it.
 
     Args:
@@ -245,16 +245,8 @@ class RingWriter(_Ring):
             self.finish()
             self._release()
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-
-class RingReader(_Ring):
+class RingReader(_Ring, Closing):
     """The reading end, from a descriptor of the writer's (`RingWriter.fd`, inherited or duplicated); takes it over.
 
     Raises:
@@ -323,11 +315,3 @@ class RingReader(_Ring):
             del self._records
             self._header[_READER_PID] = 0
             self._release()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

@@ -6,21 +6,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 import pybullet
 
 from atalante_emulator.body import GRAVITY, load_urdf
+from atalante_hal.closing import Closing
 from atalante_hal.robot import JOINTS
 
 Vector = npt.NDArray[np.float64]
 Pose = tuple[Sequence[float], Sequence[float]]  # position [m], quaternion xyzw
 
 
-class EngineDynamics:
+class EngineDynamics(Closing):
     """One robot in PyBullet, hanging by its pelvis; a context manager. Joints are in the order of `JOINTS`."""
 
     def __init__(self, urdf: str) -> None:
@@ -58,16 +57,6 @@ class EngineDynamics:
             name: float(info[0])
             for name, info in zip((root, *(info[12].decode() for info in infos)), dynamics, strict=True)
         }
-
-    def __enter__(self) -> Self:
-        """This."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Disconnect."""
-        self.close()
 
     def close(self) -> None:
         """Disconnect from the engine."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -45,7 +46,7 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
     sources = [open_log(path) for path in logs]
     decoder = Decoder(plan)
     progress = Progress()
-    with _sink(out, plan) as sink:
+    with closing(_sink(out, plan)) as sink:
         for source in sources:
             for chunk in source.chunks():
                 for piece in decoder.decode(chunk):

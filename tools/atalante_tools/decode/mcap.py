@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -91,14 +90,8 @@ class McapSink:
             self._topics[row, channel] = topic
         return topic
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None:
-            self.flush()
+    def close(self) -> None:
+        """Finish the file."""
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._file.close()
 

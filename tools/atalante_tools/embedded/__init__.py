@@ -15,12 +15,12 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 from atalante_dbc import Network
 from atalante_hal.bus import BusDown
 from atalante_hal.bus.shared import SharedBus, descriptors
+from atalante_hal.closing import Closing
 from atalante_hal.robot import Robot
 from atalante_tools.body import require_engine
 from atalante_tools.outcome import Failed
@@ -44,7 +44,7 @@ class Order:
     faults: Sequence[Fault]
 
 
-class EmbeddedRobot:
+class EmbeddedRobot(Closing):
     """The child, and `bus`, the HAL's end of the bus to it; as a context manager it is there for the block.
 
     Starting it early is worth while: until `begin` it loads what it needs.
@@ -104,11 +104,3 @@ class EmbeddedRobot:
             self._child.wait()
         if self._child.stdin is not None:
             self._child.stdin.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
