@@ -22,7 +22,14 @@ def test_both_sides_are_measured(run: Callable[[Effort], Measurement]) -> None:
 
 def test_a_log_that_is_not_clean_is_no_benchmark(monkeypatch: pytest.MonkeyPatch) -> None:
     """Seams without new counters would be findings: then the figures would not be those of a clean log."""
-    monkeypatch.setattr(benchmark, "_QUICK_REPEATED", 2)
     monkeypatch.setattr(benchmark, "COUNTER_BYTE", 4)
     with pytest.raises(WorkError, match="not clean"):
         benchmark.judge_log(Effort(quick=True))
+
+
+def test_a_repetition_of_the_full_length_joins_on_without_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A joint that has sagged since the recording began would jump back at the seam."""
+    monkeypatch.setattr(benchmark, "_REPEATED", 2)
+    with benchmark._log(Effort()) as (path, frames):
+        assert len(frames) > 2 * benchmark._CYCLES
+        assert benchmark._judging(path, frames)() > 0.0

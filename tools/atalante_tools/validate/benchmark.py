@@ -23,9 +23,10 @@ from atalante_tools.bench.measure import Block, Effort, Measurement, require
 from atalante_tools.validate.plan import Plan
 from atalante_tools.validate.project import Project
 
-#: Cycles recorded (whole periods of every message), and how often they are repeated: 50,000 cycles, 1.3 million frames.
+#: Cycles recorded (whole periods of every message, and long enough for the joints to come to rest), and how often they are
+#: repeated: 50,000 cycles, 1.3 million frames.
 _CYCLES, _REPEATED = 2000, 25
-_QUICK_CYCLES, _QUICK_REPEATED = 300, 1
+_QUICK_CYCLES, _QUICK_REPEATED = 300, 2
 #: Frames that python-can and cantools get in a block: they take their time.
 _SLICE = 30_000
 _MS = 1_000_000  # ns
@@ -130,23 +131,28 @@ class _Tap:
 
 
 def _record(cycles: int) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """The robot holding its pose in ACTIVE: frames, their cycle from 0, and which ones the HAL sent."""
-    from atalante_hal.types import Command, SupervisorState
+    """The robot holding its pose in ACTIVE: frames, their cycle from 0, and which ones the HAL sent.
+
+    The hold carries gravity, so that the joints come to rest where they began: a repetition joins on without a jump.
+    """
+    from atalante_hal.types import SupervisorState
     from atalante_tools.options import EMBEDDED, Target
+    from atalante_tools.pose_hold import PoseHold
     from atalante_tools.rig import open_hal
 
-    tap, no_vibration = _Tap(), np.zeros(8)
+    tap = _Tap()
     with open_hal(Target(EMBEDDED, "", True), tap=tap) as rig:
         hal, held = rig.hal, 0
-        anchor = hal.state.position.copy()
+        controller = PoseHold(hal.robot)
         while held < cycles:
             tap.cycle = held
             state = hal.read()
             if state.supervisor is SupervisorState.ACTIVE:
-                hal.write(Command(hal.robot.hold_kp * (anchor - state.position), no_vibration))
+                if not held:
+                    controller.reset(state)
+                hal.write(controller.update(state))
                 held += 1
             else:
-                anchor = state.position.copy()
                 hal.hold()
                 tap.taken.clear()
             require(hal.state.cycle < cycles + 2000, "the robot is ACTIVE")
