@@ -1,79 +1,140 @@
-"""Machine code and interpreter give the same numbers; without a compiler there is none, and a cache that is kept."""
+"""Machine code of hot loops: the same answers, errors like Python's, and nothing stale out of the cache."""
 
 from __future__ import annotations
 
+import math
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import FunctionType
+from typing import Any
 
-import casadi
 import numpy as np
 import pytest
 
-from atalante_control.generation import compiled as module
-from atalante_control.generation.compiled import cache_directory, compiled
-from atalante_control.generation.programme import Functions, Programme, Rows
+from atalante_hal import compiled as module
+from atalante_hal.compiled import compiled
+
+GAIN = 2.0
 
 
-@pytest.fixture(scope="module")
-def functions() -> Functions:
-    programme = Programme(3, casadi.SX.sym("p", 1))
-    x = casadi.SX.sym("x", 3)
-    # Sums of products: what a contraction to fused multiply-adds would round differently.
-    value = x[0] * x[1] + x[1] * x[2] + casadi.sin(x[0]) * x[2]
-    programme.add([Rows("one", "m", 1.0, value, np.zeros(1), np.ones(1))], x, [np.arange(3)])
-    programme.minimise(casadi.sumsqr(x) * value, x, [np.arange(3)], np.ones(1))
-    return programme.functions()
+def _scaled(x: float) -> float:
+    return x * GAIN
 
 
-@pytest.fixture
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv(module.CACHE_VARIABLE, str(tmp_path / "cache"))
-    return tmp_path / "cache"
+def total(values: Any, limit: float) -> float:
+    sum_ = 0.0
+    for i in range(len(values)):
+        sum_ += min(limit, _scaled(values[i]))
+    return sum_
 
 
-def test_same_bits_as_the_interpreter(functions: Functions, cache: Path) -> None:
-    machine = compiled(functions)
-    assert machine is not None, "this machine has no gcc"
-    random = np.random.default_rng(2)
-    for _ in range(50):
-        arguments = [random.normal(size=3), [0.3], 0.7, random.normal(size=1)]
-        for one, other in zip(functions, machine, strict=True):
-            given = arguments[: one.n_in()]
-            expected, found = one.call([casadi.DM(a) for a in given]), other.call([casadi.DM(a) for a in given])
-            for a, b in zip(expected, found, strict=True):
-                assert np.array(a).tobytes() == np.array(b).tobytes()
+def beyond(values: Any, place: int) -> float:
+    return float(values[place])
 
 
-def test_compiled_once(functions: Functions, cache: Path) -> None:
-    assert compiled(functions) is not None
-    [library] = cache.iterdir()
-    written = library.stat().st_mtime_ns
-    assert compiled(functions) is not None
-    assert [path.stat().st_mtime_ns for path in cache.iterdir()] == [written]
+def leaves(x: float) -> Any:
+    return compiled(x)  # type: ignore[type-var]
 
 
-def test_other_options_are_another_library(functions: Functions, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    compiled(functions)
-    monkeypatch.setattr(module, "OPTIONS", (*module.OPTIONS, "-g0"))
-    compiled(functions)
-    assert len(list(cache.iterdir())) == 2
+def test_gives_what_python_gives() -> None:
+    values = np.random.default_rng(0).standard_normal(100)
+    assert compiled(total)(values, 1.5) == total(values, 1.5)
 
 
-@pytest.mark.parametrize("compiler", ["no-such-compiler", "false"])
-def test_none_without_a_compiler_that_works(
-    functions: Functions, cache: Path, monkeypatch: pytest.MonkeyPatch, compiler: str
-) -> None:
-    monkeypatch.setattr(module, "COMPILER", compiler)
-    assert compiled(functions) is None
+def test_is_compiled_once() -> None:
+    assert compiled(total) is compiled(total)
+    assert compiled(total) is not total
 
 
-def test_none_where_nothing_can_be_kept(functions: Functions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    blocked = tmp_path / "file"
-    blocked.write_text("not a folder")
-    monkeypatch.setenv(module.CACHE_VARIABLE, str(blocked))
-    assert compiled(functions) is None
+def test_checks_bounds() -> None:
+    with pytest.raises(IndexError):
+        compiled(beyond)(np.zeros(3), 3)
 
 
-def test_the_cache_is_the_users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(module.CACHE_VARIABLE, raising=False)
+def test_divides_like_python() -> None:
+    with pytest.raises(ZeroDivisionError):
+        compiled(_inverse)(0.0)
+
+
+def _inverse(x: float) -> float:
+    return 1.0 / x
+
+
+def test_refuses_a_callee_of_another_module() -> None:
+    with pytest.raises(TypeError, match=r"leaves calls atalante_hal\.compiled\.compiled; .* of its own module"):
+        compiled(leaves)
+
+
+def test_is_the_plain_function_where_compiling_is_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    assert compiled(total) is total
+
+
+def test_compiles_where_nothing_can_be_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "atalante").write_text("a file where the folder should be")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert cache_directory() == tmp_path / "atalante"
+    assert module._folder(total) is None  # type: ignore[arg-type]
+    assert compiled(_kept_nowhere)(2.0) == 4.0
+
+
+def _kept_nowhere(x: float) -> float:
+    return x * x
+
+
+def _changed(function: Callable[..., Any], **names: object) -> FunctionType:
+    assert isinstance(function, FunctionType)
+    twin = FunctionType(function.__code__, {**function.__globals__, **names}, function.__name__)
+    twin.__module__, twin.__qualname__ = function.__module__, function.__qualname__
+    return twin
+
+
+def _other_scaled(x: float) -> float:
+    return x * GAIN + 1.0
+
+
+_other_scaled.__name__ = _other_scaled.__qualname__ = "_scaled"
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        _changed(total, _scaled=_changed(_scaled, GAIN=3.0)),
+        _changed(total, _scaled=_other_scaled),
+        _changed(total, _scaled=_changed(_scaled, GAIN=np.float32(2.0))),
+    ],
+    ids=["constant of a callee", "body of a callee", "type of a constant"],
+)
+def test_the_cache_notices_every_change(changed: FunctionType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert module._folder(total) != module._folder(changed)  # type: ignore[arg-type]
+    assert module._folder(total) == module._folder(_changed(total))  # type: ignore[arg-type]
+
+
+def test_a_second_process_finds_it_in_the_cache(tmp_path: Path) -> None:
+    (tmp_path / "kernel.py").write_text("def square(x):\n    return x * x\n")
+    script = (
+        "from atalante_hal.compiled import compiled; from kernel import square; f = compiled(square); f(3.0);"
+        "print(sum(f.stats.cache_hits.values()))"
+    )
+    hits = [
+        subprocess.run(
+            [sys.executable, "-c", script],
+            cwd=tmp_path,
+            env={"XDG_CACHE_HOME": str(tmp_path), "PATH": "/usr/bin:/bin"},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
+        for _ in range(2)
+    ]
+    assert hits == ["0", "1"]
+
+
+def test_machine_code_is_the_same_for_every_machine() -> None:
+    import numba
+
+    compiled(total)
+    assert (numba.config.CPU_NAME, numba.config.CPU_FEATURES) == ("generic", "")
+    assert math.isfinite(compiled(total)(np.ones(2), 5.0))
