@@ -1,10 +1,10 @@
 """Hot loops as machine code: `compiled(function)` is the same function, compiled by numba when it is first called.
 
 The source stays plain Python, one copy of it: tests that look into it (coverage, mutation), debuggers and profilers run it as it
-stands when NUMBA_DISABLE_JIT=1 is set, with the same results. A function may call functions of its own module; they are compiled
-with it. What was compiled is kept in the user's cache under a fingerprint of everything it was made from, callees and constants
-included, so a second start does not compile and a change of any of it is never missed. Code is generic for its architecture:
-one machine's results are another's, and one cache serves an emulated kernel, too.
+stands when NUMBA_DISABLE_JIT=1 is set, with the same results. Functions it calls are compiled with it. What was compiled is kept
+in the user's cache under a fingerprint of everything it was made from, callees and constants included, so a second start does
+not compile and a change of any of it is never missed. Code is generic for its architecture: one machine's results are
+another's, and one cache serves an emulated kernel, too.
 """
 
 from __future__ import annotations
@@ -27,9 +27,6 @@ def compiled(function: Function) -> Function:
     """The function as machine code: numbers and arrays in, numbers and arrays out. Bounds are checked, as in Python.
 
     Call it once with what it will be given before time matters: types it has not seen are compiled when they come.
-
-    Raises:
-        TypeError: it calls a Python function of another module, whose changes would go unseen.
     """
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         return function
@@ -71,11 +68,6 @@ def _callees(function: FunctionType) -> Iterator[tuple[str, FunctionType]]:
     for name in dict.fromkeys(_names(function.__code__)):
         value = function.__globals__.get(name)
         if isinstance(value, FunctionType):
-            if value.__module__ != function.__module__:
-                raise TypeError(
-                    f"{function.__module__}.{function.__name__} calls {value.__module__}.{name}; "
-                    "a compiled function calls functions of its own module only"
-                )
             yield name, value
 
 
