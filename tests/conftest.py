@@ -23,6 +23,7 @@ from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus import Bus
 from atalante_hal.bus.pair import lockstep_pair
+from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.frame import Frames
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot, load_robot
@@ -126,16 +127,13 @@ def urdf_text(robot: Robot) -> str:
     return urdf(ExoskeletonParameters(), robot)
 
 
-class FilterBus:
+class FilterBus(WrappedBus):
     """A bus that lets a test lose, change or add frames on their way to the HAL or to the nodes."""
 
     def __init__(self, bus: Bus) -> None:
-        self.bus = bus
+        super().__init__(bus)
         self.to_hal: Callable[[Frames], Frames] = lambda frames: frames
         self.to_nodes: Callable[[Frames], Frames] = lambda frames: frames
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.bus, name)
 
     def send(self, frames: Frames) -> None:
         kept = self.to_nodes(frames)

@@ -25,6 +25,7 @@ from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.bus.python_can import PythonCanBus, message_of
 from atalante_hal.bus.replay import LogUnreadable, ReplayBus
 from atalante_hal.bus.shared import shared_pair
+from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.frame import (
     FD_LENGTHS,
     FLAG_BRS,
@@ -273,6 +274,15 @@ class TestSharedBus(FrameSender, FrameReceiver, FrameWaiter):
     @pytest.fixture
     def ends(self) -> Iterator[tuple[Bus, Bus]]:
         one, other = shared_pair()
+        yield one, other
+        one.close()
+        other.close()
+
+
+class TestWrappedBus(FrameSender, FrameReceiver):
+    @pytest.fixture
+    def ends(self) -> Iterator[tuple[Bus, Bus]]:
+        one, other = map(WrappedBus, lockstep_pair())
         yield one, other
         one.close()
         other.close()

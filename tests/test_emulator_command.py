@@ -5,21 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
 from atalante_dbc import Network
 from atalante_hal.bus import BusDown
 from atalante_hal.bus.pair import PairBus, lockstep_pair
-from atalante_hal.frame import FRAME, Frames, new_frames
+from atalante_hal.frame import Frames, new_frames
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
 from atalante_hal.types import SupervisorState
 from atalante_tools import emulator as emulator_module
 from atalante_tools import rig as rig_module
 from atalante_tools.cli import cli
-from atalante_tools.emulator import Line
 from atalante_tools.signals import StopRequest
 
 
@@ -121,49 +119,3 @@ def test_misuse_is_one_sentence_and_code_2(arguments: list[str], sentence: str) 
     assert result.exit_code == 2
     assert sentence in result.stderr
     assert result.stderr.count("\n") == 1
-
-
-# -- the line --------------------------------------------------------------------------------------------------------
-
-
-def frames_with(ids: list[int]) -> Frames:
-    frames = new_frames(len(ids))
-    frames["can_id"], frames["len"], frames["flags"] = ids, 8, 4
-    return frames
-
-
-def received(bus: PairBus) -> list[int]:
-    block = new_frames(32)
-    ids: list[int] = block["can_id"][: bus.receive(block)].tolist()
-    return ids
-
-
-def test_the_line_counts_and_keeps_the_pendant_back_once_another_speaks() -> None:
-    near, far = lockstep_pair()
-    line = Line(near, pendant_id=0x194)
-    batch, alone, none = frames_with([0x181, 0x194, 0x701]), frames_with([0x194]), new_frames(0)
-    line.send(batch)
-    assert received(far) == [0x181, 0x194, 0x701]
-    far.send(frames_with([0x10, 0x100]))
-    assert line.receive(new_frames(8)) == 2
-    assert not line.pendant_given_away
-    far.send(frames_with([0x10, 0x194]))
-    line.receive(new_frames(8))
-    assert line.pendant_given_away
-    for _ in range(3):
-        line.send(batch)
-        line.send(alone)
-        line.send(none)
-        assert received(far) == [0x181, 0x701]
-    assert (line.sent, line.received) == (9, 4)
-
-
-def test_what_lies_behind_the_received_frames_is_not_heard() -> None:
-    near, far = lockstep_pair()
-    line = Line(near, pendant_id=0x194)
-    block = frames_with([0x194] * 8)
-    far.send(frames_with([0x10]))
-    assert line.receive(block) == 1
-    assert not line.pendant_given_away
-    assert line.stamps.dtype == np.int64
-    assert (line.dropped, line.name, block.dtype) == (0, near.name, FRAME)

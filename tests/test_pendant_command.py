@@ -21,7 +21,7 @@ from atalante_hal.robot import Robot
 from atalante_hal.types import Command, SupervisorState
 from atalante_tools import pendant, pendant_session
 from atalante_tools.cli import cli
-from atalante_tools.emulator import Line
+from atalante_tools.emulator_line import Line
 from atalante_tools.options import Target
 from atalante_tools.pendant_node import GRACE, PendantNode, Request
 from atalante_tools.pendant_session import Keyboard, Session

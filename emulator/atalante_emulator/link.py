@@ -16,7 +16,8 @@ import numpy as np
 from atalante_dbc import Message, Network
 from atalante_emulator.faults import LINK_KINDS, Fault, messages_of
 from atalante_emulator.wire import Babble, Wire
-from atalante_hal.bus import Bus, Stamps
+from atalante_hal.bus import Bus
+from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
 from atalante_hal.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, ID_EXTENDED, Frames, new_frames
 
@@ -187,7 +188,7 @@ _EFFECTS: Final[dict[str, Callable[[_Disturbance, Frames, Message, int], Sequenc
 }
 
 
-class FaultyBus:
+class FaultyBus(WrappedBus):
     """The emulator's end of a bus, with faults on the wire.
 
     Frames that come late or from nobody are on the wire when the SYNC of their cycle is: before what the HAL sent for the
@@ -208,7 +209,7 @@ class FaultyBus:
         Raises:
             FaultError: the network has no such target or signal.
         """
-        self.bus = bus
+        super().__init__(bus)
         #: The HAL sent a SYNC in the last `receive`, whatever became of it.
         self.synced = False
         self._clock, self._cycle, self._begun = clock, -1, -1
@@ -223,25 +224,6 @@ class FaultyBus:
         self._for_nodes: list[Frames] = []  # what they have not taken yet
         #: The time the frames take on the buses, while there is a flood.
         self.wire = Wire(network)
-
-    @property
-    def name(self) -> str:
-        """The channel."""
-        return self.bus.name
-
-    @property
-    def stamps(self) -> Stamps:
-        """Of the wire, for the frames as they came from there."""
-        return self.bus.stamps
-
-    @property
-    def dropped(self) -> int:
-        """Frames lost by the wire itself."""
-        return self.bus.dropped
-
-    def close(self) -> None:
-        """Leave the wire."""
-        self.bus.close()
 
     def send(self, frames: Frames) -> None:
         """What the nodes say, on its way to the HAL. Raises as the bus does."""

@@ -27,7 +27,9 @@ from atalante_dbc import Message, Network
 from atalante_emulator.body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
+from atalante_hal.bus import Bus
 from atalante_hal.bus.pair import lockstep_pair
+from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.frame import FLAG_FDF, FRAME_BYTES, Frames, as_words, header_word, new_frames
 from atalante_hal.hal import Hal
 from atalante_hal.image import ReceiveImage, TransmitImage
@@ -194,20 +196,18 @@ def _check_committed(
 # -- the HAL and the emulated robot ------------------------------------------------------------------------------------
 
 
-class FuzzedBus:
+class FuzzedBus(WrappedBus):
     """A bus that hands over fuzzed frames among those that came; first come, first served, none is lost."""
 
-    def __init__(self, bus: Any, fuzzer: Fuzzer) -> None:
-        self.bus, self._fuzzer = bus, fuzzer
+    def __init__(self, bus: Bus, fuzzer: Fuzzer) -> None:
+        super().__init__(bus)
+        self._fuzzer = fuzzer
         self.per_receive = 0  # frames to put into the next receive, then 0 again
         self.fuzzed = 0
         self.most = 0  # frames handed over in one call
         self._waiting: deque[Frames] = deque()
         self._scratch = new_frames(1024)
         self._shuffle = np.random.default_rng(0)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.bus, name)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
         """As `Bus.receive`."""

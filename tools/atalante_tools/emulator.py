@@ -14,8 +14,7 @@ from atalante_tools.terminal import Progress, say
 
 if TYPE_CHECKING:
     from atalante_emulator.emulator import Emulator
-    from atalante_hal.bus import Bus, Stamps
-    from atalante_hal.frame import Frames
+    from atalante_tools.emulator_line import Line
 
 #: Seconds between two status lines.
 STATUS_PERIOD: Final = 1.0
@@ -52,6 +51,7 @@ def command(target: Target, seed: int, operator: bool, xi: float | None) -> None
     with stop_requested() as stop, open_body(robot) as body:
         from atalante_emulator.emulator import Emulator
         from atalante_emulator.pendant import Operator
+        from atalante_tools.emulator_line import Line
 
         bus = Line(join(network, open_buses(network, target)), network.message("PENDANT_STATE").frame_id)
         try:
@@ -101,52 +101,3 @@ def status_line(emulator: Emulator, bus: Line) -> str:
     drives = ", ".join(f"{count} {name}" for name, count in states.items())
     lost = f", {emulator.frames_lost} lost" if emulator.frames_lost else ""
     return f"{emulator.cycle} cycles, {bus.received} frames in, {bus.sent} out{lost}; drives: {drives}"
-
-
-class Line:
-    """The emulated robot's bus: counts frames, and gives the pendant away.
-
-    When somebody else speaks as the pendant, the emulated operator's own frames are kept back from then on, as a pendant
-    process falls silent for a newer one.
-    """
-
-    def __init__(self, bus: Bus, pendant_id: int) -> None:
-        self._bus, self._pendant_id = bus, pendant_id
-        self.name = bus.name
-        self.sent = 0
-        self.received = 0
-        self.pendant_given_away = False
-
-    @property
-    def stamps(self) -> Stamps:
-        """As `Bus.stamps`."""
-        return self._bus.stamps
-
-    @property
-    def dropped(self) -> int:
-        """As `Bus.dropped`."""
-        return self._bus.dropped
-
-    def send(self, frames: Frames) -> None:
-        """As `Bus.send`."""
-        if self.pendant_given_away:
-            frames = self._without_pendant(frames)
-        self._bus.send(frames)
-        self.sent += len(frames)
-
-    def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """As `Bus.receive`."""
-        count = self._bus.receive(frames, timeout)
-        self.received += count
-        if not self.pendant_given_away and (frames["can_id"][:count] == self._pendant_id).any():
-            self.pendant_given_away = True
-        return count
-
-    def close(self) -> None:
-        """As `Bus.close`."""
-        self._bus.close()
-
-    def _without_pendant(self, frames: Frames) -> Frames:
-        """The batch less the pendant's frame; a batch without it is itself."""
-        kept = frames["can_id"] != self._pendant_id
-        return frames if kept.all() else frames[kept]

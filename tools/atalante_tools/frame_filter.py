@@ -16,7 +16,8 @@ from typing import Final
 import numpy as np
 
 from atalante_dbc import Network
-from atalante_hal.bus import Bus, Stamps
+from atalante_hal.bus import Bus
+from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.frame import Frames, as_words
 from atalante_hal.transceiver import FrameTap
 
@@ -52,8 +53,10 @@ class Fault:
         return self.frames is not None and all(self.hits.get(frame_id, 0) >= self.frames for frame_id in self.ids)
 
 
-class FrameFilter:
+class FrameFilter(WrappedBus):
     """A bus with faults. Without any it passes everything on.
+
+    A frame that was delayed, or comes behind one that was dropped, has another's stamp.
 
     Args:
         bus: owned by the caller.
@@ -72,7 +75,8 @@ class FrameFilter:
         step: Callable[[], object] | None = None,
         seed: int = 0,
     ) -> None:
-        self.bus, self.tap = bus, tap
+        super().__init__(bus)
+        self.tap = tap
         self.faults: list[Fault] = []
         self._network, self._step = network, step
         self._random = np.random.default_rng(seed)
@@ -131,21 +135,6 @@ class FrameFilter:
 
     # -- bus -----------------------------------------------------------------------------------------------------------
 
-    @property
-    def name(self) -> str:
-        """The channel's."""
-        return self.bus.name
-
-    @property
-    def stamps(self) -> Stamps:
-        """Of the bus; of a frame that was delayed or comes behind one that was dropped, not its own."""
-        return self.bus.stamps
-
-    @property
-    def dropped(self) -> int:
-        """Frames the bus lost; not what a fault dropped."""
-        return self.bus.dropped
-
     def send(self, frames: Frames) -> None:
         """As `Bus.send`."""
         if not self._syncs.isdisjoint(frames["can_id"].tolist()):
@@ -170,10 +159,6 @@ class FrameFilter:
         if self.tap is not None and count:
             self.tap.received(frames, count)
         return count
-
-    def close(self) -> None:
-        """Close the bus."""
-        self.bus.close()
 
     def _through(self, frames: Frames, late: list[tuple[int, Frames]]) -> Frames:
         """What arrives of a batch, with what was held back before and is due now. A copy."""

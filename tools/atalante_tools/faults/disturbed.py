@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import builtins
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from atalante_hal.bus import Bus, BusDown, BusFull
+from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.frame import Frames
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Command, Controller, State, Vector
@@ -87,21 +88,18 @@ class DisturbedClock:
         return 0.0 if late is None else float(late.value)
 
 
-class DisturbedBus:
+class DisturbedBus(WrappedBus):
     """The HAL's end of the bus, refusing frames when asked."""
 
     def __init__(self, bus: Bus, now: Moment) -> None:
-        self._bus, self._now = bus, now
-
-    def __getattr__(self, name: str) -> Any:
-        """Everything but sending is the bus's."""
-        return getattr(self._bus, name)
+        super().__init__(bus)
+        self._now = now
 
     def send(self, frames: Frames) -> None:
         """Send, or raise `BusDown` or `BusFull`."""
         refused = self._now.of("bus_down", "bus_full")
         if refused is None:
-            self._bus.send(frames)
+            super().send(frames)
         elif refused.kind == "bus_down":
             raise BusDown("the interface is down, as asked for")
         else:

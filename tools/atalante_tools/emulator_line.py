@@ -1,0 +1,42 @@
+"""The bus of `atalante emulator`: HAL -> bus -> Line -> nodes, and back."""
+
+from __future__ import annotations
+
+from atalante_hal.bus import Bus
+from atalante_hal.bus.wrapped import WrappedBus
+from atalante_hal.frame import Frames
+
+
+class Line(WrappedBus):
+    """The emulated robot's bus: counts frames, and gives the pendant away.
+
+    When somebody else speaks as the pendant, the emulated operator's own frames are kept back from then on, as a pendant
+    process falls silent for a newer one.
+    """
+
+    def __init__(self, bus: Bus, pendant_id: int) -> None:
+        super().__init__(bus)
+        self._pendant_id = pendant_id
+        self.sent = 0
+        self.received = 0
+        self.pendant_given_away = False
+
+    def send(self, frames: Frames) -> None:
+        """As `Bus.send`."""
+        if self.pendant_given_away:
+            frames = self._without_pendant(frames)
+        super().send(frames)
+        self.sent += len(frames)
+
+    def receive(self, frames: Frames, timeout: float = 0.0) -> int:
+        """As `Bus.receive`."""
+        count = super().receive(frames, timeout)
+        self.received += count
+        if not self.pendant_given_away and (frames["can_id"][:count] == self._pendant_id).any():
+            self.pendant_given_away = True
+        return count
+
+    def _without_pendant(self, frames: Frames) -> Frames:
+        """The batch less the pendant's frame; a batch without it is itself."""
+        kept = frames["can_id"] != self._pendant_id
+        return frames if kept.all() else frames[kept]
