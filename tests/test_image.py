@@ -6,6 +6,7 @@ from binascii import crc_hqx
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -424,3 +425,75 @@ def test_a_refusal_is_of_its_row_alone_and_ages_from_the_cycle_before():
     mine = rx.codec.row_of == 3
     assert np.array_equal(rx.values[~mine], new[~mine])
     assert not np.array_equal(rx.values[mine], new[mine])
+
+
+def test_everything_once_in_any_order_is_a_perfect_cycle():
+    tx, rx, buffer = pair()
+    deliver(tx, rx, buffer)
+    deliver(tx, rx, buffer, list(reversed(range(ROWS))))
+    assert rx.all_fresh
+    frames = tx.seal()
+    buffer[1 : ROWS + 1] = frames[::-1]
+    buffer[0]["can_id"] = 0x7FF
+    assert list(rx.accept(buffer, ROWS + 1)) == [0]
+    assert rx.all_fresh
+
+
+def test_a_frame_that_comes_twice_is_refused_once():
+    """Of the first row, too, where the first of the two stands before everything else."""
+    for row in (0, 3):
+        tx, rx, buffer = pair()
+        deliver(tx, rx, buffer)
+        frames = tx.seal()
+        buffer[:ROWS], buffer[ROWS] = frames, frames[row]
+        assert list(rx.accept(buffer, ROWS + 1)) == []
+        assert rx.refused == [(row, Check.REPEATED)]
+        assert not rx.all_fresh
+        assert (rx.check == Check.OK).all()
+
+
+def test_what_was_lost_before_a_good_frame_stays_told_after_a_bad_one():
+    tx, rx, buffer = pair()
+    deliver(tx, rx, buffer)
+    tx.seal()
+    frame = tx.seal()[5]
+    buffer[0] = buffer[1] = frame
+    rx.accept(buffer, 2)
+    assert (rx.check[5], rx.refused) == (Check.SOME_LOST, [(5, Check.REPEATED)])
+
+
+def test_damaged_frames_are_counted():
+    tx, rx, buffer = pair()
+    for damaged in range(1, 4):
+        frames = tx.seal()
+        frames[damaged]["data"][9] ^= 1
+        buffer[:ROWS] = frames
+        rx.accept(buffer, ROWS)
+        assert rx.crc_errors == damaged
+
+
+def test_an_image_begins_with_nothing():
+    rx = ReceiveImage(CYCLIC)
+    assert (rx.check.dtype, rx.age.dtype) == (np.uint8, np.int64)
+    assert rx.check.tolist() == [Check.NO_DATA] * ROWS
+    assert rx.age.tolist() == [NEVER] * ROWS
+    assert np.isnan(rx.values).all()
+    assert np.isnan(rx.values_before).all()
+    assert (rx.refused, rx.crc_errors, rx.all_fresh) == ([], 0, False)
+
+
+def test_what_comes_after_a_loss_is_used_and_refused_alike():
+    tx, rx, buffer = pair()
+    row, signal = rx.codec.rows["IMU_TORSO_STATE"], rx.codec.index("IMU_TORSO_STATE", "AccelX")
+    deliver(tx, rx, buffer)
+    for sent, check, kept in ((2.0, Check.SOME_LOST, 2.0), (np.nan, Check.INVALID, 2.0), (3.0, Check.OK, 3.0)):
+        tx.seal()
+        tx.values[signal] = sent
+        before = rx.values.copy()
+        deliver(tx, rx, buffer, [row])
+        assert rx.check[row] == (Check.SOME_LOST if check is Check.OK else check)
+        assert rx.values[signal] == pytest.approx(kept, abs=0.01)
+        assert np.array_equal(rx.values_before, before, equal_nan=True)
+        tx.values[signal] = 0.0
+    rx.refuse(row)
+    assert rx.values[signal] == pytest.approx(2.0, abs=0.01)
