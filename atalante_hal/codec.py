@@ -1,30 +1,34 @@
-"""Array codec: every signal of a set of messages decoded or encoded in a handful of array operations.
+"""Array codec: every signal of a set of messages decoded or encoded in one pass of machine code.
 
-The plan (word index, shifts, factors) is compiled from the DBC once. It works because no signal crosses a 64-bit word
-of the payload: a signal is one gather, two shifts, one multiply and one add, for all signals of a cycle together.
+The plan (word, place, mask, range, factor) is made from the DBC once. It works because no signal crosses a 64-bit word of the
+payload: a signal is one word, a shift and a mask, one add and one multiply.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc import Message, Signal
+from atalante_hal.compiled import compiled
 from atalante_hal.frame import FLAG_BRS, FLAG_FDF, WORDS, Frames, new_frames
 
 Vector = npt.NDArray[np.float64]
-Words = npt.NDArray[np.uint64]
+Words = npt.NDArray[np.int64]
+Plan = npt.NDArray[np.void]
 
-#: Adding this to a float rounds it to an integer that then stands in the low bits of the mantissa.
+#: What is done with a signal: where it stands, which codes it may have, and what they mean: (code + base) * factor + offset.
+PLAN = np.dtype(
+    [(name, np.int64) for name in ("word", "place", "mask", "largest", "low", "high", "invalid")]
+    + [(name, np.float64) for name in ("base", "factor", "offset")]
+)
+#: In the place of an invalid code, or of a signal: there is none.
+NO_CODE = -1
+#: Adding this to a float and taking it away again rounds it to an integer.
 _ROUND = 1.5 * 2.0**52
 _LONGEST = 51  # bits such an integer can have
-
-
-def _words(numbers: Iterable[int]) -> Words:
-    """Numbers as 64-bit words, negative ones wrapped."""
-    return np.array([number % (1 << 64) for number in numbers], np.uint64)
 
 
 def group_of(signal: str) -> str:
@@ -60,61 +64,33 @@ class Codec:
         self._compile([s for _, _, s in entries])
 
     def _compile(self, signals: list[Signal]) -> None:
-        limits = [sorted(round((x - s.offset) / s.factor) for x in (s.minimum, s.maximum)) for s in signals]
-        place = [s.start % 64 for s in signals]
-        self._word = np.array(
-            [r * WORDS + 1 + s.start // 64 for r, s in zip(self.row_of, signals, strict=True)], np.intp
-        )
-        self._factor = np.array([s.factor for s in signals])
-        self._offset = np.array([s.offset for s in signals])
-        self._has_offset = bool(self._offset.any())
-        # Decoding happens in place: the code of a signal stays at its bits of a word, counted from the signal's minimum.
-        # That needs no shifts, is one comparison for both ends of the range, and is exact in a float.
-        at_place = [2.0**p for p in place]
-        self._low = _words(low << p for (low, _), p in zip(limits, place, strict=True))
-        self._mask_at = _words((1 << s.length) - 1 << p for s, p in zip(signals, place, strict=True))
-        self._span = _words(high - low << p for (low, high), p in zip(limits, place, strict=True))
-        largest = [(1 << s.length - s.signed) - 1 for s in signals]
-        self._top = _words(end - low << p for end, (low, _), p in zip(largest, limits, place, strict=True))
-        self._turn = np.array([float(1 << s.length) for s in signals]) * at_place
-        in_codes = [s.offset / s.factor for s in signals]
-        exact = all(c == round(c) and round(c) * s.factor == s.offset for c, s in zip(in_codes, signals, strict=True))
-        self._base = np.array([low + exact * c for (low, _), c in zip(limits, in_codes, strict=True)]) * at_place
-        self._weight = self._factor / at_place
-        self._separate_offset = self._has_offset and not exact
-        self._raw = np.empty(self.size, np.uint64)
-        self._outside = np.empty(self.size, np.bool_)
-        self._all_inside = bytes(self.size)
-        self._inside = True
-        self._raw_min = np.array([float(low) for low, _ in limits])
-        self._raw_max = np.array([float(high) for _, high in limits])
-        # Encoding: scaled values to masked raw bits, in word order, or-ed together word by word.
-        by_word = np.argsort(self._word, kind="stable")
-        self._by_word = by_word
-        self._mask = np.array([(1 << s.length) - 1 for s in signals], np.uint64)
-        self._place = np.array([s.start % 64 for s in signals], np.uint64)[by_word]
-        words = self._word[by_word]
-        self._word_start = np.flatnonzero(np.diff(words, prepend=-1))
-        self._word_target = words[self._word_start]
-        self._scaled = np.empty(self.size)
-        self._bits = self._scaled.view(np.uint64)
-        self._sorted = np.empty(self.size, np.uint64)
-        self._round = np.array([_ROUND - exact * code for code in in_codes])
-        self._lowest = np.full(self.size, _ROUND).view(np.uint64) + _words(low for low, _ in limits)
-        self._range = _words(high - low for low, high in limits)
-        self._distance = np.empty(self.size, np.uint64)
-        self._beyond = np.empty(self.size, np.bool_)
+        plan = self.plan = np.zeros(len(signals), PLAN)
+        for entry, row, s in zip(plan, self.row_of.tolist(), signals, strict=True):
+            entry["word"], entry["place"] = row * WORDS + 1 + s.start // 64, s.start % 64
+            entry["mask"], entry["largest"] = (1 << s.length) - 1, (1 << s.length - s.signed) - 1
+            entry["low"], entry["high"] = sorted(round((x - s.offset) / s.factor) for x in (s.minimum, s.maximum))
+            entry["invalid"] = NO_CODE if s.invalid_raw is None else s.invalid_raw
+            # An offset that is a whole number of codes is added to the code, which is exact.
+            code = s.offset / s.factor
+            exact = code == round(code) and round(code) * s.factor == s.offset
+            entry["base"], entry["factor"], entry["offset"] = (
+                (code, s.factor, 0.0) if exact else (0.0, s.factor, s.offset)
+            )
+        #: Payload words that carry a signal.
+        self.words = np.unique(plan["word"])
+        #: Raw code of every signal, of the last `decode` or `encode`.
+        self.codes = np.zeros(self.size, np.int64)
+        self._decode, self._encode = compiled(decode), compiled(encode)
         # Decoding one row alone: place of the value, bits, largest code, range, scale.
         self._one_by_one: list[list[tuple[int, int, int, int, int, int, float, float]]] = [[] for _ in self.messages]
-        for i, (row, s, (low, high)) in enumerate(zip(self.row_of.tolist(), signals, limits, strict=True)):
-            plan = (i, s.start, (1 << s.length) - 1, largest[i], low, high, s.factor, s.offset)
-            self._one_by_one[row].append(plan)
+        columns = (plan[name].tolist() for name in ("mask", "largest", "low", "high"))
+        for i, (row, s, *codes) in enumerate(zip(self.row_of.tolist(), signals, *columns, strict=True)):
+            mask, largest, low, high = codes
+            self._one_by_one[row].append((i, s.start, mask, largest, low, high, s.factor, s.offset))
         self._invalid_codes = [
             [(s.start, (1 << s.length) - 1, s.invalid_raw) for s in m.signals if s.invalid_raw is not None]
             for m in self.messages
         ]
-        self._invalid = np.array([s.invalid_raw or 0 for s in signals], np.uint64)
-        self._no_invalid = [s.invalid_raw is None for s in signals]
 
     def index(self, message: str, signal: str) -> int:
         """Place of one signal in the decoded values.
@@ -147,49 +123,18 @@ class Codec:
             frames[row]["flags"] = FLAG_FDF | FLAG_BRS
         return frames
 
-    def extract(self, words: Words) -> bool:
-        """First half of decoding: codes out of the payload words, counted from each signal's minimum.
-
-        Args:
-            words: flat view of the frames, shape (rows * 9,).
-
-        Returns:
-            Whether every signal is inside its DBC range (an invalid code is outside it).
-        """
-        # Results as positional arguments: a fifth faster than `out=`.
-        raw = self._raw
-        words.take(self._word, None, raw, "clip")
-        np.subtract(raw, self._low, raw)
-        np.bitwise_and(raw, self._mask_at, raw)
-        # One comparison for both ends: below the minimum has wrapped around to beyond the maximum.
-        np.greater(raw, self._span, self._outside)
-        self._inside = self._outside.tobytes() == self._all_inside
-        return self._inside
-
-    def rows_outside(self) -> list[int]:
-        """Rows with a signal outside its range, of the last `extract`."""
-        return sorted(set(self.row_of[self._outside].tolist()))
-
-    def scale(self, out: Vector) -> None:
-        """Second half of decoding: codes of the last `extract` to physical values. Shape (size,)."""
-        out[...] = self._raw
-        np.add(out, self._base, out)
-        if not self._inside:
-            wrapped = self._raw > self._top
-            out[wrapped] -= self._turn[wrapped]
-        np.multiply(out, self._weight, out)
-        if self._separate_offset:
-            np.add(out, self._offset, out)
-
     def decode(self, frames: Frames, out: Vector) -> bool:
         """Physical values of all signals of the rows. Shape (size,), DBC units.
 
         Returns:
-            Whether every signal is inside its DBC range.
+            Whether every signal is inside its DBC range (an invalid code is outside it).
         """
-        inside = self.extract(frames.view(np.uint64))
-        self.scale(out)
-        return inside
+        return self._decode(frames.view(np.int64), self.plan, self.codes, out)
+
+    def rows_outside(self) -> list[int]:
+        """Rows with a signal outside its range, of the last `decode`."""
+        outside = (self.codes < self.plan["low"]) | (self.codes > self.plan["high"])
+        return sorted(set(self.row_of[outside].tolist()))
 
     def decode_row(self, row: int, payload: bytes, out: Vector) -> bool:
         """The values of one message alone, signal by signal: for a handful of signals cheaper than array operations.
@@ -227,31 +172,73 @@ class Codec:
         Raises:
             ValueError: NaN for a signal without an invalid code.
         """
-        self.pack(values, frames.view(np.uint64))
+        self.require_code(self._encode(values, self.plan, self.words, self.codes, frames.view(np.int64)))
 
-    def pack(self, values: Vector, words: Words) -> None:
-        """As `encode`, into a flat view of the frames made beforehand. Shape (rows * 9,)."""
-        scaled, bits = self._scaled, self._bits
-        shifted = np.subtract(values, self._offset, scaled) if self._separate_offset else values
-        np.divide(shifted, self._factor, scaled)
-        np.add(scaled, self._round, scaled)
-        # One comparison for both ends, infinities and NaN: as numbers of bits all are far beyond the maximum.
-        np.subtract(bits, self._lowest, self._distance)
-        np.greater(self._distance, self._range, self._beyond)
-        if self._beyond.tobytes() != self._all_inside:
-            self._round_nearest(values)
-        np.bitwise_and(bits, self._mask, bits)
-        bits.take(self._by_word, None, self._sorted, "clip")
-        np.left_shift(self._sorted, self._place, self._sorted)
-        words[self._word_target] = np.bitwise_or.reduceat(self._sorted, self._word_start)
+    def require_code(self, nameless: int) -> None:
+        """Raise `ValueError` for what `encode` returned, unless every value had a code."""
+        if nameless != NO_CODE:
+            message, signal = self.signals[nameless]
+            raise ValueError(f"{message.name}.{signal.name} is NaN and has no invalid code in the DBC")
 
-    def _round_nearest(self, values: Vector) -> None:
-        """Codes as `pack` needs them, when there are values outside their range or NaN."""
-        codes = (values - self._offset) / self._factor
-        no_value = np.isnan(codes)
-        for i in np.flatnonzero(no_value).tolist():
-            if self._no_invalid[i]:
-                message, signal = self.signals[i]
-                raise ValueError(f"{message.name}.{signal.name} is NaN and has no invalid code in the DBC")
-        np.add(np.clip(codes, self._raw_min, self._raw_max), _ROUND, self._scaled)
-        self._bits[no_value] = self._invalid[no_value]
+
+def decode(words: Words, plan: Plan, codes: Words, values: Vector) -> bool:
+    """Raw codes and physical values of all signals; returns whether every code is in its range.
+
+    Args:
+        words: flat view of the frames, shape (rows * 9,).
+        plan: shape (size,), like `codes` and `values`, which are rewritten.
+    """
+    inside = read_codes(words, plan, codes)
+    scale(codes, plan, values)
+    return inside
+
+
+def read_codes(words: Words, plan: Plan, codes: Words) -> bool:
+    """First half of decoding: raw codes; returns whether every one is in its range."""
+    inside = True
+    for i in range(len(plan)):
+        signal = plan[i]
+        code = words[signal["word"]] >> signal["place"] & signal["mask"]
+        if code > signal["largest"]:  # of a signed signal: negative
+            code -= signal["mask"] + 1
+        codes[i] = code
+        inside &= signal["low"] <= code <= signal["high"]
+    return inside
+
+
+def scale(codes: Words, plan: Plan, values: Vector) -> None:
+    """Second half of decoding: raw codes to physical values."""
+    for i in range(len(plan)):
+        values[i] = (codes[i] + plan[i]["base"]) * plan[i]["factor"] + plan[i]["offset"]
+
+
+def encode(values: Vector, plan: Plan, targets: Words, codes: Words, words: Words) -> int:
+    """Physical values into the payload words; values outside their range as the nearest valid code, NaN as the invalid one.
+
+    Args:
+        targets: payload words that carry a signal; their other bits become 0.
+        words: flat view of the frames, shape (rows * 9,).
+
+    Returns:
+        `NO_CODE`; or a signal that is NaN and has no invalid code, and then nothing was written.
+    """
+    for i in range(len(plan)):
+        signal, value = plan[i], values[i]
+        # Rounds to even; infinities and NaN stay what they are.
+        code = ((value - signal["offset"]) / signal["factor"] + (_ROUND - signal["base"])) - _ROUND
+        if signal["low"] <= code <= signal["high"]:
+            codes[i] = int(code)
+        elif code < signal["low"]:
+            codes[i] = signal["low"]
+        elif code > signal["high"]:
+            codes[i] = signal["high"]
+        elif signal["invalid"] == NO_CODE:
+            return i
+        else:
+            codes[i] = signal["invalid"]
+    for target in targets:
+        words[target] = 0
+    for i in range(len(plan)):
+        signal = plan[i]
+        words[signal["word"]] |= (codes[i] & signal["mask"]) << signal["place"]
+    return NO_CODE

@@ -7,20 +7,33 @@ mirror: values in, protected frames out.
 
 from __future__ import annotations
 
-from binascii import crc_hqx
 from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc import Message
-from atalante_hal.codec import Codec, Vector
-from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES, CRC_START, Check, check_counter, crc, data_id_bytes
-from atalante_hal.frame import FRAME_BYTES, WORDS, Frames, as_words, new_frames
+from atalante_hal.codec import NO_CODE, Codec, Plan, Vector, Words, encode, read_codes, scale
+from atalante_hal.compiled import compiled
+from atalante_hal.e2e import (
+    COUNTER_BYTE,
+    CRC_BYTES,
+    Check,
+    Octets,
+    check_counter,
+    crc,
+    data_id_bytes,
+    intact,
+    protect,
+    protected_spans,
+)
+from atalante_hal.frame import WORDS, Frames, as_words, new_frames
 
 _HEADER_BYTES = 8
-#: Counter byte -> the next one.
-_NEXT = bytes((counter + 1) & 0xFF for counter in range(256))
+#: In the place of a counter: nothing was ever received.
+_NOTHING = -1
+#: In the place of a cycle tag: the senders count for themselves.
+_NO_TAG = -1
 #: Largest `Check` whose data is new, as a plain integer.
 _FRESH = int(Check.SOME_LOST)
 #: Age of a message that never came.
@@ -49,30 +62,31 @@ class ReceiveImage:
         #: `Check` of the cycle, shape (rows,).
         self.check: npt.NDArray[np.uint8] = np.full(count, Check.NO_DATA, np.uint8)
         #: Cycles since the row was committed, shape (rows,).
-        self.age: npt.NDArray[np.int64] = np.full(count, NEVER, np.int64)
+        self.age: npt.NDArray[np.int64] = np.full(count, NEVER)
         self.crc_errors = 0
         #: What was not committed in this cycle: row and why, one entry a frame.
         self.refused: list[tuple[int, Check]] = []
         self._restarts = restarts
         self.frames = self.codec.template()
-        self._words = self.frames.view(np.uint64)
-        self._bytes = self.frames.view(np.uint8)
-        self._headers = as_words(self.frames)[:, 0].tolist()
-        self._row_of_header = {header: row for row, header in enumerate(self._headers)}
+        self._words = self.frames.view(np.int64)
+        self._headers: Words = as_words(self.frames)[:, 0].astype(np.int64)
+        self._row_of_header = {header: row for row, header in enumerate(self._headers.tolist())}
+        self._expected_headers = self._headers.tobytes()
         self.frame_ids = {message.frame_id: row for row, message in enumerate(self.codec.messages)}
         self._data_ids = [data_id_bytes(m.data_id) for m in self.codec.messages]
         self._lengths = [m.length for m in self.codec.messages]
-        self._counter: list[int | None] = [None] * count
-        self._expected_headers = as_words(self.frames)[:, 0].tobytes()
-        self._expected_counters: bytes | None = None
-        self._counters_of = [bytes([tag]) * count for tag in range(256)]
+        self._spans = protected_spans(self.codec.messages)
+        #: Counter of the last frame of each row, and what it should be next.
+        self._counters: Words = np.full((2, count), _NOTHING, np.int64)
         #: The values before the last `accept`.
         self.values_before = self.values.copy()
         self._age_before: npt.NDArray[np.int64] = self.age.copy()
         #: The last cycle was perfect: every row was committed exactly as expected.
         self.all_fresh = self._was_fresh = False
-        self._scratch: _Scratch | None = None
-        self._ordered = _Scratch(new_frames(count), self.codec.messages)
+        self._ordered = _Received(new_frames(count), count)
+        self._received = self._ordered
+        self._accept_exact = compiled(accept_exact)
+        self._accept(self._ordered, None)  # nothing; from now on it is machine code
 
     def new_cycle(self, elapsed: int = 1) -> None:
         """`elapsed` cycles have begun: until something arrives, every row is that much older and has no data."""
@@ -97,7 +111,7 @@ class ReceiveImage:
         if not self._was_fresh:
             self._age_before[:] = self.age
         if (count == rows or (count > rows and row_of.keys().isdisjoint(frames["can_id"][rows:count].tolist()))) and (
-            self.accept_exact(self._scratch_of(frames), tag)
+            self._accept(self._received_in(frames), tag)
         ):
             return range(rows, count)
         if count >= rows:
@@ -105,8 +119,8 @@ class ReceiveImage:
             foreign = [place for place, row in enumerate(found) if row < 0]
             if len(foreign) == count - rows and len(set(found) - {-1}) == rows:
                 # Everything is there once, among others or in another order: several buses, or arbitration.
-                self._ordered.words[:] = as_words(frames)[np.argsort(found, kind="stable")[count - rows :]].reshape(-1)
-                if self.accept_exact(self._ordered, tag):
+                self._ordered.words[:] = as_words(frames)[np.argsort(found)[count - rows :]].view(np.int64).ravel()
+                if self._accept(self._ordered, tag):
                     return foreign
         self.new_cycle()
         return self.accept_each(frames, count, tag)
@@ -121,36 +135,34 @@ class ReceiveImage:
 
     def begins(self, frames: Frames, count: int) -> bool:
         """Whether `frames[:count]` begin with every message of this image, in order: then a cycle is complete."""
-        return count >= len(self._headers) and self._scratch_of(frames).headers.tobytes() == self._expected_headers
+        return count >= len(self._headers) and self._received_in(frames).headers.tobytes() == self._expected_headers
 
     def awaited(self) -> set[int]:
         """Identifiers of the messages whose senders are alive: heard within the DBC's timeout."""
         ages = zip(self.codec.messages, self.age.tolist(), strict=True)
         return {message.frame_id for message, age in ages if age <= message.timeout_ms}
 
-    def _scratch_of(self, frames: Frames) -> _Scratch:
-        if self._scratch is None or self._scratch.frames is not frames:
-            self._scratch = _Scratch(frames, self.codec.messages)
-        return self._scratch
+    def _received_in(self, frames: Frames) -> _Received:
+        if self._received.frames is not frames:
+            self._received = _Received(frames, len(self._headers))
+        return self._received
 
-    def accept_exact(self, scratch: _Scratch, tag: int | None = None) -> bool:
-        """Fast path: the rows are exactly the expected messages, in order, intact, in sequence and of this cycle.
-
-        Replaces `new_cycle` and `accept_each` for a perfect cycle; otherwise returns False and changes nothing.
-        """
-        expected = self._expected_counters or self._next_counters()
-        if tag is not None and expected != self._counters_of[tag]:
+    def _accept(self, received: _Received, tag: int | None) -> bool:
+        """Fast path: replaces `new_cycle` and `accept_each` for a perfect cycle; otherwise False, and nothing is changed."""
+        if not self._accept_exact(
+            received.words,
+            received.octets,
+            self._headers,
+            self._spans,
+            self._counters,
+            _NO_TAG if tag is None else tag,
+            self.codec.plan,
+            self.codec.codes,
+            self.values,
+            self.values_before,
+            self._words,
+        ):
             return False
-        if scratch.headers.tobytes() != self._expected_headers or scratch.e2e.counters.tobytes() != expected:
-            return False
-        if scratch.e2e.checksums() != scratch.e2e.crcs.tolist():
-            return False
-        if not self.codec.extract(scratch.words):
-            return False
-        self.values_before[:] = self.values
-        self.codec.scale(self.values)
-        self._bytes[:] = scratch.bytes
-        self._expected_counters = expected.translate(_NEXT)
         if not self.all_fresh:
             self.age.fill(0)
             self.check.fill(Check.OK)
@@ -164,7 +176,6 @@ class ReceiveImage:
         Returns:
             Places in `frames[:count]` of the frames that are no message of this image.
         """
-        self._synchronise_counters()
         self.values_before[:] = self.values
         foreign: list[int] = []
         checks, words = self.check, as_words(frames)
@@ -184,7 +195,7 @@ class ReceiveImage:
             if result > _FRESH:
                 self._refuse_frame(row, result)
                 continue
-            self._words[row * WORDS : (row + 1) * WORDS] = words[place]
+            self._words[row * WORDS : (row + 1) * WORDS] = words[place].view(np.int64)
             self.age[row] = 0 if tag is None else tag - payload[COUNTER_BYTE] & 0xFF
             checks[row] = result
         return foreign
@@ -198,71 +209,69 @@ class ReceiveImage:
         if crc(payload[CRC_BYTES:], self._data_ids[row]) != int.from_bytes(payload[:CRC_BYTES], "little"):
             self.crc_errors += 1
             return Check.CRC
-        counter, last = payload[COUNTER_BYTE], self._counter[row]
-        result = check_counter(last, counter)
+        counter, last = payload[COUNTER_BYTE], int(self._counters[0, row])
+        known = last != _NOTHING
+        result = check_counter(last if known else None, counter)
         if tag is not None and result is not Check.REPEATED:
             # An answer to no SYNC of the last cycles, or older than what is known already, says nothing about what comes next.
-            behind = last is not None and counter - last & 0xFF >= _HALF_TURN
+            behind = known and counter - last & 0xFF >= _HALF_TURN
             if tag - counter & 0xFF >= LATEST or behind:
                 return Check.WRONG_SEQUENCE
-        self._counter[row] = counter
+        self._counters[:, row] = counter, counter + 1 & 0xFF
         return Check.SOME_LOST if result is Check.WRONG_SEQUENCE and self._restarts else result
 
-    def _synchronise_counters(self) -> None:
-        """Take over what the fast path counted."""
-        if self._expected_counters is not None:
-            self._counter = [(c - 1) & 0xFF for c in self._expected_counters]
-            self._expected_counters = None
 
-    def _next_counters(self) -> bytes:
-        """What the fast path is to expect after the slow one; empty while a message was never received."""
-        return bytes((c + 1) & 0xFF for c in self._counter if c is not None) if None not in self._counter else b""
-
-
-class E2eFields:
-    """Where CRC, counter and what the CRC covers lie in the rows of an array of frames: views, made once."""
-
-    def __init__(self, frames: Frames, messages: Sequence[Message]) -> None:
-        octets = frames.view(np.uint8)
-        rows = octets.reshape(-1, FRAME_BYTES)
-        self.counters = rows[:, _HEADER_BYTES + COUNTER_BYTE]
-        self.crcs = frames.view(np.uint16).reshape(-1, FRAME_BYTES // 2)[:, _HEADER_BYTES // 2]
-        # The CRC ends with the Data ID. Put into the unused bytes behind the payload, it costs no call of its own; a payload
-        # of 64 bytes leaves none.
-        protected: list[memoryview] = []
-        parked: list[int] = []
-        ids = b""
-        self._rest: list[tuple[int, bytes]] = []
-        for row, message in enumerate(messages):
-            data_id, end = data_id_bytes(message.data_id), _HEADER_BYTES + message.length
-            if end + len(data_id) <= FRAME_BYTES:
-                parked += range(row * FRAME_BYTES + end, row * FRAME_BYTES + end + len(data_id))
-                ids, end = ids + data_id, end + len(data_id)
-            else:
-                self._rest.append((row, data_id))
-            protected.append(rows[row].data[_HEADER_BYTES + CRC_BYTES : end])
-        self._octets, self._parked, self._ids = octets, np.array(parked, np.intp), np.frombuffer(ids, np.uint8)
-        self._protected, self._starts = protected, [CRC_START] * len(protected)
-
-    def checksums(self) -> list[int]:
-        """What the CRC of each row should be."""
-        self._octets[self._parked] = self._ids
-        checksums = list(map(crc_hqx, self._protected, self._starts))
-        for row, data_id in self._rest:
-            checksums[row] = crc_hqx(data_id, checksums[row])
-        return checksums
-
-
-class _Scratch:
+class _Received:
     """Views of the first rows of a receive buffer, made once: what the fast path reads every cycle."""
 
-    def __init__(self, frames: Frames, messages: Sequence[Message]) -> None:
+    def __init__(self, frames: Frames, rows: int) -> None:
         self.frames = frames
-        head = frames[: len(messages)]
-        self.words = head.view(np.uint64)
-        self.bytes = head.view(np.uint8)
+        head = frames[:rows]
+        self.words: Words = head.view(np.int64)
+        self.octets: Octets = head.view(np.uint8)
         self.headers = as_words(head)[:, 0]
-        self.e2e = E2eFields(head, messages)
+
+
+def accept_exact(
+    words: Words,
+    octets: Octets,
+    headers: Words,
+    spans: Words,
+    counters: Words,
+    tag: int,
+    plan: Plan,
+    codes: Words,
+    values: Vector,
+    values_before: Vector,
+    kept: Words,
+) -> bool:
+    """Commit rows that are exactly the expected messages, in order, intact, in sequence, in range and of this cycle.
+
+    Args:
+        words, octets: views of the frames received, shapes (rows * 9,) and (rows * 72,).
+        headers: first word of each message, shape (rows,).
+        spans: of `e2e.protected_spans`.
+        counters: of the last frames, and the next ones, shape (2, rows); moved on.
+        tag: counter all have to carry, or `_NO_TAG`.
+        plan, codes: of the codec.
+        values, values_before: shape (size,); the new ones, and what they were.
+        kept: the last good frames, shape (rows * 9,); rewritten.
+
+    Returns:
+        Whether they were; if not, nothing was changed.
+    """
+    for row in range(len(headers)):
+        if words[row * WORDS] != headers[row] or (tag != _NO_TAG and counters[1, row] != tag):
+            return False
+    if not (intact(octets, spans, counters[1]) and read_codes(words, plan, codes)):
+        return False
+    values_before[:] = values
+    scale(codes, plan, values)
+    kept[:] = words
+    for row in range(len(headers)):
+        counters[0, row] = counters[1, row]
+        counters[1, row] = counters[1, row] + 1 & 0xFF
+    return True
 
 
 class TransmitImage:
@@ -272,13 +281,16 @@ class TransmitImage:
         self.codec = Codec(messages)
         self.values = np.zeros(self.codec.size)
         self.frames = self.codec.template()
-        self._words = self.frames.view(np.uint64)
-        self._octets = self.frames.view(np.uint8)
-        self._e2e = E2eFields(self.frames, self.codec.messages)
+        self._words: Words = self.frames.view(np.int64)
+        self._octets: Octets = self.frames.view(np.uint8)
+        self._spans = protected_spans(self.codec.messages)
         rows = len(self.codec.messages)
-        self._counters = [0xFF] * rows
-        self._in_step = True  # all rows have the counter of the first: none was ever sealed alone
+        self._counters: Words = np.full(rows, 0xFF)
         self._singles = [self.frames[row : row + 1] for row in range(rows)]
+        self._seal, self._protect = compiled(seal), compiled(protect)
+        # Nothing; from now on it is machine code.
+        self._protect(self._octets, self._spans, self._counters)
+        self.seal(0xFF)
 
     def seal(self, counter: int | None = None) -> Frames:
         """Encode the values and protect every row with counter and CRC. Returns the frames to send, shape (rows,).
@@ -289,51 +301,70 @@ class TransmitImage:
         Raises:
             ValueError: NaN for a signal without an invalid code.
         """
-        self.codec.pack(self.values, self._words)
-        self._protect(counter)
+        codec = self.codec
+        nameless = self._seal(
+            self.values,
+            codec.plan,
+            codec.words,
+            codec.codes,
+            self._words,
+            self._octets,
+            self._spans,
+            self._counters,
+            _NO_TAG if counter is None else counter,
+        )
+        if nameless != NO_CODE:
+            codec.require_code(nameless)
         return self.frames
 
     @property
     def counter(self) -> int:
         """Alive counter of the last `seal`."""
-        return self._counter_of(0)
+        return int(self._counters[0])
 
     def prepare(self) -> bytes:
         """Payloads of the values as they are now, for `seal_prepared`."""
-        self.codec.pack(self.values, self._words)
+        self.codec.encode(self.values, self.frames)
         return self._octets.tobytes()
 
     def seal_prepared(self, prepared: bytes) -> Frames:
         """As `seal`, of payloads encoded beforehand: nothing that went wrong since can spoil them."""
         self._octets[:] = np.frombuffer(prepared, np.uint8)
-        self._protect(None)
+        self._counters[:] = self._counters + 1 & 0xFF
+        self._protect(self._octets, self._spans, self._counters)
         return self.frames
-
-    def _protect(self, counter: int | None) -> None:
-        if counter is not None:
-            self._counters, self._in_step = [counter] * len(self._counters), True
-        elif self._in_step:
-            counter = self._counters[0] = (self._counters[0] + 1) & 0xFF
-        else:
-            self._counters = [(counter + 1) & 0xFF for counter in self._counters]
-        if counter is None:
-            self._e2e.counters[:] = self._counters
-        else:
-            self._e2e.counters.fill(counter)
-        self._e2e.crcs[:] = self._e2e.checksums()
 
     def seal_row(self, row: int) -> Frames:
         """As `seal` for one row alone, the counters of the others stay. Shape (1,)."""
-        self.codec.pack(self.values, self._words)
-        self.resume(row, self._counter_of(row) + 1 & 0xFF)
-        self._e2e.counters[:] = self._counters
-        self._e2e.crcs[:] = self._e2e.checksums()
+        self.codec.encode(self.values, self.frames)
+        self.resume(row, int(self._counters[row]) + 1 & 0xFF)
+        self._protect(self._octets, self._spans, self._counters)
         return self._singles[row]
 
     def resume(self, row: int, counter: int) -> None:
         """Go on after the frame with this alive counter, which another sender of the row sent."""
-        self._counters = [self._counter_of(other) for other in range(len(self._counters))]
-        self._counters[row], self._in_step = counter, False
+        self._counters[row] = counter
 
-    def _counter_of(self, row: int) -> int:
-        return self._counters[0 if self._in_step else row]
+
+def seal(
+    values: Vector,
+    plan: Plan,
+    targets: Words,
+    codes: Words,
+    words: Words,
+    octets: Octets,
+    spans: Words,
+    counters: Words,
+    counter: int,
+) -> int:
+    """Encode the values and protect every row: `codec.encode`, then `e2e.protect`; arguments and result are theirs.
+
+    Args:
+        counter: of every row, or `_NO_TAG`: one more than its last.
+    """
+    nameless = encode(values, plan, targets, codes, words)
+    if nameless == NO_CODE:
+        for row in range(len(counters)):
+            counters[row] = counters[row] + 1 & 0xFF if counter == _NO_TAG else counter
+        protect(octets, spans, counters)
+    return nameless

@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 
 from atalante_hal.codec import Codec
-from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
-from atalante_hal.image import E2eFields
+from atalante_hal.compiled import compiled
+from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes, intact, protected_spans
 from atalante_hal.telemetry.ring import RingWriter
 from atalante_hal.types import SupervisorState
 from atalante_tools.bench.generated_c import COMPILER, GeneratedC, available
@@ -82,13 +82,9 @@ def decode_cycle(effort: Effort) -> Measurement:
     generated.decode(frames, theirs, 1)
     require(generated.inside, "the generated C finds signals outside their range")
     require(np.allclose(ours, theirs, rtol=1e-12, atol=0.0), "the generated C decodes other values")
-    words = frames.view(np.uint64)
-
-    def decode() -> None:
-        codec.extract(words)
-        codec.scale(ours)
-
-    return effort.interleave(timed(decode, _MANY), lambda: generated.decode(frames, theirs, _MANY_IN_C))
+    return effort.interleave(
+        timed(lambda: codec.decode(frames, ours), _MANY), lambda: generated.decode(frames, theirs, _MANY_IN_C)
+    )
 
 
 def encode_cycle(effort: Effort) -> Measurement:
@@ -110,9 +106,8 @@ def encode_cycle(effort: Effort) -> Measurement:
     # The generated C truncates where we round.
     resolution = np.array([s.factor for _, s in codec.signals])
     require((np.abs(decoded[0] - decoded[1]) <= 1.001 * resolution).all(), "the generated C encodes other values")
-    words = ours.view(np.uint64)
     return effort.interleave(
-        timed(lambda: codec.pack(values, words), _MANY), lambda: generated.encode(values, theirs, _MANY_IN_C)
+        timed(lambda: codec.encode(values, ours), _MANY), lambda: generated.encode(values, theirs, _MANY_IN_C)
     )
 
 
@@ -121,19 +116,20 @@ def e2e_check(effort: Effort) -> Measurement:
     recording = Recording(walk())
     recording.play()
     count = len(recording.cyclic)
-    fields = E2eFields(recording.frames[:count], recording.cyclic)
-    expected = fields.counters.tobytes()
+    octets, spans = recording.frames[:count].view(np.uint8), protected_spans(recording.cyclic)
+    expected = octets[spans[:, 0] + COUNTER_BYTE].astype(np.int64)
+    check_all = compiled(intact)
 
     def ours() -> bool:
-        return fields.counters.tobytes() == expected and fields.checksums() == fields.crcs.tolist()
+        return check_all(octets, spans, expected)
 
     check, remark = _frame_checker()
     payloads = [(f["data"][: m.length], m.data_id) for f, m in zip(recording.frames, recording.cyclic, strict=False)]
 
     def theirs() -> bool:
         good = True
-        for (octets, data_id), counter in zip(payloads, expected, strict=True):
-            payload = octets.tobytes()
+        for (data, data_id), counter in zip(payloads, expected, strict=True):
+            payload = data.tobytes()
             good &= check(payload, data_id) and payload[COUNTER_BYTE] == counter
         return good
 
