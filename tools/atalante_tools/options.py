@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -11,6 +12,7 @@ import click
 
 if TYPE_CHECKING:
     from atalante_control.model import Patient
+    from atalante_control.subject import Subject
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -37,6 +39,33 @@ def length(text: str) -> float:
     return metres / 100.0 if metres >= _CENTIMETRES else metres
 
 
+def options_as(
+    name: str, meaning: Callable[..., object], options: Sequence[Callable[[Any], Any]]
+) -> Callable[[_Command], _Command]:
+    """Give a command options, in this order, and hand it what they mean together as one argument.
+
+    Args:
+        name: of the argument.
+        meaning: called with the options by its parameters' names.
+        options: click's, or decorators that hand over an argument themselves.
+    """
+    parameters = inspect.signature(meaning).parameters
+
+    def decorate(command: _Command) -> _Command:
+        @functools.wraps(command)
+        def with_meaning(**arguments: Any) -> Any:
+            meant = meaning(**{key: arguments.pop(key) for key in parameters if key in arguments})
+            return command(**{name: meant}, **arguments)
+
+        decorated: Any = with_meaning
+        for option in reversed(options):
+            decorated = option(decorated)
+        given: _Command = decorated
+        return given
+
+    return decorate
+
+
 def patient_options(*, legs: bool) -> Callable[[_Command], _Command]:
     """Give a command `--mass` and `--height`, and hand it the patient as the argument `patient`; None without them.
 
@@ -55,61 +84,44 @@ def patient_options(*, legs: bool) -> Callable[[_Command], _Command]:
             ),
         ]
 
-    def decorate(command: _Command) -> _Command:
-        @functools.wraps(command)
-        def with_patient(
-            mass: float | None,
-            height: float | None,
-            thigh: float | None = None,
-            shank: float | None = None,
-            **arguments: Any,
-        ) -> Any:
-            return command(patient=_patient(mass, height, thigh, shank), **arguments)
-
-        wrapped: Any = with_patient
-        for option in reversed(options):
-            wrapped = option(wrapped)
-        decorated: _Command = wrapped
-        return decorated
-
-    return decorate
+    return options_as("patient", _patient, options)
 
 
 def subject_options(command: _Command) -> _Command:
     """Give a command `--mass`, `--height`, `--step-length` and `--step-duration`, handed over as `subject`; None without."""
-    default_length, default_duration = DEFAULT_STEP
+    step_length, step_duration = DEFAULT_STEP
+    options = [
+        patient_options(legs=False),
+        click.option(
+            "--step-length",
+            type=length,
+            metavar="M",
+            help=f"Of the patient's gait, m or cm.  [default: {step_length:g}]",
+        ),
+        click.option(
+            "--step-duration", type=float, metavar="S", help=f"Of the patient's gait, s.  [default: {step_duration:g}]"
+        ),
+    ]
+    return options_as("subject", _subject, options)(command)
 
-    @functools.wraps(command)
-    def with_subject(
-        patient: Patient | None, step_length: float | None, step_duration: float | None, **arguments: Any
-    ) -> Any:
-        subject = None
-        if patient is not None:
-            from atalante_control.subject import Subject
 
-            try:
-                subject = Subject(patient, step_length or default_length, step_duration or default_duration)
-            except ValueError as error:
-                raise click.UsageError(str(error)) from error
-        elif step_length is not None or step_duration is not None:
+def _subject(patient: Patient | None, step_length: float | None, step_duration: float | None) -> Subject | None:
+    if patient is None:
+        if step_length is not None or step_duration is not None:
             raise click.UsageError("a step of one's own needs a patient: --mass and --height")
-        return command(subject=subject, **arguments)
+        return None
+    from atalante_control.subject import Subject
 
-    wrapped: Any = with_subject
-    step_duration = click.option(
-        "--step-duration", type=float, metavar="S", help=f"Of the patient's gait, s.  [default: {default_duration:g}]"
-    )
-    step_length = click.option(
-        "--step-length",
-        type=length,
-        metavar="M",
-        help=f"Of the patient's gait, m or cm.  [default: {default_length:g}]",
-    )
-    decorated: _Command = patient_options(legs=False)(step_length(step_duration(wrapped)))
-    return decorated
+    default_length, default_duration = DEFAULT_STEP
+    try:
+        return Subject(patient, step_length or default_length, step_duration or default_duration)
+    except ValueError as error:
+        raise click.UsageError(str(error)) from error
 
 
-def _patient(mass: float | None, height: float | None, thigh: float | None, shank: float | None) -> Patient | None:
+def _patient(
+    mass: float | None, height: float | None, thigh: float | None = None, shank: float | None = None
+) -> Patient | None:
     if mass is None and height is None and thigh is None and shank is None:
         return None
     if mass is None or height is None:
@@ -180,21 +192,10 @@ def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command]
             )
         )
 
-    def decorate(command: _Command) -> _Command:
-        @functools.wraps(command)
-        def with_target(interface: str, channel: str, lockstep: bool | None = None, **arguments: Any) -> Any:
-            return command(target=_target(interface, channel, lockstep, embedded), **arguments)
-
-        wrapped: Any = with_target
-        for option in reversed(options):
-            wrapped = option(wrapped)
-        decorated: _Command = wrapped
-        return decorated
-
-    return decorate
+    return options_as("target", functools.partial(_target, embedded=embedded), options)
 
 
-def _target(interface: str, channel: str, lockstep: bool | None, embedded: bool) -> Target:
+def _target(interface: str, channel: str, lockstep: bool | None = None, *, embedded: bool) -> Target:
     if interface == EMBEDDED:
         if not embedded:
             raise click.UsageError("this needs a bus that other processes are on: -i socketcan -c vcan0")

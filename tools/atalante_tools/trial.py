@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from atalante_tools.names import find
-from atalante_tools.options import Target, json_option, subject_options
+from atalante_tools.options import Target, json_option, options_as, subject_options
 from atalante_tools.signals import stop_requested
 from atalante_tools.terminal import say, show_json, table
 
@@ -90,28 +90,7 @@ def trial_options(steps: int, out: str) -> Callable[[_Command], _Command]:
                      help="Telemetry file (TOML): Zenoh endpoint, TLS certificate, users."),
     ]  # fmt: skip
 
-    def decorate(command: _Command) -> _Command:
-        @functools.wraps(command)
-        def with_options(
-            steps: int,
-            xi: float,
-            seed: int,
-            out: Path,
-            record_rate: int,
-            can_log: Path | None,
-            telemetry: Path | None,
-            subject: Subject | None,
-            **others: Any,
-        ) -> Any:
-            return command(options=Options(steps, xi, seed, out, record_rate, can_log, telemetry, subject), **others)
-
-        wrapped: Any = subject_options(with_options)
-        for option in reversed([*options, json_option]):
-            wrapped = option(wrapped)
-        decorated: _Command = wrapped
-        return decorated
-
-    return decorate
+    return options_as("options", Options, [*options, json_option, subject_options])
 
 
 def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_json: bool) -> None:
