@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner, Result
+from distributed import LocalCluster
 
 from atalante_tools.cli import cli
 from atalante_tools.faults import campaign, tasks
@@ -56,10 +57,7 @@ def test_processes_give_what_this_process_gives() -> None:
 
 @pytest.mark.filterwarnings("ignore")  # dask's own
 def test_a_cluster_gives_what_this_process_gives() -> None:
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=2, host="127.0.0.1", dashboard_address=None
-    ) as cluster:
+    with LocalCluster(n_workers=1, threads_per_worker=2, host="127.0.0.1", dashboard_address=None) as cluster:
         there = list(campaign.results(OVERRUN, dask=cluster.scheduler_address))
     assert by_case(there) == by_case(list(campaign.results(OVERRUN)))
 
