@@ -29,16 +29,18 @@ All numbers are those of robot.toml.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, Robot, Vector
 
 _COUNT = len(JOINTS)
-#: Too small to change a sum; but it takes an infinite torque along, where 0 * inf would be an error of its own.
-_NO_WEIGHT = 2.0**-80
+#: What `limit` did.
+_AS_ASKED, _CUT, _NOT_FINITE = range(3)
 
 
 @dataclass(frozen=True)
@@ -62,25 +64,19 @@ class Limiter:
     """
 
     def __init__(self, robot: Robot, period: float) -> None:
-        envelope = robot.envelope
         self._torque_max = robot.torque_max
         self._step = robot.torque_rate_max * period
+        self._envelope = np.array([robot.position_min, robot.position_max, robot.velocity_max])
+        envelope = robot.envelope
+        self._margins = envelope.look_ahead, envelope.position_margin, envelope.velocity_margin
         self.limit: Vector = robot.torque_max.copy()
+        self.last: Vector = np.zeros(_COUNT)
         self.cut: npt.NDArray[np.bool_] = np.zeros(_COUNT, np.bool_)
         self.saturated = 0
-        #: Torque asked for, torque of the last cycle, position, velocity.
-        self._inputs = np.zeros((4, _COUNT))
-        self._asked, self.last, self._motion = self._inputs[0], self._inputs[1], self._inputs[2:]
-        # Everything that has a limit, upwards and downwards, is a small matrix times the inputs: one product, one comparison.
-        ahead, none = envelope.look_ahead, _NO_WEIGHT
-        rows = [[1.0, 0.0, 0.0, 0.0], [1.0, -1.0, 0.0, 0.0], [none, 0.0, 1.0, ahead], [none, 0.0, 0.0, 1.0]]
-        self._matrix = np.array([*rows, *np.negative(rows)])
-        self._terms = np.empty((len(self._matrix), _COUNT))
-        up = [self.limit, self._step, robot.position_max, robot.velocity_max]
-        down = [self.limit, self._step, -robot.position_min, robot.velocity_max]
-        self._bounds = np.array([*up, *down])
-        self._margins = np.array([[envelope.position_margin], [envelope.velocity_margin]])
-        self._inside = np.empty(self._terms.shape, np.bool_)
+        # Whatever the torque comes as, the machine code gets the arrays it was compiled for.
+        self._asked, self._motion = np.zeros(_COUNT), np.zeros((2, _COUNT))
+        self._apply = compiled(limit)
+        self.apply(self.last, np.zeros((2, _COUNT)))  # nothing; from now on it is machine code
 
     def apply(self, torque: Vector, motion: Vector) -> Limited:
         """Limit a command; the result is in `last`.
@@ -91,47 +87,82 @@ class Limiter:
         """
         self._asked[:] = torque
         self._motion[:] = motion
-        self._matrix.dot(self._inputs, self._terms)
-        # NaN is not inside.
-        if np.less_equal(self._terms, self._bounds, self._inside).tobytes() != _ALL_INSIDE:
-            return self._cut()
-        self.last[:] = torque
-        if self.saturated:
-            self._forget_saturation()
-        return _AS_ASKED
-
-    def _cut(self) -> Limited:
-        if not np.isfinite(self._inputs).all():
-            return _NOT_FINITE
-        motions = self._matrix[:, 2:] @ self._motion
-        beyond = (motions - self._bounds).reshape(2, 4, _COUNT)[:, 2:] / self._margins
-        up, down = self.limit * np.clip(1.0 - beyond, 0.0, 1.0).min(axis=1)
-        low, high = np.clip([-down, up], self.last - self._step, self.last + self._step)
-        np.clip(self._asked, low, high, out=self.last)
-        np.not_equal(self.last, self._asked, self.cut)
-        if not self.cut.any():
-            self.saturated = 0
-            return _AS_ASKED
-        self.saturated += 1
-        return _CLAMPED
+        inputs = self._asked, self._motion, self.last, self.limit, self._step, self._envelope
+        done = self._apply(*inputs, *self._margins, self.cut)
+        if done == _NOT_FINITE:
+            return Limited(finite=False, clamped=False)
+        self.saturated = self.saturated + 1 if done == _CUT else 0
+        return _LIMITED[done]
 
     def derate(self, limit: Vector) -> None:
         """Lower the torque limit, or raise it again up to the robot's own. Shape (12,) [Nm], none negative."""
         np.minimum(limit, self._torque_max, out=self.limit)
-        self._bounds[[0, 4]] = self.limit
 
     def restart(self, torque: Vector) -> None:
         """Count the rate limit from a torque the drives exert by themselves, within the limits. Shape (12,) [Nm]."""
         finite = np.nan_to_num(torque, nan=0.0, posinf=0.0, neginf=0.0)
         np.clip(finite, -self.limit, self.limit, out=self.last)
-        self._forget_saturation()
-
-    def _forget_saturation(self) -> None:
         self.saturated = 0
         self.cut.fill(False)
 
 
-_ALL_INSIDE = b"\1" * (8 * _COUNT)
-_NOT_FINITE = Limited(finite=False, clamped=False)
-_AS_ASKED = Limited(finite=True, clamped=False)
-_CLAMPED = Limited(finite=True, clamped=True)
+_LIMITED = {_AS_ASKED: Limited(finite=True, clamped=False), _CUT: Limited(finite=True, clamped=True)}
+
+
+def limit(
+    asked: Vector,
+    motion: Vector,
+    last: Vector,
+    torque_limit: Vector,
+    step: Vector,
+    envelope: Vector,
+    look_ahead: float,
+    position_margin: float,
+    velocity_margin: float,
+    cut: npt.NDArray[np.bool_],
+) -> int:
+    """The limits of all joints, see above.
+
+    Args:
+        asked: torque [Nm]; `motion`: position [rad] and velocity [rad/s], shape (2, 12).
+        last: torque of the last cycle [Nm], rewritten by that of this one.
+        torque_limit: [Nm]; `step`: largest change of torque in a cycle [Nm].
+        envelope: lowest and highest position [rad], highest velocity [rad/s], shape (3, 12).
+        look_ahead: [s]; `position_margin`: [rad]; `velocity_margin`: [rad/s].
+        cut: whose torque is not what was asked for; rewritten.
+
+    Returns:
+        `_AS_ASKED`, `_CUT`, or `_NOT_FINITE`: then nothing is changed.
+    """
+    for joint in range(len(asked)):
+        if not (math.isfinite(asked[joint]) and math.isfinite(motion[0, joint]) and math.isfinite(motion[1, joint])):
+            return _NOT_FINITE
+    done = _AS_ASKED
+    for joint in range(len(asked)):
+        velocity, ahead = motion[1, joint], motion[0, joint] + look_ahead * motion[1, joint]
+        too_high, too_low = (
+            (ahead - envelope[1, joint]) / position_margin,
+            (envelope[0, joint] - ahead) / position_margin,
+        )
+        too_fast_up = (velocity - envelope[2, joint]) / velocity_margin
+        too_fast_down = (-velocity - envelope[2, joint]) / velocity_margin
+        up = torque_limit[joint] * share(max(too_high, too_fast_up))
+        down = torque_limit[joint] * share(max(too_low, too_fast_down))
+        # A limit that falls under the torque of the last cycle is approached at the rate limit.
+        lowest, highest = last[joint] - step[joint], last[joint] + step[joint]
+        sent = min(max(asked[joint], within(-down, lowest, highest)), within(up, lowest, highest))
+        cut[joint] = sent != asked[joint]
+        if cut[joint]:
+            done = _CUT
+        last[joint] = sent
+    return done
+
+
+def share(beyond: float) -> float:
+    """S: the share of the torque that is left so far beyond a limit."""
+    return within(1.0 - beyond, 0.0, 1.0)
+
+
+def within(value: float, low: float, high: float) -> float:
+    """The value nearest to `value` in [low, high]."""
+    return min(max(value, low), high)

@@ -29,8 +29,13 @@ from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot, load_robot
 from atalante_hal.types import Command, State, SupervisorState
 
+# How long an example takes says nothing: the first one may compile.
+settings.register_profile("any time", deadline=None)
+settings.load_profile("any time")
 # For `make mutation`: one example that fails is enough, and making it small is what takes long.
-settings.register_profile("mutation", phases=(Phase.explicit, Phase.generate), derandomize=True, database=None)
+settings.register_profile(
+    "mutation", deadline=None, phases=(Phase.explicit, Phase.generate), derandomize=True, database=None
+)
 
 
 class Witness:

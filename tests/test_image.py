@@ -138,7 +138,7 @@ def test_foreign_frames_are_named_wherever_they_stand():
 CHANGES = ("none", "flip", "drop", "twice", "old", "range", "foreign", "length", "swap")
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(
     st.lists(
         st.tuples(st.sampled_from(CHANGES), st.integers(0, ROWS - 1), st.integers(0, 63)), min_size=1, max_size=12

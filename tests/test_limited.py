@@ -78,7 +78,7 @@ LIMITED = rollouts()
 
 
 @given(st.integers(0, 1), st.integers(0, 1), st.integers(0, 800), st.floats(0.0, 0.08), st.floats(-1.5, 1.5))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_ratio_is_that_of_the_loop_with_its_limit(joint: int, side: int, cycle: int, away: float, rate: float):
     """From any state on the side that is asked for: that is where the guide asks."""
     e, ed = (-away, -rate) if side else (away, rate)

@@ -36,7 +36,7 @@ GAIT = json.loads(HANG_GAIT.read_text())
 NONSENSE = st.sampled_from(
     [math.nan, math.inf, -math.inf, 1e300, -1e300, 10**400, True, False, "4 rad/s", "", [], [[1.0, 2.0]], {}, {"a": 1}]
 )
-anywhere = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+anywhere = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def toml(value: Any) -> str:
