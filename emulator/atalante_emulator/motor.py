@@ -1,7 +1,4 @@
-"""The twelve motors: wanted torque in, current loop, friction, brake and winding heat, torque on the joint out.
-
-What is linear (current loop, friction on top of the motor) is one matrix-vector product: one call.
-"""
+"""The twelve motors: wanted torque in, current loop, friction, brake and winding heat, torque on the joint out."""
 
 from __future__ import annotations
 
@@ -12,11 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_emulator.body import PERIOD
+from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, SIDES, Robot
 
 Vector = npt.NDArray[np.float64]
-
-_COUNT = len(JOINTS)
 
 
 @dataclass(frozen=True)
@@ -34,49 +30,53 @@ class MotorParameters:
     thermal_time: float = 300.0  # s
 
 
+def _turn(
+    velocity: Vector,
+    wanted: Vector,
+    tracking: float,
+    strength: Vector,
+    dry: Vector,
+    friction_speed: float,
+    damping: Vector,
+    push: Vector,
+    motor: Vector,
+    joint: Vector,
+) -> None:
+    """One `PERIOD` of all motors: `motor` follows `wanted`, `joint` is what the joint feels of it. Shape (12,) each."""
+    for i in range(len(motor)):
+        motor[i] += tracking * (wanted[i] - motor[i])
+        friction = dry[i] * math.tanh(velocity[i] / friction_speed) + damping[i] * velocity[i]
+        joint[i] = strength[i] * motor[i] - friction + push[i]
+
+
 class Motors:
     """Motors of all joints: `torque` as measured [Nm at the joint] and `temperature` [degC], shape (12,), are rewritten here."""
 
     def __init__(self, robot: Robot, parameters: MotorParameters, torque: Vector, temperature: Vector) -> None:
-        self._parameters, self._torque_signal, self.temperature = parameters, torque, temperature
-        # Motor torque now, wanted torque, direction of dry friction, velocity -> motor torque next, joint torque.
-        self._inputs = np.zeros(4 * _COUNT)
-        self._torque, self.wanted, self._direction, self._velocity = self._inputs.reshape(4, -1)
-        self._outputs = np.zeros(2 * _COUNT)
-        self._next_torque, self._joint_torque = self._outputs.reshape(2, -1)
-        self._per_friction_speed = np.full(_COUNT, 1.0 / parameters.friction_speed)
-        self._powered: npt.NDArray[np.bool_] = np.zeros(_COUNT, np.bool_)
-        self._strength = np.ones(_COUNT)
-        self._external: Vector | None = None
-        self._build()
+        both = len(SIDES)
+        self._parameters, self._torque, self.temperature = parameters, torque, temperature
+        self.wanted, self._push, self._joint = np.zeros((3, len(JOINTS)))
+        self._tracking = 1.0 - math.exp(-PERIOD / parameters.current_loop)
+        self._strength = np.ones(len(JOINTS))
+        self._dry, self._viscous = np.array((parameters.coulomb * both, parameters.viscous * both))
+        self._braked = self._viscous + parameters.brake * both
+        self._damping = self._braked.copy()
         self._heat = parameters.heating / (0.5 * robot.torque_max) ** 2
         temperature.fill(parameters.ambient)
-
-    def _build(self) -> None:
-        parameters, both = self._parameters, len(SIDES)
-        tracking = 1.0 - math.exp(-PERIOD / parameters.current_loop)
-        one, none = np.eye(_COUNT), np.zeros((_COUNT, _COUNT))
-        motor = [one * (1.0 - tracking), one * tracking]
-        brake = np.where(self._powered, 0.0, parameters.brake * both)
-        dry, viscous = np.diag(parameters.coulomb * both), np.diag(np.array(parameters.viscous * both) + brake)
-        self._matrix = np.block([[*motor, none, none], [*(self._strength * m for m in motor), -dry, -viscous]])
+        self._turn = compiled(_turn)
+        self.turn(np.zeros(len(JOINTS)))  # is compiled now, not in the first cycle
 
     def power(self, powered: npt.NDArray[np.bool_]) -> None:
         """Which power stages are on, shape (12,): the others brake."""
-        if powered.tobytes() != self._powered.tobytes():
-            self._powered = powered.copy()
-            self._build()
+        self._damping[:] = np.where(powered, self._viscous, self._braked)
 
     def weaken(self, motor: int, strength: float) -> None:
         """Let a motor make only this share of the torque it measures."""
         self._strength[motor] = strength
-        self._build()
 
     def push(self, joint: int, torque: float) -> None:
         """Somebody pushes a joint from now on, on top of what the motor does [Nm]; 0: no longer."""
-        external = np.zeros(_COUNT) if self._external is None else self._external
-        external[joint] = torque
-        self._external = external if external.any() else None
+        self._push[joint] = torque
 
     def turn(self, velocity: Vector) -> list[float]:
         """Joint torques for the next `PERIOD`: what the motors make of `wanted`, less friction and brake, and pushes.
@@ -87,16 +87,19 @@ class Motors:
         Returns:
             Shape (12,) [Nm].
         """
-        direction = self._direction
-        np.multiply(velocity, self._per_friction_speed, direction)
-        np.tanh(direction, direction)
-        self._velocity[:] = velocity
-        self._matrix.dot(self._inputs, self._outputs)
-        if self._external is not None:
-            self._joint_torque += self._external
-        self._torque[:] = self._next_torque
-        self._torque_signal[:] = self._next_torque
-        torque: list[float] = self._joint_torque.tolist()
+        self._turn(
+            velocity,
+            self.wanted,
+            self._tracking,
+            self._strength,
+            self._dry,
+            self._parameters.friction_speed,
+            self._damping,
+            self._push,
+            self._torque,
+            self._joint,
+        )
+        torque: list[float] = self._joint.tolist()
         return torque
 
     def warm(self, seconds: float) -> None:
