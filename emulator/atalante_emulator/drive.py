@@ -23,6 +23,7 @@ from atalante_emulator.emergency import Emergency, Errors, Reaction, reaction_to
 from atalante_emulator.encoder import Encoders
 from atalante_emulator.motor import MotorParameters, Motors
 from atalante_hal.cia402 import AUTOMATIC, Controlword, DriveState, next_state
+from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, LEG_JOINTS, SIDES, Robot
 
 Vector = npt.NDArray[np.float64]
@@ -63,6 +64,13 @@ class DriveSignals(NamedTuple):
     state: Vector  # DriveState
 
 
+def _within(target: Vector, limit: Vector, own_limit: Vector, wanted: Vector) -> None:
+    """The target within what HAL and drive allow. Shape (12,) each [Nm]."""
+    for i in range(len(wanted)):
+        most = min(limit[i], own_limit[i])
+        wanted[i] = max(-most, min(target[i], most))
+
+
 _ENABLED = np.full(len(JOINTS), float(DriveState.OPERATION_ENABLED)).tobytes()
 
 
@@ -92,10 +100,10 @@ class Drives:
         self._slow_phase = 0
         self._steady = b""  # controlwords that left every drive as it was the last time
         self._hold_at = np.zeros(len(JOINTS))  # rad, where a stopped drive holds
-        self._target: Vector = np.zeros(len(JOINTS))
-        self._limit = b""
-        self._own_limit: Vector = robot.torque_max  # Nm, of a drive this hot
-        self._lower, self._upper = np.zeros((2, len(JOINTS)))
+        self._target, self._limit = np.zeros((2, len(JOINTS)))
+        self._own_limit = robot.torque_max.copy()  # Nm, of a drive this hot
+        self._within = compiled(_within)
+        self._within(self._target, self._limit, self._own_limit, self.motors.wanted)  # compiled now, not in a cycle
         self._states_changed()
 
     # -- every cycle -------------------------------------------------------------------------------------------------
@@ -110,7 +118,7 @@ class Drives:
         Args:
             fresh: per leg, whether a valid new command came since the last cycle.
             controlword: shape (12,), `Controlword` values.
-            target: shape (12,) [Nm at the joint]; read again in every `drive` until the next command.
+            target: shape (12,) [Nm at the joint]; read again in every `drive` until the next command, as is
             limit: shape (12,) [Nm], the HAL's MaxTorque; the drive's own limit holds anyway.
         """
         missed = self.missed
@@ -124,12 +132,7 @@ class Drives:
         words = controlword.tobytes()
         if words != self._steady:
             self._run_state_machines(fresh, controlword, words)
-        self._target = target
-        limits = limit.tobytes()
-        if limits != self._limit:
-            self._limit = limits
-            np.minimum(limit, self._own_limit, out=self._upper)
-            np.negative(self._upper, out=self._lower)
+        self._target, self._limit = target, limit
 
     def drive(self, velocity: Vector) -> list[float]:
         """Joint torques for the next `PERIOD`: what the motors make of the command. Shape (12,) [Nm].
@@ -141,8 +144,7 @@ class Drives:
         if self._slow_phase == SLOW_CYCLES:
             self._slow_turn()
         wanted = self.motors.wanted
-        np.minimum(self._target, self._upper, out=wanted)
-        np.maximum(wanted, self._lower, out=wanted)
+        self._within(self._target, self._limit, self._own_limit, wanted)
         if not self._all_enabled:
             self._without_command(wanted)
         return self.motors.turn(velocity)
@@ -289,12 +291,8 @@ class Drives:
     def _judge_heat(self) -> None:
         """Less torque for a hot drive, none for one that is too hot."""
         temperature, parameters = self.motors.temperature, self.parameters
-        if temperature.max() < self._robot.derating.start and self._own_limit is self._robot.torque_max:
-            return
         # As it is told: the HAL computes the same limit from the frame.
-        limit = self._robot.torque_limit(np.rint(temperature))
-        self._own_limit = self._robot.torque_max if (limit == self._robot.torque_max).all() else limit
-        self._limit = b""
+        self._own_limit[:] = self._robot.torque_limit(np.rint(temperature))
         for drive, degrees in enumerate(temperature.tolist()):
             if degrees >= parameters.trip_temperature:
                 self.fail(drive, emergency.OVER_TEMPERATURE, stands=True)
