@@ -17,10 +17,15 @@ from atalante_hal.e2e import (
     Check,
     Qualification,
     check_counter,
+    checksum,
     crc,
     data_id_bytes,
+    intact,
+    protect,
+    protected_spans,
     qualify,
 )
+from atalante_hal.frame import FRAME_BYTES, new_frames
 from atalante_hal.image import ReceiveImage, TransmitImage
 
 NETWORK = load()
@@ -55,6 +60,61 @@ def test_a_whole_sealed_cycle_equals_the_reference(messages):
             payload = frame["data"][: message.length].tobytes()
             assert payload[2] == cycle & 0xFF
             assert oracle.p05.e2e_p05_check(payload, message.data_id)
+
+
+# -- the same for whole cycles of frames, byte by byte -----------------------------------------------------------------
+
+SHORT, LONG = NETWORK.message("LEFT_SK_STATE"), NETWORK.message("FOOT_LEFT_STATE")
+
+
+def rows_of_frames() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two frames of random bytes: octets, spans, and the counters 7 and 250 that are to be theirs."""
+    octets = np.random.default_rng(3).integers(0, 256, 2 * FRAME_BYTES).astype(np.uint8)
+    return octets, protected_spans([SHORT, LONG]), np.array([7, 250])
+
+
+def test_spans_tell_where_the_payload_of_each_row_is():
+    spans = protected_spans([SHORT, LONG])
+    assert spans.dtype == np.int64
+    assert spans.tolist() == [[8, 8 + SHORT.length, SHORT.data_id], [80, 80 + LONG.length, LONG.data_id]]
+    frames = new_frames(2)
+    frames["data"][1, 0] = 99
+    assert frames.view(np.uint8)[spans[1, 0]] == 99
+
+
+def test_checksum_is_the_crc_of_the_payload_alone():
+    octets, spans, _ = rows_of_frames()
+    for begin, end, data_id in spans.tolist():
+        for ours in (data_id, 0, 0xFFFF, 0x0102):
+            expected = crc(octets[begin + 2 : end].tobytes(), data_id_bytes(ours))
+            assert checksum(octets, begin, end, ours) == expected
+    assert checksum(octets, 0, 2, 0x1234) == crc(b"", data_id_bytes(0x1234))
+
+
+def test_protect_writes_three_bytes_a_row_and_nothing_else():
+    octets, spans, counters = rows_of_frames()
+    before = octets.copy()
+    protect(octets, spans, counters)
+    changed = np.flatnonzero(octets != before)
+    assert set(changed) <= {8, 9, 10, 80, 81, 82}
+    for message, counter, (begin, end, _) in zip((SHORT, LONG), (7, 250), spans.tolist(), strict=True):
+        payload = octets[begin:end].tobytes()
+        assert payload[2] == counter
+        assert oracle.p05.e2e_p05_check(payload, message.data_id)
+
+
+def test_rows_are_intact_only_if_every_byte_of_them_is():
+    octets, spans, counters = rows_of_frames()
+    assert not intact(octets, spans, counters)
+    protect(octets, spans, counters)
+    assert intact(octets, spans, counters) is True
+    payloads = {place for begin, end, _ in spans.tolist() for place in range(begin, end)}
+    for place in range(len(octets)):
+        octets[place] ^= 0x10
+        assert intact(octets, spans, counters) is (place not in payloads)
+        octets[place] ^= 0x10
+    for other in ([8, 250], [7, 249]):
+        assert intact(octets, spans, np.array(other)) is False
 
 
 def test_every_step_of_the_counter_is_judged():
