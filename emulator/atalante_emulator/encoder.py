@@ -8,11 +8,31 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_emulator.body import PERIOD
+from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, Robot
 
 Vector = npt.NDArray[np.float64]
 
 COUNTS = 131072  # encoder counts a motor turn, 17 bits
+LSB = 2.0 * math.pi / COUNTS  # rad at the motor
+
+
+def _sample(
+    joint: Vector,
+    counts_per_rad: Vector,
+    keep: float,
+    counts: Vector,
+    before: Vector,
+    position: Vector,
+    velocity: Vector,
+) -> None:
+    """Counts of all encoders, and position and velocity as the state frames say them. Shape (12,) each."""
+    for i in range(len(joint)):
+        count = np.rint(joint[i] * counts_per_rad[i])
+        before[i] = count if math.isnan(counts[i]) else counts[i]
+        counts[i] = count
+        position[i] = count * LSB
+        velocity[i] = keep * velocity[i] + (1.0 - keep) * ((count - before[i]) * LSB / PERIOD)
 
 
 class Encoders:
@@ -20,32 +40,19 @@ class Encoders:
 
     def __init__(self, robot: Robot, bandwidth: float, position: Vector, velocity: Vector) -> None:
         """`bandwidth` of the velocity estimate [Hz]."""
-        counts = COUNTS / (2.0 * math.pi)
-        self._counts_per_rad = robot.gear * robot.polarity * counts
-        self._lsb = np.full(len(JOINTS), 1.0 / counts)
-        # Velocity estimate v' = keep v + gain (counts - counts before). The two rows of counts take turns.
-        keep = math.exp(-2.0 * math.pi * bandwidth * PERIOD)
-        gain = (1.0 - keep) / (counts * PERIOD)
-        self._encoder = np.zeros((3, len(JOINTS)))
-        self._estimate, self._counts, self._counts_before = self._encoder
-        self._filter, self._filter_next = np.array([keep, gain, -gain]), np.array([keep, -gain, gain])
-        self._first_sample = True
+        self._counts_per_rad = robot.gear * robot.polarity * (COUNTS / (2.0 * math.pi))
+        self._keep = math.exp(-2.0 * math.pi * bandwidth * PERIOD)
+        self._counts, self._before = np.zeros((2, len(JOINTS)))
         self._position, self._velocity = position, velocity
+        self._sample = compiled(_sample)
+        self.sample(np.zeros(len(JOINTS)))  # is compiled now, not in the first cycle
+        self._counts.fill(math.nan)  # there was no sample yet
 
     def sample(self, position: Vector) -> None:
         """Read the encoders. Joint position [rad], shape (12,)."""
-        counts = self._counts_before
-        # Results as positional arguments: a fifth faster than `out=`.
-        np.multiply(position, self._counts_per_rad, counts)
-        np.rint(counts, counts)
-        if self._first_sample:
-            self._counts[:] = counts
-            self._first_sample = False
-        self._counts_before, self._counts = self._counts, counts
-        self._filter, self._filter_next = self._filter_next, self._filter
-        np.multiply(counts, self._lsb, self._position)
-        self._filter.dot(self._encoder, self._velocity)
-        self._estimate[:] = self._velocity
+        self._sample(
+            position, self._counts_per_rad, self._keep, self._counts, self._before, self._position, self._velocity
+        )
 
     @property
     def angle(self) -> Vector:
@@ -56,5 +63,5 @@ class Encoders:
     @property
     def speed(self) -> Vector:
         """Joint velocity, the bare difference of counts: for a loop inside the drive, which the filter would be too late for."""
-        speed: Vector = (self._counts - self._counts_before) / (self._counts_per_rad * PERIOD)
+        speed: Vector = (self._counts - self._before) / (self._counts_per_rad * PERIOD)
         return speed
