@@ -239,7 +239,7 @@ def test_at_full_assistance_the_guide_has_no_say():
     rng = np.random.default_rng(1)
 
     def nonsense(*state: float) -> tuple[float, float]:
-        wild.guide.bounds = [1.0, 1.0]
+        wild.guide.joints["upper"] = wild.guide.joints["lower"] = 1.0
         return tuple(rng.normal(size=2) * 1e3)  # type: ignore[return-value]
 
     wild.guide.tick = nonsense  # type: ignore[method-assign]

@@ -20,7 +20,8 @@ from atalante_control.backup import BackupPolicy
 from atalante_control.certificate import HandOver, certify
 from atalante_control.deadbeat import Deadbeat
 from atalante_control.gait import HANG_GAIT, PERIOD, bezier, derivative, load_gait
-from atalante_control.guide import GuideConfig, GuideFilter, damped_gate, gate
+from atalante_control.guide import GuideConfig, GuideFilter
+from atalante_control.guide_kernel import damped_gate, gate
 from atalante_control.guide_shapes import SHAPES, GuideShape
 from atalante_hal.robot import load_robot
 

@@ -23,7 +23,10 @@ CORE = {
         ("test_supervisor.py", "test_diagnostics.py", "test_cia402.py"),
     ),
     "limiter": (("atalante_hal/limiter.py",), ("test_limiter.py",)),
-    "guide": (("atalante_control/guide.py",), ("test_guide.py",)),
+    "guide": (
+        ("atalante_control/guide.py", "atalante_control/guide_kernel.py"),
+        ("test_guide.py", "test_guide_kernel.py"),
+    ),
     "drive": (
         ("atalante_emulator/drive.py", "atalante_emulator/emergency.py", "atalante_emulator/collision.py"),
         ("test_drive.py", "test_emergency.py", "test_collision.py"),
