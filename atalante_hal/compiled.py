@@ -10,6 +10,7 @@ another's, and one cache serves an emulated kernel, too.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -20,13 +21,16 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
+_log = logging.getLogger(__name__)
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(function: Function) -> Function:
     """The function as machine code: numbers and arrays in, numbers and arrays out. Bounds are checked, as in Python.
 
-    Call it once with what it will be given before time matters: types it has not seen are compiled when they come.
+    Call it once with what it will be given before time matters: types it has not seen are compiled when they come. What is not
+    in the cache takes seconds and is logged as information.
     """
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         return function
@@ -41,6 +45,8 @@ def _compiled(function: FunctionType) -> Any:
     config.CPU_NAME, config.CPU_FEATURES = "generic", ""
     folder = _folder(function)
     config.CACHE_DIR = str(folder or "")
+    if folder is None or not any(folder.iterdir()):
+        _log.info("%s.%s is compiled", function.__module__, function.__qualname__)
     return numba.njit(boundscheck=True, cache=folder is not None)(_twin(function))
 
 

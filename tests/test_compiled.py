@@ -103,6 +103,20 @@ def test_the_cache_notices_every_change(changed: FunctionType, monkeypatch: pyte
     assert module._folder(total) == module._folder(_changed(total))  # type: ignore[arg-type]
 
 
+def test_tells_what_takes_long(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    caplog.set_level("INFO", logger=module.__name__)
+    for _ in range(2):
+        assert compiled(_changed(_told))(2.0) == 8.0
+    assert [record.getMessage() for record in caplog.records] == [f"{__name__}._told is compiled"]
+
+
+def _told(x: float) -> float:
+    return x * x * x
+
+
 def test_a_second_process_finds_it_in_the_cache(tmp_path: Path) -> None:
     (tmp_path / "kernel.py").write_text("def square(x):\n    return x * x\n")
     script = (

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import math
 
 import pytest
 
-from atalante_tools.terminal import LIVE, LOGGED, Progress, say, show_json, table
+from atalante_hal import compiled
+from atalante_tools.terminal import LIVE, LOGGED, Patience, Progress, say, show_json, table
 
 
 class Terminal(io.StringIO):
@@ -63,3 +65,17 @@ def test_a_period_of_ones_own_replaces_both() -> None:
     progress = Progress(period=1.0, stream=io.StringIO(), now=lambda: now[0])
     now[0] = 1.0
     assert progress.due()
+
+
+def test_compiling_is_announced_once(capsys: pytest.CaptureFixture[str]) -> None:
+    logger = logging.getLogger(compiled.__name__)
+    before = list(logger.handlers), logger.level
+    try:
+        Patience.begin()
+        for name in ("accept", "limit"):
+            logger.info("%s is compiled", name)
+    finally:
+        logger.handlers, logger.level = before
+    assert capsys.readouterr().err == (
+        "preparing machine code: some seconds, once after an installation or an update\n"
+    )

@@ -103,7 +103,8 @@ in_guest() {
 
     result=$(mktemp -d) # global: the traps need it after this function, as they need guest
     trap 'rm -rf "$result"' EXIT
-    printf -v command '%q ' env "PYTHON=$python" bash tests/vcan/run.sh --inside "$result" "$@"
+    # Without the compiler's library: loading it there takes longer than all loops as plain Python.
+    printf -v command '%q ' env "PYTHON=$python" NUMBA_DISABLE_JIT=1 bash tests/vcan/run.sh --inside "$result" "$@"
     say "this kernel has no usable SocketCAN; booting ${kernel#/boot/} in QEMU without KVM (half a minute, then slowly)"
     # Through a pipe: vng opens its standard output anew, and a file would be written over from its start.
     exec {show}> >(exec cat)

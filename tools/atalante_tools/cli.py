@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 import click
 
 from atalante_tools.outcome import INTERRUPTED, TERMINATED, Misused, failure_of
+from atalante_tools.terminal import Patience
 
 #: Command -> its line in the list. Each is the attribute `command` of the module of that name.
 COMMANDS = {
@@ -94,6 +95,7 @@ def main() -> NoReturn:
     """Entry point."""
     # A command that moves the robot replaces this by ending in HOLD first; Python alone would skip every `finally`.
     signal.signal(signal.SIGTERM, _terminate)
+    Patience.begin()
     try:
         cli(prog_name="atalante")
     except KeyboardInterrupt:

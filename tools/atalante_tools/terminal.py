@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -18,6 +19,27 @@ LOGGED: Final = 5.0
 def say(text: str) -> None:
     """One line for the person at the terminal, on stderr."""
     click.echo(text, err=True)
+
+
+class Patience(logging.Handler):
+    """Says once that hot loops are being compiled, which takes seconds, when the first one is."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self._said = False
+
+    @classmethod
+    def begin(cls) -> None:
+        """Listen to `atalante_hal.compiled`, without importing it: most commands compile nothing."""
+        logger = logging.getLogger("atalante_hal.compiled")
+        logger.addHandler(cls())
+        logger.setLevel(logging.INFO)
+
+    def emit(self, _record: logging.LogRecord) -> None:
+        """A loop is compiled."""
+        if not self._said:
+            self._said = True
+            say("preparing machine code: some seconds, once after an installation or an update")
 
 
 def show_json(value: Mapping[str, Any]) -> None:
