@@ -65,6 +65,8 @@ class Sensors:
 
     velocity_error: float  # rad/s at the joint, reported velocity against the encoder, on average
     attitude_error: float  # rad, tibia against pelvis IMU, each axis, against the encoders between them
+    attitude_change: float  # rad, by which that changes within a fraction of a second
+    misalignment: float  # rad more for each rad the leg turns meanwhile
     quaternion_error: float  # of its squared norm against 1
     cell_free: float  # N, vertical: a force cell under this carries nothing
     cell_loaded: float  # N, vertical, three cells together: over this the fourth carries something
@@ -138,6 +140,8 @@ _TABLES = {
     "sensors": {
         "velocity_error": _Key(1, 0.01, 10.0, "rad/s"),
         "attitude_error": _Key(1, 1e-3, 0.5, "rad"),
+        "attitude_change": _Key(1, 1e-4, 0.5, "rad"),
+        "misalignment": _Key(1, 0.0, 0.5, "rad a rad"),
         "quaternion_error": _Key(1, 1e-4, 0.5, "of 1"),
         "cell_free": _Key(1, 1.0, 1000.0, "N"),
         "cell_loaded": _Key(1, 1.0, 3000.0, "N"),

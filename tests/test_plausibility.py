@@ -21,7 +21,7 @@ from atalante_hal.e2e import Check
 from atalante_hal.image import ReceiveImage
 from atalante_hal.plausibility import Finding, Plausibility
 from atalante_hal.plausibility.finding import Signals, measured, signals_of
-from atalante_hal.plausibility.imus import hip_angles
+from atalante_hal.plausibility.legs import hip_angles
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, load_robot
 
 NETWORK = atalante_dbc.load()
@@ -535,6 +535,101 @@ class TestStuckEncoder:
         machine = Machine()
         machine.missing = {row("left_SK")}
         assert machine.run(200) == ()
+
+
+class TestStandingEncoder:
+    """An encoder that stands still while pelvis and tibia IMU say that its leg turns; nobody drives it."""
+
+    allowed = ROBOT.sensors.attitude_change / (1.0 - ROBOT.sensors.misalignment)
+
+    @staticmethod
+    def standing(joint: int) -> tuple[Machine, Callable[[float], None]]:
+        """A robot that stands, and how to turn a joint whose encoder does not show it."""
+        machine = Machine(amplitude=0.0)
+        turned = np.zeros(12)
+        machine.position = lambda: MIDDLE + turned  # type: ignore[method-assign]
+        machine.run(40)
+        return machine, lambda angle: turned.__setitem__(joint, angle)
+
+    @staticmethod
+    def still(now: Signals) -> None:
+        now.position[:] = MIDDLE * GEAR
+
+    @joints
+    @pytest.mark.parametrize("phase", [0, 9, 24])
+    def test_found_without_any_torque(self, joint: int, phase: int):
+        machine = Machine(amplitude=0.1)
+        machine.run(200 + phase, lambda now: now.torque.fill(0.0))
+        stuck = float(machine.now.position[joint])
+
+        def stick(now: Signals) -> None:
+            now.position[joint] = stuck
+            now.torque[:] = 0.0
+
+        if JOINTS[joint].endswith(("SA", "HA")):  # the promised miss
+            assert machine.run(400, stick) == ()
+            return
+        machine.until_found(Dtc.ENC_STUCK, 80, stick)
+        finding = only(machine.checks.findings)
+        assert finding.node == JOINTS[joint].upper()
+        assert f"encoder of {JOINTS[joint]} stands still while its leg turned by" in finding.text
+        machine.missing = {row("pendant")}
+        assert only(machine.run(40, stick)) is finding
+
+    @joints
+    @signs
+    def test_the_threshold_is_tight(self, joint: int, sign: float):
+        if JOINTS[joint].endswith(("SA", "HA")):
+            return
+        machine, turn = self.standing(joint)
+        turn(sign * 0.99 * self.allowed)
+        assert machine.run(33, self.still) == ()
+        machine, turn = self.standing(joint)
+        turn(sign * 1.01 * self.allowed)
+        assert 16 < machine.until_found(Dtc.ENC_STUCK, 48, self.still) <= 48
+        pair = (
+            {joint, joint ^ 1} if JOINTS[joint].endswith(("SH", "SK")) else {joint}
+        )  # no attitude tells these two apart
+        assert [f.node for f in machine.checks.findings] == [JOINTS[one].upper() for one in sorted(pair)]
+        assert [f.value for f in machine.checks.findings] == pytest.approx([sign * 1.01 * self.allowed] * len(pair))
+        turn(0.0)
+        assert machine.run(33, self.still) == ()
+
+    def test_one_sample_is_a_stray(self):
+        machine, turn = self.standing(JOINTS.index("left_TH"))
+        for _ in range(5):
+            turn(0.1)
+            assert machine.run(16, self.still) == ()
+            turn(0.0)
+            assert machine.run(16, self.still) == ()
+
+    def test_a_leg_that_turns_about_another_axis_does_not_show_how_its_imu_is_mounted(self):
+        machine, turn = self.standing(JOINTS.index("left_SH"))
+        askew = pinocchio.Quaternion(np.array([0.0, 0.0, math.sin(math.radians(0.4)), math.cos(math.radians(0.4))]))
+        tibia, begin = IMUS.index("left_tibia"), machine.cycles
+
+        def mounted(now: Signals) -> None:
+            angle = -1.25 * PERIOD * (machine.cycles - begin)
+            turn(angle)
+            now.position[:] = MIDDLE * GEAR
+            now.position[2] += angle * GEAR[2]
+            now.velocity[2] = -1.25 * GEAR[2]
+            w, x, y, z = now.quaternion[tibia]
+            x, y, z, w = (pinocchio.Quaternion(np.array([x, y, z, w])) * askew).coeffs()
+            now.quaternion[tibia] = w, x, y, z
+
+        assert machine.run(400, mounted) == ()
+
+    def test_the_heading_of_an_imu_may_drift_under_a_robot_that_stands(self):
+        machine = Machine(amplitude=0.0)
+
+        def drift(now: Signals) -> None:
+            half = 0.5 * 1.1e-3 * machine.time
+            w, x, y, z = now.quaternion[1]
+            c, s = math.cos(half), math.sin(half)
+            now.quaternion[1] = c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w
+
+        assert machine.run(6500, drift) == ()
 
 
 class TestFrozenImu:

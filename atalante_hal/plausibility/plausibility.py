@@ -1,6 +1,6 @@
 """The plausibility checks of one cycle, in the right order and as cheap as they can be.
 
-    process image -> [what stands still | velocity, norms | feet | drift, in turn] -> jump and range -> state
+    process image -> [what stands still | velocity, norms | feet | legs, in turn] -> jump and range -> state
 
 A cycle in which everything is plausible costs one look at the encoders and one at the IMUs; the slow checks take turns. What
 fails is refused: its message keeps the values it had, and ages.
@@ -23,12 +23,13 @@ from atalante_hal.plausibility.finding import (
     signals_of,
 )
 from atalante_hal.plausibility.imus import Imus
+from atalante_hal.plausibility.legs import Legs
 from atalante_hal.plausibility.stillness import Stillness
 from atalante_hal.robot import Robot
 
 #: Cycles between two turns of what looks for standstill and wrong velocities, and of the look at the feet.
 SLOW, FEET = 16, 4
-#: Cycles after which the turns repeat; norms and the drift of each leg get one.
+#: Cycles after which the turns repeat; norms and each leg get one.
 _ROUND = 32
 _FRESH = int(Check.SOME_LOST)
 
@@ -53,6 +54,7 @@ class Plausibility:
         self._encoders = Encoders(robot, now, signals_of(codec, image.values_before), period, SLOW)
         self._imus = Imus(robot, codec, now)
         self._stillness = Stillness(robot, image, now, SLOW)
+        self._legs = Legs(robot, now, self._stillness.standing)
         self._feet = Feet(robot, now, FEET)
         self._joint_rows, self._imu_rows, self._foot_rows = (
             rows_of(codec, messages) for messages in (JOINT_MESSAGES, IMU_MESSAGES, FOOT_MESSAGES)
@@ -71,11 +73,7 @@ class Plausibility:
         turns[0::SLOW] = [self._stillness.sample] * (_ROUND // SLOW)
         turns[2::SLOW] = [self._encoders.judge_velocity] * (_ROUND // SLOW)
         turns[1::FEET] = [self._judge_feet] * (_ROUND // FEET)
-        turns[4], turns[8], turns[24] = (
-            self._imus.judge_norms,
-            self._imus.judge_left_drift,
-            self._imus.judge_right_drift,
-        )
+        turns[4], turns[8], turns[24] = self._imus.judge_norms, self._legs.judge_left, self._legs.judge_right
         return turns
 
     def check(self) -> tuple[Finding, ...]:
@@ -131,6 +129,7 @@ class Plausibility:
         findings = (
             *self._encoders.findings(),
             *self._imus.findings(),
+            *self._legs.findings(),
             *self._stillness.findings(),
             *self._feet.findings(),
         )

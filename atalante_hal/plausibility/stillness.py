@@ -5,12 +5,13 @@ does not count, neither way.
 
 An encoder may stand still: it is stuck only if the drive's torque has swung by `breakaway` since it moved last, which is over
 twice the dry friction of its joint, and if the joint is not at its end stop, which holds it against any torque. A stuck encoder
-of a joint that nobody drives is not found until somebody does.
+of a joint that nobody drives is not found here until somebody does; see `legs` for those that the IMUs see.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from atalante_hal.diagnostics import Dtc
 from atalante_hal.e2e import Check
@@ -51,7 +52,9 @@ class Stillness:
         self._to_freeze = to_freeze
         self._limit = limit
         self._over, self._none_over = np.empty(size, np.bool_), bytes(size)
-        self._encoders, self._gyros, self._cells = (
+        #: Samples on end in which each encoder stood still, shape (12,).
+        self.standing: npt.NDArray[np.int64]
+        self.standing, self._gyros, self._cells = (
             self._repeats[codec.slice(quantity)] for quantity in ("Position", "Gyro", "Force")
         )
         self._encoders_same, self._no_encoder = self._same[codec.slice("Position")], bytes(len(JOINTS))
@@ -95,7 +98,7 @@ class Stillness:
 
     def _follow_torque(self) -> None:
         """Range of the torque since an encoder moved last."""
-        first = self._encoders == 1
+        first = self.standing == 1
         torque = self._now.torque
         low = np.where(first, self._sampled_torque, self._torque_low)
         high = np.where(first, self._sampled_torque, self._torque_high)
@@ -106,7 +109,7 @@ class Stillness:
         angle = self._now.position * self._to_joint
         pushed = self._torque_high - self._torque_low >= self._breakaway
         free = (angle > self._low_stop) & (angle < self._high_stop)
-        self.encoders = np.flatnonzero((self._encoders >= self._to_stuck) & pushed & free).tolist()
+        self.encoders = np.flatnonzero((self.standing >= self._to_stuck) & pushed & free).tolist()
         frozen = (self._gyros.reshape(len(IMUS), -1) >= self._to_freeze).all(axis=1)
         self.imus = np.flatnonzero(frozen).tolist()
         dead = (self._cells.reshape(len(FEET), len(CELLS), -1) >= self._to_freeze).any(axis=2)
