@@ -389,6 +389,7 @@ class Hal:
         if pendant.started and state.supervisor is not _S.ACTIVE:
             faulty = {node for node, drive in zip(_NODES, state.drive_state.tolist(), strict=True) if drive in _FAULTY}
             self._heartbeats.acknowledge(faulty)
+            self._transceiver.acknowledge()
             self._start_wanted = ENABLE_CYCLES
         elif self._start_wanted:
             self._start_wanted -= 1

@@ -79,6 +79,7 @@ class Transceiver:
         self._refused = 0  # batches in a row for which the transmit queue had no room
         self._full_this_cycle = False
         self._floods = 0  # cycles in a row
+        self._bus_off = 0  # error class of the frame that said so, until the operator acknowledges it
         #: Nothing is wrong with the bus.
         self.quiet = True
 
@@ -141,7 +142,8 @@ class Transceiver:
         for can_id in frames["can_id"].tolist():
             if can_id & ID_ERROR:
                 if can_id & ERROR_BUS_OFF:
-                    self._find(Dtc.BUS_OFF, True, can_id & ~ID_ERROR, "")
+                    self._bus_off = can_id & ~ID_ERROR
+                    self.quiet = False
             elif can_id in self._own_ids:
                 self._find(Dtc.HAL_DUPLICATE, True, can_id, f"somebody else sends id 0x{can_id:X}, which is this HAL's")
             else:
@@ -172,15 +174,21 @@ class Transceiver:
         except BusError as error:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} fails: {error}")
 
+    def acknowledge(self) -> None:
+        """The operator starts again: a controller that was bus-off may be used, if it can."""
+        self._bus_off = 0
+
     def judge(self, cycle: int, memory: FaultMemory) -> None:
-        """Raise what was found since the last judgement."""
+        """Raise what was found since the last judgement, and a bus-off that nobody has acknowledged."""
         self._refused = self._refused + 1 if self._full_this_cycle else 0
         self._full_this_cycle = False
         self._floods = self._floods + 1 if any(dtc is Dtc.BUS_FLOOD for dtc, *_ in self._found) else 0
         for dtc, confirmed, value, text in self._found:
             memory.raise_dtc(cycle, dtc, self._node, value=value, confirmed=confirmed, text=text)
         self._found.clear()
-        self.quiet = not (self._refused or self._floods)
+        if self._bus_off:
+            memory.raise_dtc(cycle, Dtc.BUS_OFF, self._node, value=self._bus_off)
+        self.quiet = not (self._refused or self._floods or self._bus_off)
 
     def _find(self, dtc: Dtc, confirmed: bool, value: float, text: str) -> None:
         self._found.append((dtc, confirmed, value, text))

@@ -259,7 +259,19 @@ def test_frames_that_are_no_message_to_this_node(desk: Desk, can_id: int, code: 
     assert desk.transceiver.quiet is (code is None)
     assert desk.judge() == ({code: True} if code else {})
     assert [e.value for e in desk.memory.events] == ([value] if code else [])
+    desk.transceiver.acknowledge()
     assert desk.judge() == {}
+    assert desk.transceiver.quiet
+
+
+def test_bus_off_stands_until_somebody_acknowledges_it(desk: Desk):
+    desk.transceiver.foreign(ids(ID_ERROR | 0x40))
+    for _ in range(3):
+        assert desk.judge() == {"BUS_OFF": True}
+        assert not desk.transceiver.quiet
+    desk.transceiver.acknowledge()
+    assert desk.judge() == {}
+    assert desk.transceiver.quiet
 
 
 def test_each_of_several_strange_frames_counts(desk: Desk):
