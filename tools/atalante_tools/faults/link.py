@@ -185,7 +185,14 @@ SCENARIOS: Final = (
         (
             Case("for good", (Fault("bus_off", "left_leg"),), recovers=False),
             Case("for 100 cycles", (Fault("bus_off", "left_leg", 0, 100),)),
-            Case("before the start, for 3 cycles", (Fault("bus_off", "left_leg", 5, 3),), None, begins=5, state=_OFF),
+            Case(
+                "before the start, for 3 cycles",
+                (Fault("bus_off", "left_leg", 5, 3),),
+                phase=None,
+                begins=5,
+                state=_OFF,
+                watched=200,
+            ),
         ),
         lasting=Case("one bus", (Fault("bus_off", "left_leg"),)),
     ),
