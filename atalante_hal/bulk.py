@@ -62,14 +62,9 @@ class BulkCodec:
         self._place = {field.name: place for place, field in enumerate(self.fields)}
         self._signed = sum(f.kind == "signed" for f in self.fields)
         self._plan()
-        #: Fields that are integers too wide for one product of doubles, or floats: scaled one by one.
-        self._special = [p for p, f in enumerate(self.fields) if f.kind == "float" or f.length == _WORD]
-        self._factor = np.array([float(f.factor) for f in self.fields])[:, None]
-        self._offset = np.array([float(f.offset) for f in self.fields])[:, None]
-        self._has_offset = bool(self._offset.any())
 
     def place(self, name: str) -> int:
-        """Row of a signal in what `extract` and `scaled` return.
+        """Row of a signal in what `extract` returns.
 
         Raises:
             KeyError: with the names there are.
@@ -135,15 +130,6 @@ class BulkCodec:
         np.right_shift(signed, self._right_signed, out=signed)
         np.right_shift(raw[self._signed :], self._right_unsigned, out=raw[self._signed :])
         return raw
-
-    def scaled(self, raw: Words) -> npt.NDArray[np.float64]:
-        """Physical values of all fields as doubles. Shape (fields, n), DBC units."""
-        values: npt.NDArray[np.float64] = np.multiply(raw.view(np.int64), self._factor)
-        if self._has_offset:
-            values += self._offset
-        for place in self._special:
-            values[place] = self.values(raw, place)
-        return values
 
     def values(self, raw: Words, place: int) -> Values:
         """Physical values of one field, integers exact. Shape (n,), DBC units."""

@@ -177,7 +177,8 @@ def test_refuses_gains_that_are_none(bad: tuple[float, float, float]):
         BackupPolicy(1.0, 1.0, 1.0, 0.0)
 
 
-def test_settling_rate_is_that_of_the_slowest_mode():
+def test_what_is_left_late_decays_like_the_slowest_mode():
     late = np.array([0.5, 0.6])
     error = OVERDAMPED.transition(late)[:, 0, 0]
-    assert math.log(error[0] / error[1]) / 0.1 == pytest.approx(OVERDAMPED.settling_rate, rel=1e-3)
+    slowest = -np.roots([OVERDAMPED.inertia, OVERDAMPED.kd, OVERDAMPED.kp]).max()
+    assert math.log(error[0] / error[1]) / 0.1 == pytest.approx(slowest, rel=1e-3)

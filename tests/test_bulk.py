@@ -258,18 +258,6 @@ def test_same_values_as_the_codec_of_the_loop(network: atalante_dbc.Network) -> 
     assert network.messages
 
 
-def test_scaled_is_the_same_for_all_fields_at_once() -> None:
-    generator = np.random.default_rng(4)
-    for layout in catalogue(Path(__file__).with_name("foreign") / "floats.dbc").layouts:
-        codec = BulkCodec(layout)
-        frames = random_frames(generator, layout, 50)
-        raw = codec.extract(np.ascontiguousarray(frames.view(np.uint64).reshape(50, -1)[:, 1:].T))
-        with np.errstate(invalid="ignore"):
-            together = codec.scaled(raw)
-            for place in range(len(codec.fields)):
-                np.testing.assert_array_equal(together[place], codec.values(raw, place).astype(np.float64))
-
-
 def test_a_field_knows_its_place() -> None:
     codec = BulkCodec(catalogue(atalante_dbc.DBC_FILE).layout("LEFT_FH_STATE"))
     assert codec.fields[codec.place("Position")].name == "Position"

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from atalante_control.guide_shapes import SHAPES, GuideShape, half_width, shape_named
+from atalante_control.guide_shapes import SHAPES, GuideShape, half_width
 
 PHASE = np.linspace(0.0, 1.0, 801)
 ALL = list(SHAPES.values())
@@ -76,9 +76,3 @@ def test_shapes_do_what_their_names_say():
 
 def test_a_guide_already_narrower_than_the_pinch_stays_as_it_is():
     np.testing.assert_allclose(SHAPES["pinched"].bounds(PHASE, 1.0), half_width(1.0))
-
-
-def test_an_unknown_name_is_answered_with_the_names():
-    assert shape_named("pinched") is SHAPES["pinched"]
-    with pytest.raises(ValueError, match="'square' is unknown; the shapes are constant, widening"):
-        shape_named("square")

@@ -55,12 +55,6 @@ class BackupPolicy:
         """True when Kd^2 >= 4 Kp J: the impulse response never changes sign, and constant extremes are the worst."""
         return self.kd**2 >= 4.0 * self.kp * self.inertia * (1.0 - 1e-12)
 
-    @property
-    def settling_rate(self) -> float:
-        """Decay rate of the slowest mode [1/s]."""
-        sigma, spread = self._poles()
-        return sigma - spread.real
-
     def transition(self, tau: Vector) -> Vector:
         """Phi(tau), closed form. Args: tau shape (n,) [s]. Returns: shape (n, 2, 2) acting on (e, e')."""
         impulse, slope = self._impulse(tau)

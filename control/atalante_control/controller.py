@@ -34,10 +34,11 @@ from atalante_control.certificate import Certificate, HandOver, certify, largest
 from atalante_control.deadbeat import Deadbeat
 from atalante_control.flat_foot import Tibiae, flat_feet
 from atalante_control.gait import PERIOD, Gait, bezier
+from atalante_control.gravity import Gravity
 from atalante_control.guide import GuideConfig, GuideFilter
 from atalante_control.guide_shapes import GuideShape
 from atalante_control.haptics import intensity, levels
-from atalante_control.idealization import AssistedInertia, Friction, Gravity
+from atalante_control.idealization import AssistedInertia, Friction
 from atalante_control.impact import step_over
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_control.pid import AIR_GAINS, LEFT, RIGHT, Pid, PidGains
@@ -115,13 +116,13 @@ class HangStatistics:
 
     @property
     def inside_fraction(self) -> float:
-        """Part of the time with both joints in the guide; 1 before anything is counted."""
-        return self.inside / self.cycles if self.cycles else 1.0
+        """Part of the counted time with both joints in the guide; 0 before anything is counted."""
+        return self.inside / max(1, self.cycles)
 
     @property
     def active_fraction(self) -> float:
-        """Part of the time the filter acts."""
-        return self.active / self.cycles if self.cycles else 0.0
+        """Part of the counted time the filter acts."""
+        return self.active / max(1, self.cycles)
 
 
 def baseline_share(xi: float, fade: float) -> float:

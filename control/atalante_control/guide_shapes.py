@@ -98,14 +98,3 @@ SNAP = GuideShape("snap", "closes to 0.1 degrees in 0.02 T: what no backup polic
 
 #: The shapes that ship, by name. `snap` cannot be certified; it shows how that is announced.
 SHAPES = {shape.name: shape for shape in (CONSTANT, WIDENING, NARROWING, PINCHED, ASYMMETRIC, SNAP)}
-
-
-def shape_named(name: str) -> GuideShape:
-    """The shape of that name.
-
-    Raises:
-        ValueError: there is none; the message lists the names.
-    """
-    if name not in SHAPES:
-        raise ValueError(f"guide shape {name!r} is unknown; the shapes are {', '.join(SHAPES)}")
-    return SHAPES[name]

@@ -299,14 +299,13 @@ def _tell_where(telemetry: TelemetryProcess) -> None:
 
 def _result(name: str, certified: bool, controller: HangController, hal: Hal, statistics: Statistics) -> Result:
     walked = controller.statistics
-    counted = max(1, walked.cycles)
     return Result(
         shape=name,
         certified=certified,
         steps=walked.steps,
         max_ratio=round(walked.max_ratio, 4),
-        inside=round(walked.inside / counted, 4),
-        filter_active=round(walked.active / counted, 4),
+        inside=round(walked.inside_fraction, 4),
+        filter_active=round(walked.active_fraction, 4),
         cycles=statistics.cycles,
         real_time_factor=round(statistics.real_time_factor, 2),
         frames=int(hal.record[hal.layout["frames"]][0]),

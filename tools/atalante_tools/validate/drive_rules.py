@@ -63,7 +63,6 @@ class DriveRules:
         for family in plan.families:
             place = next((p for p, f in enumerate(family.codec.fields) if f.name == state), None)
             if place is not None:
-                self._state_place = place
                 self.drives[family.rows.start] = [self._drive(plan, row, command) for row in family.rows]
         self.state, self.command = state, command
 

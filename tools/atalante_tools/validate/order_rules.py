@@ -58,14 +58,14 @@ class OrderRules:
         """Judge a chunk. `steps` of the alive counters, shape (n,)."""
         for bus in self.buses:
             span = stream.of(bus.sync)
-            places, stamps, moved = stream.places[span], stream.stamps[span], steps[span]
+            places, stamps = stream.places[span], stream.stamps[span]
             begins = np.concatenate([[bus.stamp], stamps])
             for row in bus.states:
                 of = stream.of(row)
                 if of.start != of.stop:
                     number = _cycles(places, stream.places[of])
                     self._judge_lateness(bus, row, stream.stamps[of], begins[number], number)
-                    self._judge_order(bus, row, stream.stamps[of], steps[of], number + bus.count, begins, moved)
+                    self._judge_order(bus, row, stream.stamps[of], steps[of], number + bus.count, begins)
             if len(stamps):
                 bus.count += len(stamps)
                 bus.stamp = int(stamps[-1])
@@ -89,7 +89,6 @@ class OrderRules:
         steps: Steps,
         cycles: Places,
         begins: npt.NDArray[np.int64],
-        sync_steps: Steps,
     ) -> None:
         """Two states in one cycle and none in the next: the second came before its SYNC. None, then two: the first was late.
 
