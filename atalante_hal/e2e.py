@@ -71,8 +71,11 @@ _PAYLOAD = 8  # first byte of the payload in a frame
 
 def protected_spans(messages: Sequence[Message]) -> Words:
     """Where the payload of each row of frames begins and ends, and its Data ID. Shape (rows, 3)."""
-    first = [row * FRAME_BYTES + _PAYLOAD for row in range(len(messages))]
-    return np.array([(b, b + m.length, m.data_id) for b, m in zip(first, messages, strict=True)], np.int64)
+    spans = []
+    for row, message in enumerate(messages):
+        begin = row * FRAME_BYTES + _PAYLOAD
+        spans.append((begin, begin + message.length, message.data_id))
+    return np.array(spans)
 
 
 def checksum(octets: Octets, begin: int, end: int, data_id: int) -> int:

@@ -92,7 +92,7 @@ class Heartbeats:
         self._age(cycle)
         unknown = []
         for place, frame_id in enumerate(frames["can_id"].tolist()):
-            if image.accept_each(frames[place : place + 1], 1):
+            if image.accept_each(frames[place:], 1):
                 unknown.append(place)
                 continue
             if image.check[image.frame_ids[frame_id]] > Check.SOME_LOST:

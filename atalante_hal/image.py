@@ -77,7 +77,7 @@ class ReceiveImage:
         self._lengths = [m.length for m in self.codec.messages]
         self._spans = protected_spans(self.codec.messages)
         #: Counter of the last frame of each row, and what it should be next.
-        self._counters: Words = np.full((2, count), _NOTHING, np.int64)
+        self._counters: Words = np.full((2, count), _NOTHING)
         #: The values before the last `accept`.
         self.values_before = self.values.copy()
         self._age_before: npt.NDArray[np.int64] = self.age.copy()
@@ -195,7 +195,7 @@ class ReceiveImage:
             if result > _FRESH:
                 self._refuse_frame(row, result)
                 continue
-            self._words[row * WORDS : (row + 1) * WORDS] = words[place].view(np.int64)
+            self._words[row * WORDS : (row + 1) * WORDS] = words[place]
             self.age[row] = 0 if tag is None else tag - payload[COUNTER_BYTE] & 0xFF
             checks[row] = result
         return foreign
@@ -285,7 +285,7 @@ class TransmitImage:
         self._octets: Octets = self.frames.view(np.uint8)
         self._spans = protected_spans(self.codec.messages)
         rows = len(self.codec.messages)
-        self._counters: Words = np.full(rows, 0xFF)
+        self._counters: Words = np.zeros(rows, np.int64)
         self._singles = [self.frames[row : row + 1] for row in range(rows)]
         self._seal, self._protect = compiled(seal), compiled(protect)
         # Nothing; from now on it is machine code.

@@ -49,6 +49,7 @@ def test_crc_and_counter_bytes_equal_the_reference(message):
         assert oracle.p05.e2e_p05_check(bytes(ours), message.data_id)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("messages", [CYCLIC, SENT], ids=["to the HAL", "from the HAL"])
 def test_a_whole_sealed_cycle_equals_the_reference(messages):
     image = TransmitImage(messages)
@@ -150,6 +151,7 @@ def flips(chance: random.Random, kind: int, bits: int) -> int:
     return pattern if pattern.bit_count() % 2 else pattern ^ 1
 
 
+@pytest.mark.exhaustive
 def test_frames_with_one_two_or_an_odd_number_of_flipped_bits_are_refused():
     """100,000 of them, among all messages the HAL receives."""
     tx, _, _ = _received(CYCLIC)
@@ -168,6 +170,7 @@ def test_frames_with_one_two_or_an_odd_number_of_flipped_bits_are_refused():
     assert refused == 100_000
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("row", range(len(CYCLIC)), ids=[m.name for m in CYCLIC])
 def test_damaged_replayed_swapped_shortened_and_lengthened_frames_leave_the_values_alone(row):
     for kind, expected in (

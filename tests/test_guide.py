@@ -379,6 +379,7 @@ CERTIFIED = ["constant", "widening", "narrowing", "pinched", "asymmetric"]
 BOX = HandOver()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", list(pushes(0)))
 @pytest.mark.parametrize("shape", CERTIFIED)
 def test_a_certified_guide_is_never_left(shape: str, kind: str):
@@ -386,12 +387,14 @@ def test_a_certified_guide_is_never_left(shape: str, kind: str):
     assert walk(LIMITED, SHAPES[shape], pushes(3)[kind], BOX, 3) <= 1.0
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", ["swing", "random", "with the motion"])
 def test_a_certified_ringing_guide_is_never_left(kind: str):
     assert certify(guide(RINGING), 0.5, BOX).certified
     assert walk(RINGING, SHAPES["constant"], pushes(4)[kind], BOX, 2) <= 1.0
 
 
+@pytest.mark.exhaustive
 def test_an_uncertified_guide_is_left():
     weak = replace(CONFIG, policies=(policy(8.0, 14.0), policy(1.9, 14.0)))
     for config, shape in ((weak, "pinched"), (LIMITED, "snap")):

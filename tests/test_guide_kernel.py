@@ -14,7 +14,7 @@ from atalante_control.backup import BackupPolicy, ForcedResponse, forced_respons
 from atalante_control.deadbeat import Deadbeat
 from atalante_control.gait import HANG_GAIT, PERIOD, load_gait
 from atalante_control.guide import GuideConfig, GuideFilter
-from atalante_control.guide_kernel import limited, tick
+from atalante_control.guide_kernel import BOUND, _off_limit, damped_gate, gate, limited, tick
 from atalante_control.guide_shapes import GuideShape, half_width
 from atalante_hal.robot import load_robot
 
@@ -154,3 +154,169 @@ def test_a_state_that_is_no_number_gives_a_torque_that_is_none():
     """The limiter turns it into HOLD; a limit that swallowed it would not."""
     f = guide()
     assert all(math.isnan(u) for u in f.tick(100, math.nan, 0.0, 0.0, math.nan))
+
+
+# -- a rollout cycle by cycle ------------------------------------------------------------------------------------------
+
+
+#: 0.06 rad above and 0.05 below, whatever the assistance factor.
+TUBE = GuideShape(
+    "tube", "", lambda phase, width: (np.full_like(phase, 0.06 / width), np.full_like(phase, 0.05 / width))
+)
+
+
+def tube(
+    policies: tuple[BackupPolicy, BackupPolicy] = POLICIES,
+    points: int = 100,
+    zeta: float = 0.01,
+    derivative_time: float = 0.005,
+) -> GuideFilter:
+    config = GuideConfig(policies, DISTURBANCE, points, zeta=zeta, derivative_time=derivative_time, reserve=RESERVE)
+    result = GuideFilter(config, TUBE, DEADBEAT, GAIT.coefficients[2:4], GAIT.mirrored().coefficients[2:4])
+    result.start_step(XI, DEVIATION, RATE)
+    return result
+
+
+def of(f: GuideFilter, joint: int) -> tuple[np.void, np.ndarray, np.ndarray]:
+    return f.joints[joint], f.flow[joint], f.step[joint]
+
+
+def cycle_by_cycle(
+    f: GuideFilter, joint: int, side: int, cycle: int, e: float, ed: float
+) -> tuple[list[float], list[bool]]:
+    """Error towards the side, and whether the drive saturates, of every cycle from `cycle` to the horizon."""
+    policy, (low, high) = f.config.policies[joint], f.config.disturbance[joint]
+    external, sign, limit = (low, -1.0, LIMITS[joint]) if side else (high, 1.0, LIMITS[joint])
+    (phi,), (s,) = policy.transition(np.array([PERIOD])), policy.step_response(np.array([PERIOD]))
+    p, drift = f.step[joint][:, :2], f.step[joint][:, 2:4]
+    x, errors, saturated = np.array([e, ed]), [sign * e], []
+    for k in range(cycle, f.horizon):
+        u = -policy.kp * x[0] - policy.kd * x[1]
+        saturated.append(abs(u) > limit)
+        if saturated[-1]:
+            a = (math.copysign(limit, u) + external) / policy.inertia
+            pushed = x - drift[k]
+            x = drift[k + 1] + [pushed[0] + pushed[1] * PERIOD + 0.5 * a * PERIOD**2, pushed[1] + a * PERIOD]
+        else:
+            x = p[k + 1] + phi @ (x - p[k]) + external * s
+        errors.append(sign * x[0])
+    return errors, saturated
+
+
+STATES = np.random.default_rng(8).uniform(-1.0, 1.0, (60, 2)) * [0.06, 1.2]
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_limited_rollout_is_that_of_the_loop_cycle_by_cycle(joint: int, side: int):
+    f, seen, bound = tube(points=800), 0, (0.06, 0.05)[side]
+    for cycle in (0, 350, 880):
+        for away, rate in STATES[:12]:
+            e = abs(away) * (-1.0 if side else 1.0)
+            errors, saturated = cycle_by_cycle(f, joint, side, cycle, e, rate)
+            seen += any(saturated)
+            expected, now = max(errors) / bound, errors[0] / bound
+            ratio = max(limited(*of(f, joint), side, cycle, e, rate), now)
+            if expected > 1.9:
+                assert ratio > 1.9
+            else:
+                assert ratio == pytest.approx(expected, abs=2e-4)
+    assert seen >= 10
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_a_saturated_rollout_comes_off_its_limit_at_the_first_cycle_that_asks_for_less(joint: int):
+    f = tube()
+    policy, limit, drift = POLICIES[joint], LIMITS[joint], f.step[joint][:, 2:4]
+    found = 0
+    for i, (e, ed) in enumerate((STATES * [2.0, 3.0]).tolist()):
+        if abs(policy.kp * e + policy.kd * ed) <= limit:
+            continue
+        found += 1
+        cycle, side = (0, 350, 700, 897)[i % 4], i % 2
+        force = math.copysign(limit, -policy.kp * e - policy.kd * ed) + DISTURBANCE[joint][1 - side]
+        tau = np.arange(f.horizon + 1 - cycle) * PERIOD
+        errors = (
+            e
+            - drift[cycle, 0]
+            + (ed - drift[cycle, 1]) * tau
+            + 0.5 * force / policy.inertia * tau**2
+            + drift[cycle:, 0]
+        )
+        rates = ed - drift[cycle, 1] + force / policy.inertia * tau + drift[cycle:, 1]
+        off = np.abs(policy.kp * errors + policy.kd * rates) <= limit
+        off = off | (np.sign(policy.kp * errors + policy.kd * rates) != np.sign(policy.kp * e + policy.kd * ed))
+        end = int(np.argmax(off)) if off.any() else len(tau) - 1
+        sign = -1.0 if side else 1.0
+        ratios = sign * errors[: end + 1] / f.step[joint][cycle : cycle + end + 1, BOUND + side]
+        at, rate, when, peak = _off_limit(*of(f, joint)[::2], side, cycle, e, ed, force)
+        if end > 256:  # so far ahead it is looked for in twelve strides at most
+            assert cycle + 256 < when <= cycle + 384
+            continue
+        assert when == cycle + end
+        assert (at, rate) == pytest.approx((errors[end], rates[end]), abs=1e-12)
+        if sign * ed > 0.0 > sign * rates[end]:
+            assert peak == pytest.approx(ratios.max(), rel=1e-3)
+        else:
+            assert peak == 0.0
+    assert found > 20
+
+
+def expected_tick(f: GuideFilter, joint: int, cycle: int, e: float, ed: float) -> tuple[float, int]:
+    """Ratio of one joint, and the rollouts that are stepped."""
+    policy, (low, high), limit = f.config.policies[joint], f.config.disturbance[joint], LIMITS[joint]
+    points = f.grid[f.grid >= cycle]
+    tau = (points - cycle) * PERIOD
+    p = f.step[joint][:, :2]
+    (largest, smallest), s = policy.disturbance(tau, low, high), policy.step_response(tau)
+    x = p[points] + policy.transition(tau) @ (np.array([e, ed]) - p[cycle])
+    torque = policy.kp * x[:, 0] + policy.kd * x[:, 1]
+    errors = x[:, 0] + largest, -(x[:, 0] + smallest)
+    torques = (
+        torque + policy.kp * largest + policy.kd * high * s[:, 1],
+        -(torque + policy.kp * smallest + policy.kd * low * s[:, 1]),
+    )
+    monotone = all(p.monotone for p in f.config.policies)
+    asked, worst, stepped = policy.kp * e + policy.kd * ed, max(e / 0.06, -e / 0.05), 0
+    for side, bound in enumerate((0.06, 0.05)):
+        against = abs(asked) if not monotone else -asked if side else asked
+        most = np.abs(torques[side]).max() if not monotone else torques[side].max()
+        if against > limit or most > limit:
+            stepped += 1
+            ratio = limited(*of(f, joint), side, cycle, e, ed)
+        else:
+            ratio = (errors[side] / bound).max()
+        worst = max(worst, ratio)
+    return worst, stepped
+
+
+@pytest.mark.parametrize("policies", [POLICIES, RINGING], ids=["monotone", "ringing"])
+def test_a_tick_is_the_papers_law_of_the_largest_ratio(policies):
+    f = tube(policies, zeta=0.02, derivative_time=0.004)
+    h, rate, fresh, steps = [1.0, 1.0], [0.0, 0.0], True, [0, 0]
+    for i, states in enumerate(np.random.default_rng(2).uniform(-1.0, 1.0, (24, 4)) * [0.03, 0.7, 0.03, 0.7]):
+        cycle = 37 * i
+        if i == 12:
+            f.start_step(0.8, DEVIATION, RATE)
+            fresh = True
+        states = states.tolist()
+        u = tick(f.joints, f.flow, f.step, min(cycle, 800), *states)
+        for joint, (e, ed) in enumerate((states[:2], states[2:])):
+            policy = policies[joint]
+            ratio, stepped = expected_tick(f, joint, min(cycle, 800), e, ed)
+            now = 1.0 - ratio**2
+            rate[joint] = 0.0 if fresh else rate[joint] + 0.2 * ((now - h[joint]) / PERIOD - rate[joint])
+            h[joint], steps[joint] = now, steps[joint] + stepped
+            weight = damped_gate(gate(now, 0.8 if i >= 12 else 0.5), rate[joint], 0.02)
+            backup = -policy.kp * e - policy.kd * ed
+            assert f.h[joint] == pytest.approx(now, abs=1e-9)
+            assert f.joints["rate"][joint] == pytest.approx(rate[joint], abs=1e-6)
+            assert f.gates[joint] == pytest.approx(weight, abs=1e-9)
+            assert u[joint] == pytest.approx(
+                weight * max(-policy.torque_limit, min(policy.torque_limit, backup)), abs=1e-6
+            )
+        assert f.joints["stepped"].tolist() == steps
+        assert f.bounds == pytest.approx([0.06, 0.05])
+        assert not f.joints["fresh"].any()
+        fresh = False
+    assert min(steps) >= 3

@@ -14,7 +14,8 @@ START, STOP, HOLD = 1, 2, 3
 
 @pytest.fixture
 def pendant() -> Pendant:
-    return Pendant(ReceiveImage([NETWORK.message("LEFT_SK_STATE"), NETWORK.message("PENDANT_STATE")]))
+    names = ("LEFT_SK_STATE", "PENDANT_STATE", "IMU_TORSO_STATE")  # there are values before and after the pendant's
+    return Pendant(ReceiveImage([NETWORK.message(name) for name in names]))
 
 
 def say(
@@ -32,6 +33,7 @@ def test_nothing_is_pressed_before_it_is_heard(pendant: Pendant):
     assert (pendant.dead_man, pendant.stop_requested, pendant.started, pendant.assistance_factor) == (False,) * 3 + (
         None,
     )
+    assert pendant.heard == b""
 
 
 def test_dead_man(pendant: Pendant):

@@ -79,7 +79,7 @@ def test_a_boot_up_is_a_reset_of_a_node_that_was_there(nodes: Nodes):
     assert nodes.judge() == {}
     assert nodes.heartbeats.quiet
     nodes.hear(nodes.frame("LEFT_SK", NodeState=0))
-    assert not nodes.heartbeats.quiet
+    assert nodes.heartbeats.quiet is False
     assert nodes.judge() == {("NODE_RESET", "LEFT_SK"): True}
     nodes.hear(nodes.frame("LEFT_SK", NodeState=5))
     assert nodes.judge() == {}
@@ -93,13 +93,13 @@ def test_a_node_that_began_anew_is_believed_whatever_its_counter_says(well: Node
 
 def test_another_dbc(nodes: Nodes):
     nodes.hear(nodes.frame("IMU_TORSO", DbcHash=NETWORK.hash32 ^ 1))
-    assert not nodes.heartbeats.quiet
+    assert nodes.heartbeats.quiet is False
     assert nodes.judge() == {("DBC_MISMATCH", "IMU_TORSO"): True}
     assert nodes.heartbeats.missing() == set(NODES)
     assert nodes.memory.events[0].value == NETWORK.hash32 ^ 1
     nodes.now += 1
     assert nodes.judge() == {("DBC_MISMATCH", "IMU_TORSO"): True}  # as long as it says nothing else
-    assert not nodes.heartbeats.quiet
+    assert nodes.heartbeats.quiet is False
 
 
 @pytest.mark.parametrize("node", ["LEFT_SK", "HAPTICS", "PENDANT"])
@@ -112,7 +112,7 @@ def test_a_heartbeat_is_lost_after_its_timeout(well: Nodes, node: str):
     well.now = 1 + 250
     assert well.heartbeats.overdue(well.now)
     assert well.judge() == {("HEARTBEAT_LOST", node): True}
-    assert not well.heartbeats.quiet
+    assert well.heartbeats.quiet is False
     assert well.memory.events[0].value == 250
     well.hear(well.frame(node))
     assert not well.heartbeats.overdue(well.now)
@@ -120,8 +120,15 @@ def test_a_heartbeat_is_lost_after_its_timeout(well: Nodes, node: str):
     assert well.heartbeats.quiet
 
 
-def test_who_was_never_heard_is_not_overdue(nodes: Nodes):
-    assert not nodes.heartbeats.overdue(10_000)
+def test_before_the_first_frame_nobody_is_known_and_nothing_is_wrong(nodes: Nodes):
+    assert nodes.heartbeats.known is False
+    assert nodes.heartbeats.quiet is True
+    assert nodes.heartbeats.missing() == set(NODES)
+
+
+@pytest.mark.parametrize("cycle", [0, 1, 10_000])
+def test_who_was_never_heard_is_not_overdue(nodes: Nodes, cycle: int):
+    assert not nodes.heartbeats.overdue(cycle)
     assert nodes.judge() == {}
 
 
@@ -153,10 +160,10 @@ def test_the_supply_of_another_node_moves_nothing(well: Nodes, node: str):
 
 def test_an_emergency_holds_until_the_node_says_that_it_is_over(well: Nodes):
     well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0x4310))
-    assert not well.heartbeats.quiet
+    assert well.heartbeats.quiet is False
     for _ in range(3):
         assert well.judge() == {("OVER_TEMP", "LEFT_SK"): True}
-        assert not well.heartbeats.quiet
+        assert well.heartbeats.quiet is False
         well.now += 1
     assert well.memory.events[0].text == "LEFT_SK: a drive is too hot to hold (emergency 0x4310)"
     assert well.memory.events[0].value == 0x4310
@@ -180,7 +187,11 @@ def test_several_emergencies_of_a_cycle_are_all_heard(well: Nodes):
     }
     well.now += 1
     assert well.judge() == {("CMD_TIMEOUT", "LEFT_SK"): True, ("EMCY_2xxx", "LEFT_SA"): True}
-    assert [e.code for e in well.memory.events] == ["CMD_SOME_LOST", "EMCY_2310", "CMD_TIMEOUT"]
+    assert [(e.code, e.value) for e in well.memory.events] == [
+        ("CMD_SOME_LOST", 0x8110),
+        ("EMCY_2310", 0x2310),
+        ("CMD_TIMEOUT", 0x8250),
+    ]
 
 
 def test_the_operator_acknowledges_all_but_what_is_still_faulty(well: Nodes):
@@ -199,12 +210,16 @@ def test_amplitudes_are_handed_over_when_they_come(well: Nodes):
     row = well.tx.codec.rows["HAPTICS_STATE"]
     assert well.hear(well.tx.seal_row(row).copy()) == []
     assert (well.vibration == 0.5).all()
+    well.tx.values[level] = 0.75
+    well.tx.seal_row(row)  # is lost
+    assert well.hear(well.tx.seal_row(row).copy()) == []
+    assert (well.vibration == 0.75).all()
     well.tx.values[level] = 1.0
     damaged = well.tx.seal_row(row).copy()
     damaged["data"][0, 9] ^= 1
     well.hear(damaged)
-    assert (well.vibration == 0.5).all()
-    assert not well.heartbeats.quiet
+    assert (well.vibration == 0.75).all()
+    assert well.heartbeats.quiet is False
 
 
 def damaged(frame: Frames) -> Frames:
@@ -227,7 +242,7 @@ def test_what_is_refused_is_told_and_not_believed(well: Nodes):
         repeated,
         out_of_range,
     )
-    assert not well.heartbeats.quiet
+    assert well.heartbeats.quiet is False
     assert well.judge() == {
         ("E2E_CRC", "LEFT_SK"): False,
         ("FRAME_LENGTH", "LEFT_SA"): False,
@@ -243,3 +258,5 @@ def test_frames_of_nobody_are_handed_back(well: Nodes):
     stranger["can_id"] = 0x7FF
     assert well.hear(stranger, well.frame("LEFT_SK"), stranger) == [0, 2]
     assert well.heartbeats.quiet
+    cyclic = TransmitImage([NETWORK.message("LEFT_SK_STATE")]).seal()
+    assert well.hear(cyclic) == [0]  # that is the fast image's

@@ -499,3 +499,38 @@ def test_what_comes_after_a_loss_is_used_and_refused_alike():
         tx.values[signal] = 0.0
     rx.refuse(row)
     assert rx.values[signal] == pytest.approx(2.0, abs=0.01)
+
+
+def test_values_may_be_somebody_elses():
+    values = np.zeros(ReceiveImage(CYCLIC).codec.size)
+    rx = ReceiveImage(CYCLIC, values)
+    assert rx.values is values
+
+
+def test_the_last_good_frames_are_kept():
+    tx, rx, buffer = pair()
+    deliver(tx, rx, buffer)
+    deliver(tx, rx, buffer)
+    assert rx.all_fresh
+    assert rx.frames.tobytes() == tx.frames.tobytes()
+    before = tx.frames.copy()
+    tx.values[:] = 1.0
+    deliver(tx, rx, buffer, [2])
+    assert rx.frames[2] == tx.frames[2] != before[2]
+    assert np.delete(rx.frames, 2).tobytes() == np.delete(before, 2).tobytes()
+
+
+def test_one_row_is_one_frame():
+    tx = TransmitImage(CYCLIC)
+    assert (tx.counter, tx.frames["data"][0, 2]) == (0xFF, 0xFF)
+    for row in range(ROWS):
+        assert [frame["can_id"] for frame in tx.seal_row(row)] == [CYCLIC[row].frame_id]
+
+
+def test_what_has_no_code_cannot_be_sealed():
+    tx = TransmitImage(CYCLIC)
+    tx.values[tx.codec.index("PENDANT_STATE", "DeadMan")] = np.nan
+    before = tx.frames.copy()
+    with pytest.raises(ValueError, match=r"^PENDANT_STATE.DeadMan is NaN and has no invalid code in the DBC$"):
+        tx.seal()
+    assert tx.frames.tobytes() == before.tobytes()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-_PLAUSIBILITY = ("finding", "encoders", "imus", "feet", "stillness", "plausibility")
+_PLAUSIBILITY = ("finding", "encoders", "imus", "legs", "feet", "stillness", "plausibility")
 #: The safety core: files that are judged together, and the tests that have to notice a change of them.
 CORE = {
     "e2e": (("atalante_hal/e2e.py",), ("test_e2e.py", "test_image.py")),
@@ -32,3 +32,5 @@ CORE = {
         ("test_drive.py", "test_emergency.py", "test_collision.py"),
     ),
 }
+#: Parts with loops that run as machine code, which has no mutants and no lines: there they run as the source they are.
+LOOPS = ("e2e", "image", "limiter", "guide", "drive")

@@ -23,7 +23,7 @@ from contextlib import chdir
 from dataclasses import dataclass
 from pathlib import Path
 
-from core import CORE
+from core import CORE, LOOPS
 from mutmut.mutation.diff_apply import get_diff_for_mutant
 
 HERE = Path(__file__).resolve().parent
@@ -44,11 +44,13 @@ PYPROJECT = """
 [tool.pytest.ini_options]
 testpaths = ["tests"]
 pythonpath = ["tests/fuzz", "tests/witness"]
-addopts = "-q --strict-markers --import-mode=importlib --hypothesis-profile=mutation {plugins}"
+addopts = "-q --strict-markers --import-mode=importlib --hypothesis-profile=mutation -m 'not exhaustive' {plugins}"
+markers = ["exhaustive"]
 
 [tool.mutmut]
 source_paths = {packages}
 only_mutate = {files}
+also_copy = ["dbc"]
 pytest_add_cli_args_test_selection = {tests}
 timeout_constant = 20.0
 timeout_multiplier = 3.0
@@ -72,13 +74,14 @@ class Trial:
     """The mutants of a part of the core and the tests that are to notice them, in a directory of their own."""
 
     def __init__(self, part: str) -> None:
-        self._files, self._tests = CORE[part]
+        self._part, (self._files, self._tests) = part, CORE[part]
         self._work = WORK / part
 
     def lay_out(self) -> None:
         """Copy the project; files that are as they were keep their time, and the mutants in them their verdicts."""
         self._work.mkdir(parents=True, exist_ok=True)
-        for package in (*PACKAGES, "tests"):
+        # The witness of the tests reads the DBC where it is in the project.
+        for package in (*PACKAGES, "dbc", "tests"):
             target = self._work / Path(package).name
             if target.exists():
                 shutil.rmtree(target)
@@ -104,7 +107,7 @@ class Trial:
             **os.environ,
             "PYTHONPATH": "",
             "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
-            "NUMBA_DISABLE_JIT": "1",  # mutants are of the source
+            "NUMBA_DISABLE_JIT": "1" if self._part in LOOPS else "0",
             "HYPOTHESIS_STORAGE_DIRECTORY": str(self._work / ".hypothesis"),
         }
         command = [sys.executable, "-m", "mutmut", "run", "--max-children", str(children)]
