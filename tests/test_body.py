@@ -28,7 +28,7 @@ def run(body: PyBulletBody, seed: int, steps: int) -> list[bytes]:
     trace = []
     for _ in range(steps):
         body.step((rng.normal(size=12) * 20.0).tolist())
-        trace.append(body.position.tobytes() + body.velocity.tobytes() + repr(body.imu).encode())
+        trace.append(body.position.tobytes() + body.velocity.tobytes() + body.imu.tobytes())
     return trace
 
 
@@ -76,14 +76,14 @@ def test_imu_links_move_as_kinematics_says(body: PyBulletBody) -> None:
     q[q_index], v[v_index] = body.position, body.velocity
     pinocchio.forwardKinematics(model, data, q, v)
     pinocchio.updateFramePlacements(model, data)
-    for imu, (place, (x, y, z, w), velocity, rotation) in zip(IMUS, body.imu, strict=True):
+    for imu, state in zip(IMUS, body.imu, strict=True):
+        (x, y, z, w), velocity, rotation = np.split(state, [4, 7])
         frame = model.getFrameId(imu_link(imu))
         twist = pinocchio.getFrameVelocity(model, data, frame, pinocchio.LOCAL_WORLD_ALIGNED)
-        np.testing.assert_allclose(place, data.oMf[frame].translation, atol=1e-7)
         np.testing.assert_allclose(pinocchio.Quaternion(w, x, y, z).matrix(), data.oMf[frame].rotation, atol=1e-7)
         np.testing.assert_allclose(velocity, twist.linear, atol=1e-6)
         np.testing.assert_allclose(rotation, twist.angular, atol=1e-6)
-    assert any(np.linalg.norm(state[2]) > 0.05 for state in body.imu)
+    assert any(np.linalg.norm(state[4:7]) > 0.05 for state in body.imu)
 
 
 def test_joints_stop_at_their_limits(body: PyBulletBody) -> None:

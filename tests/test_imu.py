@@ -7,7 +7,7 @@ import pinocchio
 import pytest
 
 from atalante_control.model import imu_link, pinocchio_model
-from atalante_emulator.body import GRAVITY, PERIOD, LinkState, PyBulletBody
+from atalante_emulator.body import GRAVITY, PERIOD, PyBulletBody
 from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
 from atalante_hal.robot import IMUS
 
@@ -16,13 +16,18 @@ def signals() -> ImuSignals:
     return ImuSignals(np.zeros((4, 4)), np.zeros((4, 3)), np.zeros((4, 3)))
 
 
-def still(x: float = 0.0, y: float = 0.0, z: float = 0.0, w: float = 1.0) -> LinkState:
-    return (0.0, 0.0, 0.0), (x, y, z, w), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+def links(
+    rotation: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0),
+    velocity: tuple[float, ...] = (0.0,) * 3,
+    rate: tuple[float, ...] = (0.0,) * 3,
+) -> np.ndarray:
+    """Four that move alike: quaternion xyzw, m/s, rad/s."""
+    return np.tile([*rotation, *velocity, *rate], (4, 1))
 
 
 def test_at_rest_the_specific_force_points_up() -> None:
     out = signals()
-    Imus(ImuParameters(), out).sample([still()] * 4)
+    Imus(ImuParameters(), out).sample(links())
     assert out.quaternion.tolist() == [[1.0, 0.0, 0.0, 0.0]] * 4
     assert not out.gyro.any()
     assert out.accel.tolist() == [[0.0, 0.0, GRAVITY]] * 4
@@ -32,15 +37,14 @@ def test_gravity_is_seen_in_the_sensor_s_axes() -> None:
     """Pitched by +30 degrees (nose down) the x axis points 30 degrees below the horizon."""
     out = signals()
     half = math.radians(15.0)
-    tilted = still(y=math.sin(half), w=math.cos(half))
-    Imus(ImuParameters(), out).sample([tilted] * 4)
+    Imus(ImuParameters(), out).sample(links((0.0, math.sin(half), 0.0, math.cos(half))))
     np.testing.assert_allclose(out.accel[0], [-0.5 * GRAVITY, 0.0, math.sqrt(0.75) * GRAVITY])
 
 
 def test_quaternion_has_one_sign() -> None:
     out = signals()
     half = math.radians(20.0)
-    Imus(ImuParameters(), out).sample([still(x=-math.sin(half), w=-math.cos(half))] * 4)
+    Imus(ImuParameters(), out).sample(links((-math.sin(half), 0.0, 0.0, -math.cos(half))))
     np.testing.assert_allclose(out.quaternion[2], [math.cos(half), math.sin(half), 0.0, 0.0])
 
 
@@ -51,13 +55,9 @@ def test_a_carousel_feels_its_centripetal_acceleration() -> None:
     radius, rate = 0.5, 2.0
     for step in range(20):
         angle = rate * step * PERIOD
-        link = (
-            (radius * math.cos(angle), radius * math.sin(angle), 0.0),
-            (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2)),
-            (-radius * rate * math.sin(angle), radius * rate * math.cos(angle), 0.0),
-            (0.0, 0.0, rate),
-        )
-        imus.sample([link] * 4)
+        turned = 0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2)
+        velocity = -radius * rate * math.sin(angle), radius * rate * math.cos(angle), 0.0
+        imus.sample(links(turned, velocity, (0.0, 0.0, rate)))
     np.testing.assert_allclose(out.accel[1], [-radius * rate**2, 0.0, GRAVITY], atol=3e-3)
     np.testing.assert_allclose(out.gyro[1], [0.0, 0.0, rate], atol=1e-12)
 
@@ -66,9 +66,7 @@ def test_free_fall_feels_nothing() -> None:
     out = signals()
     imus = Imus(ImuParameters(), out)
     for step in range(3):
-        imus.sample(
-            [((0.0, 0.0, 0.0), (0.1, 0.2, 0.3, math.sqrt(0.86)), (0.0, 0.0, -GRAVITY * PERIOD * step), (0.0,) * 3)] * 4
-        )
+        imus.sample(links((0.1, 0.2, 0.3, math.sqrt(0.86)), (0.0, 0.0, -GRAVITY * PERIOD * step)))
     np.testing.assert_allclose(out.accel, 0.0, atol=1e-12)
 
 
@@ -131,14 +129,21 @@ def test_noise_and_bias_are_seeded_and_of_the_stated_size() -> None:
     assert gyro.tobytes() == again.tobytes() != other.tobytes()
 
 
-@pytest.mark.parametrize("moved", [0, 3])
-def test_only_what_moved_is_computed_again(moved: int) -> None:
+@pytest.mark.parametrize("moved", range(4))
+def test_each_sees_its_own_link(moved: int) -> None:
     out = signals()
     imus = Imus(ImuParameters(), out)
-    links = [still() for _ in range(4)]
-    imus.sample(links)
-    out.gyro[:] = 9.0
-    links[moved] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.5, 0.0, 0.0))
-    imus.sample(links)
-    assert out.gyro[moved].tolist() == [0.5, 0.0, 0.0]
-    assert (np.delete(out.gyro, moved, axis=0) == 9.0).all()
+    imus.sample(links())
+    moving = links()
+    moving[moved] = (0.0, 0.0, 0.0, 1.0, 0.001, 0.002, 0.003, 0.5, 0.6, 0.7)
+    imus.sample(moving)
+    assert out.gyro[moved].tolist() == [0.5, 0.6, 0.7]
+    np.testing.assert_allclose(out.accel[moved], [1.0, 2.0, 3.0 + GRAVITY])
+    assert not np.delete(out.gyro, moved, axis=0).any()
+    assert (np.delete(out.accel, moved, axis=0) == [0.0, 0.0, GRAVITY]).all()
+
+
+def test_a_link_that_moves_at_switch_on_does_not_seem_to_be_hit() -> None:
+    out = signals()
+    Imus(ImuParameters(), out).sample(links(velocity=(1.0, -2.0, 0.5)))
+    assert (out.accel == [0.0, 0.0, GRAVITY]).all()

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from operator import itemgetter
 from pathlib import Path
 from struct import Struct
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -20,8 +20,6 @@ import pybullet
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS
 
 Vector = npt.NDArray[np.float64]
-#: World pose and velocity of a link: position [m], quaternion xyzw, velocity [m/s], angular velocity [rad/s].
-LinkState = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], tuple[float, ...]]
 Vector3 = tuple[float, float, float]
 
 #: Step of the mechanics and of the bus cycle [s].
@@ -29,8 +27,13 @@ PERIOD = 1e-3
 GRAVITY = 9.81  # m/s2
 #: Solver iterations are part of the model, not a speed setting: the standing pose depends on them.
 SOLVER_ITERATIONS = 50
+#: Numbers of a link's state, in the world: quaternion xyzw, velocity [m/s], angular velocity [rad/s].
+LINK_STATE: Final = 10
 #: Entries of a PyBullet joint state.
 _POSITION, _VELOCITY = itemgetter(0), itemgetter(1)
+#: And of a link state.
+_ATTITUDE, _LINEAR, _ANGULAR = 5, 6, 7
+_PACK_JOINTS, _PACK_LINK = Struct(f"{2 * len(JOINTS)}d").pack_into, Struct(f"{LINK_STATE}d").pack_into
 
 
 class Body(Protocol):
@@ -45,8 +48,8 @@ class Body(Protocol):
         """Shape (12,) [rad/s]."""
 
     @property
-    def imu(self) -> Sequence[LinkState]:
-        """One an IMU of IMUS; the axes are the IMU's."""
+    def imu(self) -> Vector:
+        """Attitude and velocities of each of IMUS, whose axes they are. Shape (4, LINK_STATE)."""
 
     @property
     def contact(self) -> Sequence[tuple[int, int, Vector3]]:
@@ -106,15 +109,17 @@ class PyBulletBody:
         pybullet.setJointMotorControlArray(
             self._body, self._joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * len(JOINTS), **client
         )
-        if ground is not None:
+        self._touches = ground is not None  # its own parts do not collide
+        if self._touches:
             plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, **client)
             pybullet.createMultiBody(0.0, plane, basePosition=[0.0, 0.0, ground], **client)
-        self._state = np.zeros(2 * len(JOINTS))
-        self._state_bytes = self._state.data
-        self._pack = Struct(f"{len(self._state)}d").pack_into
-        self.position, self.velocity = np.split(self._state, 2)
-        self.imu: list[LinkState] = [_still(state) for state in self._link_states(self._imus)]
-        self.foot_rotation: list[tuple[float, ...]] = [state[5] for state in self._link_states(self._feet)]
+        joints, self.imu = np.zeros((2, len(JOINTS))), np.zeros((len(IMUS), LINK_STATE))
+        self.position, self.velocity = joints
+        self._joint_memory = joints.reshape(-1).data
+        for row, state in zip(self.imu, self._link_states(self._imus), strict=True):
+            row[:4] = state[_ATTITUDE]
+        self._imu_memory = [self.imu[place].data for place in self._moving]
+        self.foot_rotation: list[tuple[float, ...]] = [state[_ATTITUDE] for state in self._link_states(self._feet)]
         self.contact: Sequence[tuple[int, int, Vector3]] = ()
         self.reset([0.0] * len(JOINTS))
 
@@ -170,17 +175,17 @@ class PyBulletBody:
         return (
             pybullet.getJointStates(self._body, self._joints, self._client),
             self._link_states(self._moving_links),
-            pybullet.getContactPoints(self._body, physicsClientId=self._client),
+            pybullet.getContactPoints(self._body, physicsClientId=self._client) if self._touches else (),
         )
 
     def _unpack(self, joints: Any, links: Any, contacts: Any) -> None:
-        self._pack(self._state_bytes, 0, *map(_POSITION, joints), *map(_VELOCITY, joints))
-        for place, state in zip(self._moving, links, strict=True):
-            self.imu[place] = state[4:]
+        _PACK_JOINTS(self._joint_memory, 0, *map(_POSITION, joints), *map(_VELOCITY, joints))
+        for memory, state in zip(self._imu_memory, links, strict=True):
+            _PACK_LINK(memory, 0, *state[_ATTITUDE], *state[_LINEAR], *state[_ANGULAR])
         self.contact = self._forces(contacts) if contacts else ()
 
     def _forces(self, contacts: Any) -> list[tuple[int, int, Vector3]]:
-        self.foot_rotation = [state[5] for state in self._link_states(self._feet)]
+        self.foot_rotation = [state[_ATTITUDE] for state in self._link_states(self._feet)]
         forces = []
         for contact in contacts:
             foot, cell = self._cell_of[contact[3]]
@@ -226,7 +231,3 @@ def _behind(link: int, joints: set[int], infos: Sequence[Any]) -> bool:
             return True
         link = infos[link][16]
     return False
-
-
-def _still(state: Any) -> LinkState:
-    return state[4], state[5], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)

@@ -1,20 +1,20 @@
 """The four IMUs: attitude, angular rate and specific force of the links they sit on, with noise and bias.
 
 Acceleration is the difference of the link's velocity over the last millisecond plus gravity, turned into the sensor: it agrees
-with the motion and needs no model. Three- and four-vectors are scalar Python: faster than arrays of that size.
+with the motion and needs no model.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
-from struct import Struct
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from atalante_emulator.body import GRAVITY, PERIOD, LinkState
+from atalante_emulator.body import GRAVITY, LINK_STATE, PERIOD
+from atalante_hal.compiled import compiled
 
 Vector = npt.NDArray[np.float64]
 
@@ -38,39 +38,14 @@ class ImuSignals(NamedTuple):
     accel: Vector  # (4, 3) m/s2, specific force: +g upwards at rest
 
 
-_FOUR = Struct("4d").pack_into
-_THREE = Struct("3d").pack_into
-
-
-class Imus:
-    """The IMUs of a body; row i of the signals is IMU i of `robot.IMUS`."""
-
-    def __init__(self, parameters: ImuParameters, signals: ImuSignals) -> None:
-        self._parameters = parameters
-        self._count = len(signals.quaternion)
-        self._rows = [tuple(signal[imu].data for signal in signals) for imu in range(self._count)]
-        self._velocity: list[Sequence[float] | None] = [None] * self._count
-        self._seen: list[LinkState | None] = [None] * self._count
-
-    def sample(self, links: Sequence[LinkState]) -> None:
-        """Read the sensors; call once a `PERIOD`.
-
-        Args:
-            links: world pose and velocity of each IMU, after the step just made.
-        """
-        for imu, link in enumerate(links):
-            # The same object again is a link that the body never moves.
-            if link is not self._seen[imu]:
-                self._sample_one(imu, link)
-
-    def _sample_one(self, imu: int, link: LinkState) -> None:
-        _, (x, y, z, w), (vx, vy, vz), (wx, wy, wz) = link
-        before = self._velocity[imu]
-        if before is None:
-            ax, ay, az = 0.0, 0.0, GRAVITY
-        else:
-            bx, by, bz = before
-            ax, ay, az = (vx - bx) / PERIOD, (vy - by) / PERIOD, (vz - bz) / PERIOD + GRAVITY
+def _sample(links: Vector, before: Vector, quaternion: Vector, gyro: Vector, accel: Vector) -> None:
+    """All IMUs. Shapes as in `Body.imu` and `ImuSignals`; `before` (4, 3) is the velocity of the last sample, NaN: none."""
+    for i in range(len(links)):
+        x, y, z, w, vx, vy, vz, wx, wy, wz = links[i]
+        if math.isnan(before[i, 0]):
+            before[i] = vx, vy, vz
+        ax, ay, az = (vx - before[i, 0]) / PERIOD, (vy - before[i, 1]) / PERIOD, (vz - before[i, 2]) / PERIOD + GRAVITY
+        before[i] = vx, vy, vz
         # Rows of the matrix that turns world vectors into the sensor.
         x2, y2, z2 = x + x, y + y, z + z
         xx, yy, zz, xy, xz, yz = x * x2, y * y2, z * z2, x * y2, x * z2, y * z2
@@ -78,26 +53,30 @@ class Imus:
         r00, r01, r02 = 1.0 - yy - zz, xy + zw, xz - yw
         r10, r11, r12 = xy - zw, 1.0 - xx - zz, yz + xw
         r20, r21, r22 = xz + yw, yz - xw, 1.0 - xx - yy
-        quaternion, gyro, accel = self._rows[imu]
-        if w < 0.0:
-            w, x, y, z = -w, -x, -y, -z
-        _FOUR(quaternion, 0, w, x, y, z)
-        _THREE(
-            gyro,
-            0,
-            r00 * wx + r01 * wy + r02 * wz,
-            r10 * wx + r11 * wy + r12 * wz,
-            r20 * wx + r21 * wy + r22 * wz,
-        )
-        _THREE(
-            accel,
-            0,
-            r00 * ax + r01 * ay + r02 * az,
-            r10 * ax + r11 * ay + r12 * az,
-            r20 * ax + r21 * ay + r22 * az,
-        )
-        self._velocity[imu] = link[2]
-        self._seen[imu] = link
+        sign = -1.0 if w < 0.0 else 1.0
+        quaternion[i] = sign * w, sign * x, sign * y, sign * z
+        gyro[i] = r00 * wx + r01 * wy + r02 * wz, r10 * wx + r11 * wy + r12 * wz, r20 * wx + r21 * wy + r22 * wz
+        accel[i] = r00 * ax + r01 * ay + r02 * az, r10 * ax + r11 * ay + r12 * az, r20 * ax + r21 * ay + r22 * az
+
+
+class Imus:
+    """The IMUs of a body; row i of the signals is IMU i of `robot.IMUS`."""
+
+    def __init__(self, parameters: ImuParameters, signals: ImuSignals) -> None:
+        self._parameters, self._signals = parameters, signals
+        self._count = len(signals.quaternion)
+        self._before = np.zeros((self._count, 3))
+        self._sample = compiled(_sample)
+        self.sample(np.zeros((self._count, LINK_STATE)))  # is compiled now, not in the first cycle
+        self._before.fill(math.nan)
+
+    def sample(self, links: Vector) -> None:
+        """Read the sensors; call once a `PERIOD`.
+
+        Args:
+            links: attitude and velocities of each IMU, as in `Body.imu`, after the step just made. Shape (4, 10).
+        """
+        self._sample(links, self._before, *self._signals)
 
     def draw_bias(self, generator: np.random.Generator) -> tuple[Vector, Vector]:
         """Constant errors of these devices: of gyro and accelerometer. Shapes (12,) [rad/s], (12,) [m/s2]."""
