@@ -19,8 +19,9 @@ from hypothesis import strategies as st
 from atalante_control.certificate import certify
 from atalante_control.controller import HangConfig, HangController, baseline_share
 from atalante_control.gait import HANG_GAIT, Gait, load_gait
+from atalante_control.gravity import Gravity
 from atalante_control.guide_shapes import SHAPES
-from atalante_control.idealization import Friction, Gravity
+from atalante_control.idealization import Friction
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_control.pid import AIR_GAINS, LEFT, RIGHT, Pid
 from atalante_hal.robot import IMUS, JOINTS, MOTORS, load_robot

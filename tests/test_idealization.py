@@ -1,4 +1,4 @@
-"""Idealization: friction, gravity and the coupled pair, each against Pinocchio asked another way."""
+"""Idealization: friction and the coupled pair, against Pinocchio asked another way."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from atalante_control.gait import HANG_GAIT, load_gait
-from atalante_control.idealization import AssistedInertia, Friction, Gravity
-from atalante_control.model import ArticulatedModel, ExoskeletonParameters, pinocchio_model, urdf
+from atalante_control.idealization import AssistedInertia, Friction
+from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import JOINTS, load_robot
 
 ROBOT = load_robot()
@@ -20,7 +20,6 @@ URDF = urdf(ExoskeletonParameters(), ROBOT)
 MODEL = pinocchio_model(URDF)
 SWING = load_gait(HANG_GAIT, ROBOT).tables().q
 HIP, KNEE = JOINTS.index("left_SH"), JOINTS.index("left_SK")
-LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 
 @given(st.integers(0, 5), st.floats(-10.0, 10.0))
@@ -44,45 +43,6 @@ def test_friction_at_rest_is_nothing_and_has_no_step():
 def test_friction_refuses_what_is_none(bad: dict[str, object]):
     with pytest.raises(ValueError, match=r"finite|positive"):
         Friction(**bad)  # type: ignore[arg-type]
-
-
-def test_gravity_of_a_level_pelvis_is_pinocchios():
-    rng, gravity, data = np.random.default_rng(5), Gravity(MODEL), MODEL.model.createData()
-    for _ in range(20):
-        q = rng.uniform(ROBOT.position_min, ROBOT.position_max)
-        pin = np.empty(12)
-        pin[MODEL.q] = q
-        np.testing.assert_allclose(
-            gravity.torque(q, LEVEL), pinocchio.computeGeneralizedGravity(MODEL.model, data, pin)[MODEL.v], atol=1e-12
-        )
-
-
-def test_gravity_of_a_tilted_pelvis_is_that_of_a_floating_base():
-    rng, gravity = np.random.default_rng(6), Gravity(MODEL)
-    floating = pinocchio_model(URDF, fixed_base=False)
-    data = floating.model.createData()
-    for _ in range(20):
-        q, attitude = rng.uniform(ROBOT.position_min, ROBOT.position_max), rng.normal(size=4)
-        attitude /= np.linalg.norm(attitude)
-        full = pinocchio.neutral(floating.model)
-        full[3:7] = attitude[[1, 2, 3, 0]]
-        full[floating.q] = q
-        expected = pinocchio.computeGeneralizedGravity(floating.model, data, full)[floating.v]
-        np.testing.assert_allclose(gravity.torque(q, tuple(attitude)), expected, atol=1e-9)
-
-
-def test_gravity_goes_by_the_joint_map():
-    order = np.random.default_rng(7).permutation(12)
-    reordered = ArticulatedModel(MODEL.model, MODEL.q[order], MODEL.v[order])
-    q = np.random.default_rng(8).uniform(ROBOT.position_min, ROBOT.position_max)
-    expected = Gravity(MODEL).torque(q, LEVEL).copy()
-    np.testing.assert_allclose(Gravity(reordered).torque(q[order], LEVEL), expected[order], atol=1e-12)
-
-
-def test_gravity_leaves_the_model_it_was_given_alone():
-    gravity = Gravity(MODEL)
-    gravity.torque(np.zeros(12), (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0))
-    np.testing.assert_allclose(MODEL.model.gravity.linear, [0.0, 0.0, -9.81])
 
 
 def mass_matrix(q: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ import pinocchio
 import pytest
 
 from atalante_control.gait import HANG_GAIT, bezier, load_gait, motion
-from atalante_control.idealization import Gravity
+from atalante_control.gravity import Gravity
 from atalante_control.model import ExoskeletonParameters, Patient, pinocchio_model, urdf
 from atalante_control.stance_dynamics import STANCE_FOOT, StanceDynamics, stance_dynamics
 from atalante_hal.robot import load_robot

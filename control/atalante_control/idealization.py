@@ -1,4 +1,4 @@
-"""Joint idealization: what makes an assisted joint feel like a free inertia. `q, q', pelvis attitude -> u_i, u_g`.
+"""Joint idealization: what makes an assisted joint feel like a free inertia. `q, q' -> u_i`, with u_g from `gravity`.
 
 The paper's u_i = k_d sign(q') + k_v q' + u_g, with three things it leaves open settled here:
 
@@ -14,7 +14,6 @@ The paper's u_i = k_d sign(q') + k_v q' + u_g, with three things it leaves open 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,8 +25,6 @@ from atalante_hal.robot import JOINTS, LEG_JOINTS
 
 Vector = npt.NDArray[np.float64]
 Pair = tuple[float, float]
-
-_GRAVITY = 9.81  # m/s2
 
 
 @dataclass(frozen=True)
@@ -53,45 +50,6 @@ class Friction:
     def torque(self, joint: int, velocity: float) -> float:
         """Compensation k_d tanh(q' / v_s) + k_v q' [Nm] of one of `LEG_JOINTS` by index."""
         return self.coulomb[joint] * math.tanh(velocity / self.smoothing) + self.viscous[joint] * velocity
-
-
-class Gravity:
-    """u_g: generalized gravity of the empty exoskeleton, by Pinocchio, hanging from a pelvis of known attitude."""
-
-    def __init__(self, articulated: ArticulatedModel) -> None:
-        """Take a model with the pelvis fixed; it is copied."""
-        self._model = pinocchio.Model(articulated.model)
-        self._data = self._model.createData()
-        self._into, self._out_of = articulated.q, articulated.v
-        self._ordered = np.array_equal(articulated.q, np.arange(len(JOINTS))) and np.array_equal(
-            articulated.v, np.arange(len(JOINTS))
-        )
-        self._q = pinocchio.neutral(self._model)
-        self._down = np.zeros(3)
-        self._attitude: Sequence[float] = ()
-
-    def torque(self, position: Vector, pelvis: Sequence[float]) -> Vector:
-        """Torques that hold the exoskeleton still.
-
-        Args:
-            position: shape (12,) [rad].
-            pelvis: attitude of the pelvis IMU, unit quaternion wxyz, pelvis to world.
-
-        Returns:
-            Shape (12,) [Nm], overwritten by the next call.
-        """
-        if pelvis != self._attitude:  # handing it to Pinocchio costs as much as the torques
-            self._attitude = pelvis
-            w, x, y, z = pelvis
-            down = self._down
-            down[0] = -_GRAVITY * 2.0 * (x * z - w * y)
-            down[1] = -_GRAVITY * 2.0 * (y * z + w * x)
-            down[2] = -_GRAVITY * (1.0 - 2.0 * (x * x + y * y))
-            self._model.gravity.linear = down
-        if self._ordered:
-            return pinocchio.computeGeneralizedGravity(self._model, self._data, position)  # type: ignore[no-any-return]
-        self._q[self._into] = position
-        return np.asarray(pinocchio.computeGeneralizedGravity(self._model, self._data, self._q)[self._out_of])
 
 
 class AssistedInertia:

@@ -22,7 +22,7 @@ import numpy.typing as npt
 import pinocchio
 
 from atalante_control.gait import bezier, control_points, motion
-from atalante_control.idealization import Gravity
+from atalante_control.gravity import Gravity
 from atalante_control.model import LEG_LINKS, ExoskeletonParameters, Patient, pinocchio_model, urdf
 from atalante_hal.robot import SIDES, Robot
 

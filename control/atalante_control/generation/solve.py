@@ -52,7 +52,7 @@ _WARM: dict[str, Any] = {"ipopt.mu_init": 1e-3, "ipopt.bound_mult_init_method": 
 #: Everything that decides a gait.
 _SOURCES = (
     *(f"generation/{module}.py" for module in ("dynamics", "guess", "problem", "programme", "rules", "solve")),
-    *("gait.py", "idealization.py", "stance_dynamics.py", "model/*.py"),
+    *("gait.py", "gravity.py", "stance_dynamics.py", "model/*.py"),
 )
 
 

@@ -1,0 +1,125 @@
+"""Gravity of the empty exoskeleton, hanging from a pelvis of known attitude. `q, pelvis attitude -> u_g`.
+
+Statics of a tree of links, as in the recursive Newton-Euler algorithm (Featherstone, Rigid Body Dynamics Algorithms, 5.3):
+outwards every link learns where down is; inwards it hands the force and the moment that hold it to its parent, and its joint
+bears the share about its axis. The tree is Pinocchio's, which is the witness of the tests.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import pinocchio
+
+from atalante_control.model import ArticulatedModel
+from atalante_hal.compiled import compiled
+from atalante_hal.robot import JOINTS
+
+Vector = npt.NDArray[np.float64]
+Vector3 = tuple[float, float, float]
+
+_GRAVITY = 9.81  # m/s2
+
+#: A link, in the frame of the joint that moves it: what stays, then what a pose gives it.
+LINK = np.dtype(
+    [
+        ("joint", np.int64),  # its place in JOINTS
+        ("parent", np.int64),
+        ("offset", np.float64, 3),  # m, of the joint in the parent's frame
+        ("turn", np.float64, (3, 3, 3)),  # rotation to the parent: turn[0] + sin(q) turn[1] + (1 - cos(q)) turn[2]
+        ("axis", np.float64, 3),
+        ("mass", np.float64),  # kg
+        ("lever", np.float64, 3),  # m, its centre of mass
+        ("rotation", np.float64, (3, 3)),
+        ("down", np.float64, 3),  # m/s2, acceleration of a falling body
+        ("force", np.float64, 3),  # N, that holds it and what hangs from it
+        ("moment", np.float64, 3),  # Nm, about its joint
+    ],
+    align=True,
+)
+
+
+class Gravity:
+    """u_g: generalized gravity of the empty exoskeleton, hanging from a pelvis of known attitude."""
+
+    def __init__(self, articulated: ArticulatedModel) -> None:
+        """Take a model with the pelvis fixed."""
+        self._links, self._torque = _links(articulated), np.zeros(len(JOINTS))
+        self._hold = compiled(_hold)
+        self.torque(np.zeros(len(JOINTS)), (1.0, 0.0, 0.0, 0.0))
+
+    def torque(self, position: Vector, pelvis: Sequence[float]) -> Vector:
+        """Torques that hold the exoskeleton still.
+
+        Args:
+            position: shape (12,) [rad].
+            pelvis: attitude of the pelvis IMU, unit quaternion wxyz, pelvis to world.
+
+        Returns:
+            Shape (12,) [Nm], overwritten by the next call.
+        """
+        w, x, y, z = pelvis
+        self._hold(self._links, position, w, x, y, z, self._torque)
+        return self._torque
+
+
+def _links(articulated: ArticulatedModel) -> npt.NDArray[np.void]:
+    """The pelvis, then the links of a model, parents first."""
+    model, into, _ = articulated
+    data, neutral = model.createData(), pinocchio.neutral(model)
+    places = {int(q): joint for joint, q in enumerate(into)}
+    links = np.zeros(model.njoints, LINK)
+    for i in range(1, model.njoints):
+        link, placement, inertia = links[i], model.jointPlacements[i], model.inertias[i]
+        axis = pinocchio.computeJointJacobian(model, data, neutral, i)[3:, model.idx_vs[i]]
+        cross = pinocchio.skew(axis)
+        link["joint"], link["parent"] = places[model.idx_qs[i]], model.parents[i]
+        link["offset"], link["axis"] = placement.translation, axis
+        link["turn"] = [placement.rotation @ part for part in (np.eye(3), cross, cross @ cross)]
+        link["mass"], link["lever"] = inertia.mass, inertia.lever
+    return links
+
+
+def _hold(
+    links: npt.NDArray[np.void], position: Vector, w: float, x: float, y: float, z: float, torque: Vector
+) -> None:
+    down = links[0]["down"]
+    down[0], down[1] = -_GRAVITY * 2.0 * (x * z - w * y), -_GRAVITY * 2.0 * (y * z + w * x)
+    down[2] = -_GRAVITY * (1.0 - 2.0 * (x * x + y * y))
+    for i in range(1, len(links)):
+        link = links[i]
+        angle, turn, rotation = position[link["joint"]], link["turn"], link["rotation"]
+        sine, versine = math.sin(angle), 1.0 - math.cos(angle)
+        for j in range(3):
+            for k in range(3):
+                rotation[j, k] = turn[0, j, k] + sine * turn[1, j, k] + versine * turn[2, j, k]
+        down, force, moment, mass = link["down"], link["force"], link["moment"], link["mass"]
+        down[0], down[1], down[2] = _product(rotation.T, links[link["parent"]]["down"])
+        force[0], force[1], force[2] = -mass * down[0], -mass * down[1], -mass * down[2]
+        moment[0], moment[1], moment[2] = _cross(link["lever"], force)
+    for i in range(len(links) - 1, 0, -1):
+        link = links[i]
+        axis, moment = link["axis"], link["moment"]
+        torque[link["joint"]] = axis[0] * moment[0] + axis[1] * moment[1] + axis[2] * moment[2]
+        pull, twist = _product(link["rotation"], link["force"]), _product(link["rotation"], moment)
+        arm = _cross(link["offset"], pull)
+        parent = links[link["parent"]]
+        for j in range(3):
+            parent["force"][j] += pull[j]
+            parent["moment"][j] += twist[j] + arm[j]
+
+
+def _product(matrix: Vector, v: Vector) -> Vector3:
+    a, b, c = v[0], v[1], v[2]
+    return (
+        matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2] * c,
+        matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2] * c,
+        matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2] * c,
+    )
+
+
+def _cross(a: Vector, b: Vector | Vector3) -> Vector3:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

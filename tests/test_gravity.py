@@ -1,0 +1,56 @@
+"""Gravity of the hanging exoskeleton against Pinocchio asked another way."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pinocchio
+
+from atalante_control.gravity import Gravity
+from atalante_control.model import ArticulatedModel, ExoskeletonParameters, pinocchio_model, urdf
+from atalante_hal.robot import load_robot
+
+ROBOT = load_robot()
+URDF = urdf(ExoskeletonParameters(), ROBOT)
+MODEL = pinocchio_model(URDF)
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+
+
+def test_gravity_of_a_level_pelvis_is_pinocchios():
+    rng, gravity, data = np.random.default_rng(5), Gravity(MODEL), MODEL.model.createData()
+    for _ in range(20):
+        q = rng.uniform(ROBOT.position_min, ROBOT.position_max)
+        pin = np.empty(12)
+        pin[MODEL.q] = q
+        np.testing.assert_allclose(
+            gravity.torque(q, LEVEL), pinocchio.computeGeneralizedGravity(MODEL.model, data, pin)[MODEL.v], atol=1e-12
+        )
+
+
+def test_gravity_of_a_tilted_pelvis_is_that_of_a_floating_base():
+    rng, gravity = np.random.default_rng(6), Gravity(MODEL)
+    floating = pinocchio_model(URDF, fixed_base=False)
+    data = floating.model.createData()
+    for _ in range(20):
+        q, attitude = rng.uniform(ROBOT.position_min, ROBOT.position_max), rng.normal(size=4)
+        attitude /= np.linalg.norm(attitude)
+        full = pinocchio.neutral(floating.model)
+        full[3:7] = attitude[[1, 2, 3, 0]]
+        full[floating.q] = q
+        expected = pinocchio.computeGeneralizedGravity(floating.model, data, full)[floating.v]
+        np.testing.assert_allclose(gravity.torque(q, tuple(attitude)), expected, atol=1e-9)
+
+
+def test_gravity_goes_by_the_joint_map():
+    order = np.random.default_rng(7).permutation(12)
+    reordered = ArticulatedModel(MODEL.model, MODEL.q[order], MODEL.v[order])
+    q = np.random.default_rng(8).uniform(ROBOT.position_min, ROBOT.position_max)
+    expected = Gravity(MODEL).torque(q, LEVEL).copy()
+    np.testing.assert_allclose(Gravity(reordered).torque(q[order], LEVEL), expected[order], atol=1e-12)
+
+
+def test_gravity_leaves_the_model_it_was_given_alone():
+    gravity = Gravity(MODEL)
+    gravity.torque(np.zeros(12), (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0))
+    np.testing.assert_allclose(MODEL.model.gravity.linear, [0.0, 0.0, -9.81])
