@@ -8,7 +8,7 @@ from atalante_emulator.faults import Fault
 from atalante_hal.cia402 import Controlword, DriveState
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import SupervisorState
-from atalante_tools.faults.runner import CONFIG, RECOVERY, observe, walk_begins
+from atalante_tools.faults.runner import AGAIN, CONFIG, observe, walk_begins
 from atalante_tools.faults.scenario import Case, Host, Press
 from atalante_tools.faults.verdict import uncontrolled
 
@@ -44,8 +44,7 @@ def test_the_operator_does_as_told_and_starts_again_when_it_is_over() -> None:
     assert seen.states[seen.first + 4] is S.HOLD
     assert seen.pressed == seen.first + 20 + 60
     assert {*seen.states[seen.first + 4 : seen.quiet]} == {S.HOLD}
-    assert seen.states[-1] is S.ACTIVE
-    assert seen.last == seen.pressed + 2 * RECOVERY
+    assert [*seen.states[-AGAIN - 1 :]] == [S.HOLD] + [S.ACTIVE] * AGAIN
 
 
 def test_a_fault_of_the_host_is_judged_from_where_it_struck() -> None:

@@ -25,15 +25,16 @@ SCENARIOS: Final = (
                 state=state,
                 dtc=dtc,
                 node=_KNEE,
+                recovers=recovers,
                 watched=watched,
             )
-            for what, code, state, dtc, watched in (
-                ("current", 0x2310, _S.FAULT, "EMCY_2310", _SUNK),
-                ("voltage", 0x3210, _S.HOLD, "EMCY_3210", 60),
-                ("temperature", 0x4210, _S.LOWER, "OVER_TEMP", _SUNK),
-                ("encoder", 0x7305, _S.LOWER, "EMCY_7305", _SUNK),
-                ("communication", 0x8100, _S.HOLD, "EMCY_8100", 60),
-                ("software", 0x6100, _S.FAULT, "EMCY_6100", 60),
+            for what, code, state, dtc, watched, recovers in (
+                ("current", 0x2310, _S.FAULT, "EMCY_2310", _SUNK, True),
+                ("voltage", 0x3210, _S.HOLD, "EMCY_3210", 60, True),
+                ("temperature", 0x4210, _S.LOWER, "OVER_TEMP", 60, False),
+                ("encoder", 0x7305, _S.LOWER, "EMCY_7305", _SUNK, True),
+                ("communication", 0x8100, _S.HOLD, "EMCY_8100", 60, True),
+                ("software", 0x6100, _S.FAULT, "EMCY_6100", 60, True),
             )
         ),
     ),

@@ -33,8 +33,8 @@ SCENARIOS: Final = (
             *(
                 Case(
                     f"1 % of all, seed {seed}",
-                    tuple(Fault("drop", bus, 0, 1500, p=0.01) for bus in _BUSES),
-                    noticed=1500,
+                    tuple(Fault("drop", bus, 0, 800, p=0.01) for bus in _BUSES),
+                    noticed=800,
                     seed=seed,
                     checks=(guide_kept,),
                 )
@@ -65,7 +65,7 @@ SCENARIOS: Final = (
                     seed=seed,
                     checks=(guide_kept,),
                 )
-                for p, within in ((0.2, 3000), (0.3, 400), (0.4, 200), (0.5, 150))
+                for p, within in ((0.2, 1000), (0.3, 400), (0.4, 200), (0.5, 150))
                 for seed in range(2)
             ),
         ),

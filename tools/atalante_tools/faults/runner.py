@@ -36,13 +36,15 @@ if TYPE_CHECKING:
 Vector = npt.NDArray[np.float64]
 #: What the controller records of its guide: tracking error of the assisted joints, and how far off the guide is.
 _GUIDE: Final = ("error", "q_bound")
-#: Half a second to the first pose: what is wanted is the walk.
-CONFIG: Final = HangConfig(startup=0.5)
+#: The robot hangs in the gait's first pose: what is wanted is the walk.
+CONFIG: Final = HangConfig(startup=0.1)
 ASSISTANCE: Final = 0.5
 #: Cycles of the HAL within which a robot with no fault is ACTIVE.
 _START: Final = 600
 #: Cycles between the operator's presses of START when it is over (the first leaves FAULT, the second HOLD), and after the last.
-RECOVERY: Final = 150
+RECOVERY: Final = 100
+#: Cycles in a row in ACTIVE after which it has started again.
+AGAIN: Final = 10
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,7 @@ class Stage:
     network: Network
     robot: Robot
     gait: Gait
+    pose: list[float]  # the gait's first, rad
     controller: HangController
 
 
@@ -60,7 +63,8 @@ def stage() -> Stage:
     """Network, robot, gait and controller of every run."""
     network, robot = atalante_dbc.load(), load_robot()
     gait = load_gait(HANG_GAIT, robot)
-    return Stage(network, robot, gait, HangController(robot, gait, SHAPES["constant"], CONFIG))
+    pose = gait.tables().q[0].tolist()
+    return Stage(network, robot, gait, pose, HangController(robot, gait, SHAPES["constant"], CONFIG))
 
 
 @functools.cache
@@ -91,7 +95,12 @@ def observe(case: Case, bound: int, *, recovery: bool = True) -> Observation:
         case_run.presses[quiet].append("start")
         case_run.presses[quiet + RECOVERY].append("start")
     last = quiet + 2 * RECOVERY if recovery else quiet - 1
-    case_run.go(lambda state: state.cycle >= last)
+    again = [SupervisorState.ACTIVE] * AGAIN
+
+    def over(state: State) -> bool:
+        return state.cycle >= last or (state.cycle >= quiet + AGAIN and case_run.states[-AGAIN:] == again)
+
+    case_run.go(over)
     return case_run.observation(quiet if recovery else None)
 
 
@@ -123,6 +132,7 @@ class _Run:
             network=shared.network,
             robot=shared.robot,
             seed=self._case.seed,
+            pose=shared.pose,
             operator=operator,
             assistance_factor=ASSISTANCE,
             controller_fields=controller.telemetry_fields,
