@@ -7,13 +7,13 @@ cannot wind up; a joint led by the virtual guide integrates only as far as the b
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from atalante_control.gait import PERIOD
+from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, LEG_JOINTS
 
 Vector = npt.NDArray[np.float64]
@@ -82,15 +82,17 @@ class Pid:
     def __init__(self, gains: PidGains) -> None:
         stance, swing = gains.stance, gains.swing
         roles = {LEFT: (stance, swing), RIGHT: (swing, stance)}  # left leg, right leg
-        self._gains_of = {s: _row(left.kp, right.kp, left.kd, right.kd) for s, (left, right) in roles.items()}
-        self._integral_of = {s: _row(left.ki, right.ki) * PERIOD for s, (left, right) in roles.items()}
+        #: Kp, Kd and what the integral grows by in a cycle, shape (3, 12).
+        self._gains_of = {
+            s: np.array([(*left.kp, *right.kp), (*left.kd, *right.kd), (*left.ki, *right.ki)])
+            * [[1.0], [1.0], [PERIOD]]
+            for s, (left, right) in roles.items()
+        }
         n = len(JOINTS)
-        self._upper = np.full(n, gains.integral_limit)
-        self._lower, self._integral, self._term = -self._upper, np.zeros(n), np.empty(n)
-        self._error = np.empty(2 * n)
-        self._position_error, self._velocity_error = self._error[:n], self._error[n:]
-        self.torque = np.zeros(n)
+        self._limit, self._integral, self.torque = gains.integral_limit, np.zeros(n), np.zeros(n)
         self.start_step(RIGHT, np.ones(n))
+        self._kernel = compiled(_update)
+        self.update(np.zeros(2 * n), np.zeros(n), np.zeros(n))
 
     def reset(self) -> None:
         """Empty the integrals."""
@@ -103,8 +105,8 @@ class Pid:
             stance: LEFT or RIGHT.
             share: how far the baseline acts on each joint, shape (12,) in [0, 1]; scales what is integrated.
         """
-        self._gains = self._gains_of[stance]
-        self._integral_gain = self._integral_of[stance] * share
+        self._gains = self._gains_of[stance].copy()
+        self._gains[2] *= share
 
     def update(self, desired: Vector, q: Vector, qd: Vector) -> Vector:
         """u_t of one cycle.
@@ -117,18 +119,15 @@ class Pid:
         Returns:
             `torque`.
         """
-        error, integral, torque, n = self._error, self._integral, self.torque, len(JOINTS)
-        np.subtract(desired[:n], q, out=self._position_error)
-        np.subtract(desired[n:], qd, out=self._velocity_error)
-        np.multiply(self._position_error, self._integral_gain, out=self._term)
-        np.add(integral, self._term, out=integral)
-        np.maximum(integral, self._lower, out=integral)
-        np.minimum(integral, self._upper, out=integral)
-        np.multiply(error, self._gains, out=error)
-        np.add(self._position_error, self._velocity_error, out=torque)
-        np.add(torque, integral, out=torque)
-        return torque
+        self._kernel(desired, q, qd, self._gains, self._limit, self._integral, self.torque)
+        return self.torque
 
 
-def _row(*columns: Sequence[float]) -> Vector:
-    return np.concatenate([np.array(column, dtype=np.float64) for column in columns])
+def _update(
+    desired: Vector, q: Vector, qd: Vector, gains: Vector, limit: float, integral: Vector, torque: Vector
+) -> None:
+    n = len(q)
+    for joint in range(n):
+        error, rate = desired[joint] - q[joint], desired[n + joint] - qd[joint]
+        integral[joint] = min(max(integral[joint] + error * gains[2, joint], -limit), limit)
+        torque[joint] = error * gains[0, joint] + rate * gains[1, joint] + integral[joint]
