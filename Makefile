@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 OUT ?= runs
 
-.PHONY: demo test test-vcan fuzz mutation lint bench messages supervisor-table clean
+.PHONY: demo test test-vcan fuzz coverage mutation lint bench messages supervisor-table clean
 
 demo: .venv/installed-all ## everything in one process tree: 30 steps in the air with each guide shape
 	$(BIN)/atalante demo --out $(OUT)/demo
@@ -16,6 +16,9 @@ test-vcan: .venv/installed-dev ## the tests on real SocketCAN, in a kernel of th
 
 fuzz: .venv/installed-dev ## 10 million random and mutated frames at the HAL and at every emulated node
 	PYTHONPATH=tests/fuzz $(BIN)/python tests/fuzz/frame_fuzzer.py --frames 10000000
+
+coverage: .venv/installed-dev ## every line and branch of the safety core is run by its own tests
+	$(BIN)/python tests/mutation/cover.py
 
 mutation: .venv/installed-dev ## mutants of the safety core: 95 % are killed, the others are argued in tests/mutation/SURVIVORS.md
 	$(BIN)/python tests/mutation/mutate.py

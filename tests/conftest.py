@@ -14,7 +14,7 @@ import hal_witness
 import numpy as np
 import pytest
 from command_limits import RECORD, CommandLimits
-from hypothesis import Phase, settings
+from hypothesis import HealthCheck, Phase, settings
 
 import atalante_dbc
 from atalante_control.model import ExoskeletonParameters, urdf
@@ -32,10 +32,17 @@ from atalante_hal.types import Command, State, SupervisorState
 # How long an example takes says nothing: the first one may compile.
 settings.register_profile("any time", deadline=None)
 settings.load_profile("any time")
-# For `make mutation`: one example that fails is enough, and making it small is what takes long.
+# For `make mutation`: one example that fails is enough, and making it small is what takes long; its process runs a test twice.
 settings.register_profile(
-    "mutation", deadline=None, phases=(Phase.explicit, Phase.generate), derandomize=True, database=None
+    "mutation",
+    deadline=None,
+    phases=(Phase.explicit, Phase.generate),
+    derandomize=True,
+    database=None,
+    suppress_health_check=[HealthCheck.differing_executors],
 )
+# For `make coverage`: a line is covered or it is not.
+settings.register_profile("coverage", settings.get_profile("mutation"), max_examples=5)
 
 
 class Witness:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from atalante_dbc import load
@@ -140,7 +140,6 @@ def test_foreign_frames_are_named_wherever_they_stand():
 CHANGES = ("none", "flip", "drop", "twice", "old", "range", "foreign", "length", "swap")
 
 
-@settings(max_examples=80)
 @given(
     st.lists(
         st.tuples(st.sampled_from(CHANGES), st.integers(0, ROWS - 1), st.integers(0, 63)), min_size=1, max_size=12
