@@ -36,14 +36,10 @@ from atalante_hal.types import Command, State, SupervisorState
 PERIOD = 1e-3  # s, the SYNC period
 #: Cycles within which every drive must have followed to OPERATION ENABLED.
 ENABLE_CYCLES = 200
-#: Time in which FULL_ASSIST leads the assistance factor from 0 to 1 [s].
-FULL_ASSIST_RAMP = 1.0
 #: Longest time FINISH_STEP goes on [cycles]: more than a step.
 FINISH_STEP_CYCLES = 2000
 #: Cycles in a row with a torque the limiter cuts, after which the controller is helped.
 SATURATED_CYCLES = 200
-#: Share of its twin's torque on the other leg below which a hot drive no longer walks.
-DERATED_IMBALANCE = 0.5
 #: Longest wait for answers while the robot is put into HOLD at the end [s].
 STOP_PATIENCE = 1.0
 
@@ -91,7 +87,9 @@ class Hal:
         #: What went wrong or changed, once, when it began.
         self.events = self._memory.events
         self._build_images(controller_fields, assistance_factor)
-        self._transceiver = Transceiver(network, "HAL", bus, len(self.messages), tap)
+        self._transceiver = Transceiver(
+            network, "HAL", bus, tap, cyclic=len(self.messages), surplus=robot.thresholds.surplus_frames
+        )
         self._limiter = Limiter(robot, PERIOD)
         self._commands = Commands(network, self._transceiver, self._parts, self._limiter.limit)
         self._status = StatusReport(network, self._transceiver, robot.hash32, gait_hash)
@@ -125,7 +123,7 @@ class Hal:
         self._image = ReceiveImage(fast, parts.signals)
         self._plausibility = Plausibility(self.robot, self._image, PERIOD)
         self._judgement = Judgement(self.network, self._image)
-        self._heartbeats = Heartbeats(self.network)
+        self._heartbeats = Heartbeats(self.network, self.robot.thresholds)
         self._pendant = Pendant(self._image)
         self.state = parts.state(assistance_factor, len(fast))
         self.state.valid, self.state.age = self._judgement.valid, self._image.age
@@ -378,7 +376,7 @@ class Hal:
         for place, (node, mine, twins) in enumerate(zip(_NODES, share, share[len(share) // 2 :] + share, strict=False)):
             if mine < 1.0:
                 text = f"{node}: its torque limit is {limit[place]:.0f} of {full[place]:.0f} Nm because it is hot"
-                confirmed = mine < DERATED_IMBALANCE * twins
+                confirmed = mine < self.robot.thresholds.derated_imbalance * twins
                 self._memory.raise_dtc(
                     self.state.cycle, Dtc.DERATED, node, value=limit[place], confirmed=confirmed, text=text
                 )
@@ -431,7 +429,7 @@ class Hal:
         led = state.supervisor in (_S.FULL_ASSIST, _S.FINISH_STEP)
         target = 1.0 if led else self._assistance_factor
         if self._leading:
-            step, way = PERIOD / FULL_ASSIST_RAMP, target - state.assistance_factor
+            step, way = PERIOD / self.robot.thresholds.full_assist_ramp, target - state.assistance_factor
             state.assistance_factor += max(-step, min(step, way))
             self._leading = state.assistance_factor != target
         elif not led:

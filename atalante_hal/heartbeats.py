@@ -19,11 +19,10 @@ from atalante_hal.e2e import Check
 from atalante_hal.fault_memory import FaultMemory
 from atalante_hal.frame import Frames
 from atalante_hal.image import NEVER, ReceiveImage
+from atalante_hal.robot import Thresholds
 
 #: NMT state of a node that works.
 OPERATIONAL = 5
-#: Supply [V] of a drive below which the battery is nearly empty, and below which drives cannot hold much longer.
-SUPPLY_LOW, UNDER_VOLTAGE = 42.0, 36.0
 
 
 class _Status(NamedTuple):
@@ -42,11 +41,12 @@ class Heartbeats:
     `quiet` says that nothing is wrong, so that nothing has to be judged.
     """
 
-    def __init__(self, network: Network) -> None:
+    def __init__(self, network: Network, thresholds: Thresholds) -> None:
         messages = [m for m in network.received_by("HAL") if m.cycle_ms != 1]
         self.image = ReceiveImage(messages, restarts=True)
         codec = self.image.codec
         self._hash = network.hash32
+        self._low, self._under = thresholds.supply_low, thresholds.supply_under
         self._statuses = [
             _Status(
                 m.sender,
@@ -153,7 +153,7 @@ class Heartbeats:
 
     def _take_status(self, status: _Status) -> None:
         values = self.image.values
-        low = status.drive and values[status.supply] < SUPPLY_LOW
+        low = status.drive and values[status.supply] < self._low
         if low or values[status.dbc_hash] != self._hash or values[status.state] != OPERATIONAL:
             self.quiet = False
         if status.node not in self._heard:
@@ -178,16 +178,16 @@ class Heartbeats:
             return
         lost = age >= status.timeout
         mismatch = values[status.dbc_hash] != self._hash
-        supply = float(values[status.supply]) if status.drive else SUPPLY_LOW
+        supply = float(values[status.supply]) if status.drive else self._low
         if lost:
             memory.raise_dtc(cycle, Dtc.HEARTBEAT_LOST, node, value=age)
         if mismatch:
             memory.raise_dtc(cycle, Dtc.DBC_MISMATCH, node, value=values[status.dbc_hash])
-        if supply < UNDER_VOLTAGE:
+        if supply < self._under:
             memory.raise_dtc(cycle, Dtc.UNDER_VOLTAGE, node, value=supply)
-        elif supply < SUPPLY_LOW:
+        elif supply < self._low:
             memory.raise_dtc(cycle, Dtc.SUPPLY_LOW, node, value=supply)
-        if lost or mismatch or supply < SUPPLY_LOW:
+        if lost or mismatch or supply < self._low:
             self.quiet = False
 
 

@@ -73,6 +73,17 @@ class Sensors:
 
 
 @dataclass(frozen=True)
+class Thresholds:
+    """What the HAL bears before it reacts, and how fast it does."""
+
+    supply_low: float  # V, of a drive: below it the battery is nearly empty
+    supply_under: float  # V, below it drives cannot hold much longer
+    derated_imbalance: float  # share of its twin's torque on the other leg below which a hot drive no longer walks
+    full_assist_ramp: float  # s, in which FULL_ASSIST leads the assistance factor from 0 to 1
+    surplus_frames: float  # beyond one of each cyclic message that a cycle may bring
+
+
+@dataclass(frozen=True)
 class Robot:
     """Limits, transmission and sensors; arrays of shape (12,) in the order of `JOINTS`, read-only, joint side."""
 
@@ -90,6 +101,7 @@ class Robot:
     envelope: Envelope
     derating: Derating
     sensors: Sensors
+    thresholds: Thresholds
     hash32: int  # CRC-32 of the file, as reported in HAL_STATUS
 
     def torque_limit(self, temperature: Vector) -> Vector:
@@ -146,6 +158,13 @@ _TABLES = {
         "cell_free": _Key(1, 1.0, 1000.0, "N"),
         "cell_loaded": _Key(1, 1.0, 3000.0, "N"),
     },
+    "thresholds": {
+        "supply_low": _Key(1, 5.0, 100.0, "V"),
+        "supply_under": _Key(1, 5.0, 100.0, "V"),
+        "derated_imbalance": _Key(1, 0.01, 1.0, "share of the other leg's"),
+        "full_assist_ramp": _Key(1, 0.01, 60.0, "s"),
+        "surplus_frames": _Key(1, 1, 100, "frames"),
+    },
 }
 
 
@@ -174,6 +193,10 @@ def load_robot(path: Path | None = None) -> Robot:
     }
     if not others["derating"]["start"] < others["derating"]["end"]:
         raise RobotError(f"{path}: derating.start is below derating.end, not {others['derating']['start']!r}")
+    if not others["thresholds"]["supply_under"] < others["thresholds"]["supply_low"]:
+        raise RobotError(
+            f"{path}: thresholds.supply_under is below thresholds.supply_low, not {others['thresholds']['supply_under']!r}"
+        )
 
     def both(column: Vector) -> Vector:
         return _frozen(np.concatenate([column, column]))
@@ -195,6 +218,7 @@ def load_robot(path: Path | None = None) -> Robot:
         envelope=Envelope(**others["envelope"]),
         derating=Derating(**others["derating"]),
         sensors=Sensors(**others["sensors"]),
+        thresholds=Thresholds(**others["thresholds"]),
         hash32=zlib.crc32(raw),
     )
 

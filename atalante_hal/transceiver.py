@@ -19,8 +19,6 @@ from atalante_hal.image import ReceiveImage
 
 #: Frames one cycle can take; the cyclic set is about 20.
 RECEIVE_BUDGET = 128
-#: Frames beyond one of each cyclic message that a cycle may bring: status, emergencies, a few late ones.
-SURPLUS = 12
 #: Cycles in a row after which a flood, or a transmit queue without room, is confirmed.
 PERSISTENT = 5
 #: Time to listen for another HAL before the first SYNC [s].
@@ -61,17 +59,20 @@ class Outgoing:
 class Transceiver:
     """Sends and receives for one node; collects what is wrong with the bus until `judge`."""
 
-    def __init__(self, network: Network, node: str, bus: Bus, cyclic: int, tap: FrameTap | None) -> None:
+    def __init__(
+        self, network: Network, node: str, bus: Bus, tap: FrameTap | None, *, cyclic: int, surplus: float
+    ) -> None:
         """Begin.
 
         Args:
             cyclic: frames a perfect cycle brings.
+            surplus: frames more than that are a flood, see `robot.Thresholds`.
         """
         self.bus, self.tap = bus, tap
         self._table = {_header(m) for m in network.sent_by(node)}
         self._own_ids = {m.frame_id for m in network.sent_by(node)}
         self._node = node
-        self._surplus = cyclic + SURPLUS
+        self._most = cyclic + surplus
         #: Receive buffer, always the same array.
         self.scratch = new_frames(RECEIVE_BUDGET)
         #: Found since the last judgement: code, whether confirmed, value, sentence.
@@ -133,7 +134,7 @@ class Transceiver:
             count = first
         if self.tap is not None:
             self.tap.received(scratch[first:] if first else scratch, count - first)
-        if count > self._surplus:
+        if count > self._most:
             self._find(Dtc.BUS_FLOOD, self._floods + 1 >= PERSISTENT, count, "")
         return count
 

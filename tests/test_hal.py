@@ -13,7 +13,7 @@ from atalante_dbc import DBC_FILE
 from atalante_hal.bus import BusDown, BusFull
 from atalante_hal.cia402 import Controlword, DriveState
 from atalante_hal.diagnostics import Dtc, dtcs_of, number_of
-from atalante_hal.hal import ENABLE_CYCLES, FINISH_STEP_CYCLES, FULL_ASSIST_RAMP, PERIOD, SATURATED_CYCLES, Hal
+from atalante_hal.hal import ENABLE_CYCLES, FINISH_STEP_CYCLES, PERIOD, SATURATED_CYCLES, Hal
 from atalante_hal.limiter import Limited
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Command, SupervisorState
@@ -326,12 +326,13 @@ def into_full_assist(rig):
 def test_full_assist_ramps_in_its_time_and_the_operator_ramps_back(make_rig):
     rig = make_rig(assistance_factor=0.5)
     state = into_full_assist(rig)
-    cycles = round(FULL_ASSIST_RAMP / PERIOD / 2)
+    ramp = rig.hal.robot.thresholds.full_assist_ramp
+    cycles = round(ramp / PERIOD / 2)
     assert state.assistance_factor == pytest.approx(0.501)
     before = state.assistance_factor
     for _ in range(cycles - 1):
         state = walk(rig, 1)
-        assert 0.0 < state.assistance_factor - before <= PERIOD / FULL_ASSIST_RAMP + 1e-12
+        assert 0.0 < state.assistance_factor - before <= PERIOD / ramp + 1e-12
         before = state.assistance_factor
     assert state.assistance_factor == 1.0
     assert rig.hal.record[rig.hal.layout["assistance_factor"]] == 1.0

@@ -9,10 +9,12 @@ from atalante_dbc import load
 from atalante_hal.diagnostics import Dtc
 from atalante_hal.fault_memory import FaultMemory
 from atalante_hal.frame import Frames, new_frames
-from atalante_hal.heartbeats import SUPPLY_LOW, UNDER_VOLTAGE, Heartbeats
+from atalante_hal.heartbeats import Heartbeats
 from atalante_hal.image import TransmitImage
+from atalante_hal.robot import load_robot
 
-NETWORK = load()
+NETWORK, THRESHOLDS = load(), load_robot().thresholds
+LOW, UNDER = THRESHOLDS.supply_low, THRESHOLDS.supply_under
 SLOW = [m for m in NETWORK.received_by("HAL") if m.cycle_ms != 1]
 NODES = [n.name for n in NETWORK.nodes if n.kind not in ("master", "pendant")]
 
@@ -22,7 +24,7 @@ class Nodes:
 
     def __init__(self) -> None:
         self.tx = TransmitImage(SLOW)
-        self.heartbeats, self.memory = Heartbeats(NETWORK), FaultMemory()
+        self.heartbeats, self.memory = Heartbeats(NETWORK, THRESHOLDS), FaultMemory()
         self.vibration = np.zeros(8)
         self.now = 0
         for node in [*NODES, "PENDANT"]:
@@ -136,10 +138,10 @@ def test_who_was_never_heard_is_not_overdue(nodes: Nodes, cycle: int):
     ("volts", "code"),
     [
         (48.0, None),
-        (SUPPLY_LOW, None),
-        (SUPPLY_LOW - 0.1, "SUPPLY_LOW"),
-        (UNDER_VOLTAGE, "SUPPLY_LOW"),
-        (UNDER_VOLTAGE - 0.1, "UNDER_VOLTAGE"),
+        (LOW, None),
+        (LOW - 0.1, "SUPPLY_LOW"),
+        (UNDER, "SUPPLY_LOW"),
+        (UNDER - 0.1, "UNDER_VOLTAGE"),
         (0.0, "UNDER_VOLTAGE"),
     ],
 )

@@ -56,6 +56,12 @@ def test_the_right_leg_mirrors_the_left():
         ("look_ahead = 0.02", "look_ahead = 20.0", r"look_ahead is 1 number from 0\.001 to 1 \(s\)"),
         ("floor = 0.3", "flor = 0.3", r"derating\.flor is unknown; valid keys are start, end, floor"),
         ("end = 115.0", "end = 90.0", r"derating\.start is below derating\.end, not 90\.0"),
+        ("[thresholds]", "[limits]", "limits"),
+        ("supply_under = 36.0", "supply_under = 42.0", r"supply_under is below thresholds\.supply_low, not 42\.0"),
+        ("supply_low = 42.0", "supply_low = 42000", r"thresholds\.supply_low is 1 number from 5 to 100 \(V\)"),
+        ("derated_imbalance = 0.5", "", r"thresholds\.derated_imbalance is missing"),
+        ("full_assist_ramp = 1.0", "full_assist_ramp = 0.0", r"full_assist_ramp is 1 number from 0\.01 to 60 \(s\)"),
+        ("surplus_frames = 12", "surplus_frames = -1", r"surplus_frames is 1 number from 1 to 100 \(frames\)"),
     ],
 )
 def test_a_wrong_file_is_refused_with_the_key(old: str, new: str, key: str, tmp_path: Path):

@@ -10,9 +10,10 @@ from atalante_hal.bus import BusDown, BusError, BusFull
 from atalante_hal.fault_memory import FaultMemory
 from atalante_hal.frame import FLAG_FDF, ID_ERROR, ID_EXTENDED, Frames, new_frames
 from atalante_hal.image import ReceiveImage, TransmitImage
-from atalante_hal.transceiver import RECEIVE_BUDGET, SURPLUS, HalDuplicate, Transceiver, TransmitDenied
+from atalante_hal.transceiver import RECEIVE_BUDGET, HalDuplicate, Transceiver, TransmitDenied
 
 NETWORK = load()
+SURPLUS = 12
 OURS = NETWORK.sent_by("HAL")
 CYCLIC = [NETWORK.message(name) for name in ("LEFT_SK_STATE", "RIGHT_SK_STATE")]
 
@@ -63,7 +64,7 @@ class Tap:
 class Desk:
     def __init__(self) -> None:
         self.bus, self.tap, self.memory = Bus(), Tap(), FaultMemory()
-        self.transceiver = Transceiver(NETWORK, "HAL", self.bus, len(CYCLIC), self.tap)
+        self.transceiver = Transceiver(NETWORK, "HAL", self.bus, self.tap, cyclic=len(CYCLIC), surplus=SURPLUS)
         self.cycle = 0
 
     def judge(self) -> dict[str, bool]:
