@@ -326,7 +326,7 @@ class Emulator:
             self._seal()
 
     def _seal(self) -> None:
-        np.add(self._truth, self._noise.rows[self.cycle % NOISE_CYCLES], self._tx.values)
+        self._noise.add(self.cycle, self._truth, self._tx.values)
         for rewrite in self.before_send:
             rewrite(self.cycle, self._tx.values)
         self._tx.seal(self._tag)
