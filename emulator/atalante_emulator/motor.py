@@ -30,23 +30,16 @@ class MotorParameters:
     thermal_time: float = 300.0  # s
 
 
-def _turn(
-    velocity: Vector,
-    wanted: Vector,
-    tracking: float,
-    strength: Vector,
-    dry: Vector,
-    friction_speed: float,
-    damping: Vector,
-    push: Vector,
-    motor: Vector,
-    joint: Vector,
-) -> None:
-    """One `PERIOD` of all motors: `motor` follows `wanted`, `joint` is what the joint feels of it. Shape (12,) each."""
-    for i in range(len(motor)):
-        motor[i] += tracking * (wanted[i] - motor[i])
-        friction = dry[i] * math.tanh(velocity[i] / friction_speed) + damping[i] * velocity[i]
-        joint[i] = strength[i] * motor[i] - friction + push[i]
+#: Rows of the numbers of all motors; what is commanded, what they are like, and the torque on the joint.
+_WANTED, _STRENGTH, _DRY, _DAMPING, _PUSH, _JOINT = range(6)
+
+
+def _turn(velocity: Vector, motors: Vector, tracking: float, friction_speed: float, torque: Vector) -> None:
+    """One `PERIOD` of all motors: `torque` follows what is wanted, the joint feels it less friction. Shapes (12,), (6, 12)."""
+    for i in range(len(torque)):
+        torque[i] += tracking * (motors[_WANTED, i] - torque[i])
+        friction = motors[_DRY, i] * math.tanh(velocity[i] / friction_speed) + motors[_DAMPING, i] * velocity[i]
+        motors[_JOINT, i] = motors[_STRENGTH, i] * torque[i] - friction + motors[_PUSH, i]
 
 
 class Motors:
@@ -55,12 +48,14 @@ class Motors:
     def __init__(self, robot: Robot, parameters: MotorParameters, torque: Vector, temperature: Vector) -> None:
         both = len(SIDES)
         self._parameters, self._torque, self.temperature = parameters, torque, temperature
-        self.wanted, self._push, self._joint = np.zeros((3, len(JOINTS)))
         self._tracking = 1.0 - math.exp(-PERIOD / parameters.current_loop)
-        self._strength = np.ones(len(JOINTS))
-        self._dry, self._viscous = np.array((parameters.coulomb * both, parameters.viscous * both))
+        self._motors = np.zeros((6, len(JOINTS)))
+        self.wanted, self._joint = self._motors[_WANTED], self._motors[_JOINT]
+        self._viscous = np.array(parameters.viscous * both)
         self._braked = self._viscous + parameters.brake * both
-        self._damping = self._braked.copy()
+        self._motors[_STRENGTH] = 1.0
+        self._motors[_DRY] = parameters.coulomb * both
+        self._motors[_DAMPING] = self._braked
         self._heat = parameters.heating / (0.5 * robot.torque_max) ** 2
         temperature.fill(parameters.ambient)
         self._turn = compiled(_turn)
@@ -68,15 +63,15 @@ class Motors:
 
     def power(self, powered: npt.NDArray[np.bool_]) -> None:
         """Which power stages are on, shape (12,): the others brake."""
-        self._damping[:] = np.where(powered, self._viscous, self._braked)
+        self._motors[_DAMPING] = np.where(powered, self._viscous, self._braked)
 
     def weaken(self, motor: int, strength: float) -> None:
         """Let a motor make only this share of the torque it measures."""
-        self._strength[motor] = strength
+        self._motors[_STRENGTH, motor] = strength
 
     def push(self, joint: int, torque: float) -> None:
         """Somebody pushes a joint from now on, on top of what the motor does [Nm]; 0: no longer."""
-        self._push[joint] = torque
+        self._motors[_PUSH, joint] = torque
 
     def turn(self, velocity: Vector) -> list[float]:
         """Joint torques for the next `PERIOD`: what the motors make of `wanted`, less friction and brake, and pushes.
@@ -87,18 +82,7 @@ class Motors:
         Returns:
             Shape (12,) [Nm].
         """
-        self._turn(
-            velocity,
-            self.wanted,
-            self._tracking,
-            self._strength,
-            self._dry,
-            self._parameters.friction_speed,
-            self._damping,
-            self._push,
-            self._torque,
-            self._joint,
-        )
+        self._turn(velocity, self._motors, self._tracking, self._parameters.friction_speed, self._torque)
         torque: list[float] = self._joint.tolist()
         return torque
 
