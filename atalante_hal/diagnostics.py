@@ -108,6 +108,7 @@ class Dtc(StrEnum):
     CYCLE_GAP = "CYCLE_GAP", _R.HOLD, _S.ERROR, "too long between two cycles"
     OVERRUN = "OVERRUN", _R.HOLD, _S.ERROR, "late cycles in a row"
     OPERATOR_STOP = "OPERATOR_STOP", _R.HOLD, _S.INFO, "the operator stops, lets the dead-man go, or is not heard"
+    SWING_TIMEOUT = "SWING_TIMEOUT", _R.FINISH_STEP, _S.ERROR, "a joint of the swing leg is not heard for a moment"
     # Outside the loop.
     RECORD_STOPPED = "RECORD_STOPPED", _R.INFO, _S.WARNING, "the recording ended early"
     TELEMETRY_DOWN = "TELEMETRY_DOWN", _R.INFO, _S.WARNING, "the telemetry process is gone"

@@ -309,7 +309,7 @@ class Hal:
         """Everything that is wrong in this cycle, and what the supervisor makes of it."""
         state, memory, cycle = self.state, self._memory, self.state.cycle
         judgement, pendant = self._judgement, self._pendant
-        judgement.judge(cycle, memory)
+        judgement.judge(cycle, memory, self._plausibility.swing)
         state.joints_valid = judgement.joints_valid
         self._heartbeats.judge(cycle, memory)
         self._transceiver.judge(cycle, memory)

@@ -4,6 +4,9 @@
 
 A message that was not committed is pending trouble; it is confirmed when its data is as old as the DBC's timeout. A message
 that loses more than a fifth of its frames trips its leaky bucket. What tripped is trusted again after 16 good cycles in a row.
+
+Who stands on one leg had better put the other one down: a joint of the swing leg that is not heard has its step finished, and
+is held like any other when it still is not heard after twice the timeout, 10 cycles.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from atalante_hal.diagnostics import Dtc
 from atalante_hal.e2e import FULL, SETTLED, Check, Qualification, qualify
 from atalante_hal.fault_memory import FaultMemory
 from atalante_hal.image import NEVER, ReceiveImage
+from atalante_hal.robot import SIDES
 
 #: Why a message was not committed -> what is noted at once.
 PENDING = {
@@ -35,6 +39,8 @@ CONFIRMED = {
     Check.REPEATED: Dtc.E2E_FROZEN,
 }
 _FRESH = int(Check.SOME_LOST)
+#: Timeouts for which a joint of the swing leg may not be heard before the robot holds.
+SWING_TIMEOUTS = 2
 
 
 class Judgement:
@@ -47,6 +53,7 @@ class Judgement:
         self._timeouts = [m.timeout_ms for m in messages]
         kinds = [network.node(m.sender).kind for m in messages]
         self._invalid = [Dtc.IMU_INVALID if kind == "imu" else Dtc.SIGNAL_RANGE for kind in kinds]
+        self._legs = [_leg(m.sender) if kind == "drive" else None for m, kind in zip(messages, kinds, strict=True)]
         self._joint_rows = [row for row, kind in enumerate(kinds) if kind == "drive"]
         self._confirms = [kind != "pendant" for kind in kinds]
         self._needed = [row for row, kind in enumerate(kinds) if kind != "pendant"]
@@ -68,8 +75,12 @@ class Judgement:
         """Whether a row's sender is trusted."""
         return self.qualification[row].trusted
 
-    def judge(self, cycle: int, memory: FaultMemory) -> None:
-        """Judge a cycle that is not perfect, or follows one that was not."""
+    def judge(self, cycle: int, memory: FaultMemory, swing: int | None = None) -> None:
+        """Judge a cycle that is not perfect, or follows one that was not.
+
+        Args:
+            swing: leg that swings while the other one stands, by its place in SIDES; None: none does.
+        """
         image = self._image
         checks, ages = image.check.tolist(), image.age.tolist()
         for row, why in image.refused:
@@ -78,13 +89,13 @@ class Judgement:
             memory.raise_dtc(cycle, dtc, self._senders[row], value=value, confirmed=False)
         for row, (check, age) in enumerate(zip(checks, ages, strict=True)):
             if check or age or self.qualification[row] is not SETTLED:
-                self._judge_row(cycle, memory, row, Check(check), age)
+                self._judge_row(cycle, memory, row, Check(check), age, swing)
         trusted = [q.trusted for q in self.qualification]
         self.valid[:] = [check <= _FRESH and good for check, good in zip(checks, trusted, strict=True)]
         self.joints_valid = bool(self.valid[self._joint_rows].all())
         self.settled = image.all_fresh and all(q is SETTLED for q in self.qualification)
 
-    def _judge_row(self, cycle: int, memory: FaultMemory, row: int, check: Check, age: int) -> None:
+    def _judge_row(self, cycle: int, memory: FaultMemory, row: int, check: Check, age: int, swing: int | None) -> None:
         sender = self._senders[row]
         fresh, late = check <= Check.SOME_LOST, age >= self._timeouts[row]
         # What a frame says may be impossible: the way it came is good all the same.
@@ -95,7 +106,10 @@ class Judgement:
         if confirmed and check is not Check.IMPLAUSIBLE:  # which `plausibility` tells
             dtc = self._invalid[row] if check is Check.INVALID else CONFIRMED[check]
             text = f"{sender}: {dtc.meaning}; its data is {age} cycles old"
-            memory.raise_dtc(cycle, dtc, sender, value=age, text=text)
+            in_swing = swing is not None and self._legs[row] == swing
+            if brief := in_swing and age < SWING_TIMEOUTS * self._timeouts[row]:
+                memory.raise_dtc(cycle, Dtc.SWING_TIMEOUT, sender, value=age)
+            memory.raise_dtc(cycle, dtc, sender, value=age, confirmed=not brief, text=text)
         elif fresh and age and not late:
             memory.raise_dtc(cycle, Dtc.NODE_LATE, sender, value=age, confirmed=False)
         if check is Check.SOME_LOST:
@@ -106,3 +120,8 @@ class Judgement:
     def missing(self) -> set[str]:
         """Senders that are not heard in time or not trusted yet."""
         return {self._senders[row] for row in self._needed if not self.qualification[row].trusted}
+
+
+def _leg(drive: str) -> int:
+    """Leg of a drive, by its place in SIDES."""
+    return SIDES.index(drive.split("_")[0].lower())

@@ -31,6 +31,7 @@ class Bench:
         self.tx, self.image = TransmitImage(MESSAGES), ReceiveImage(MESSAGES)
         self.judgement, self.memory = Judgement(NETWORK, self.image), FaultMemory()
         self.buffer, self.number = new_frames(64), 0
+        self.swing: int | None = None
 
     def cycle(self, change: Change = lambda frames: frames, times: int = 1) -> Bench:
         for _ in range(times):
@@ -38,7 +39,7 @@ class Bench:
             frames = change(self.tx.seal(self.number & 0xFF).copy())
             self.buffer[: len(frames)] = frames
             self.image.accept(self.buffer, len(frames), self.number & 0xFF)
-            self.judgement.judge(self.number, self.memory)
+            self.judgement.judge(self.number, self.memory, self.swing)
             self.memory.close_cycle(self.number)
         return self
 
@@ -341,3 +342,39 @@ def test_the_age_of_what_comes_late_after_a_loss_is_told_with_it(bench: Bench) -
     bench.cycle(lambda frames: np.concatenate([kept[0], np.delete(frames, KNEE)]))
     assert bench.image.check[KNEE] == Check.SOME_LOST
     assert bench.memory.active[Dtc.E2E_SOME_LOST, "LEFT_SK"].value == 1
+
+
+class TestSwingLeg:
+    """A robot that stands on its right leg."""
+
+    @pytest.fixture
+    def bench(self) -> Bench:
+        bench = Bench().well()
+        bench.swing = 0
+        return bench
+
+    def test_a_joint_that_is_not_heard_for_a_moment_has_its_step_finished(self, bench: Bench):
+        bench.cycle(lose(KNEE), times=4)
+        assert bench.active == {}
+        for _ in range(5):
+            bench.cycle(lose(KNEE))
+            assert bench.active == {("SWING_TIMEOUT", "LEFT_SK"): True, ("NODE_TIMEOUT", "LEFT_SK"): False}
+        assert bench.cycle(lose(KNEE)).active == {("NODE_TIMEOUT", "LEFT_SK"): True}
+
+    def test_a_joint_of_the_leg_it_stands_on_is_held_at_once(self, bench: Bench):
+        assert bench.cycle(lose(OTHER_KNEE), times=5).active == {("NODE_TIMEOUT", "RIGHT_SK"): True}
+
+    def test_of_a_robot_on_both_legs_every_joint_is(self, bench: Bench):
+        bench.swing = None
+        assert bench.cycle(lose(KNEE), times=5).active == {("NODE_TIMEOUT", "LEFT_SK"): True}
+
+    def test_who_is_no_joint_is_silent_as_ever(self, bench: Bench):
+        assert bench.cycle(lose(IMU, FOOT), times=10).active == {
+            ("NODE_TIMEOUT", "IMU_PELVIS"): True,
+            ("NODE_TIMEOUT", "FOOT_LEFT"): True,
+        }
+
+    def test_the_frame_after_five_lost_ones_is_refused_and_the_next_one_is_not(self, bench: Bench):
+        bench.cycle(lose(KNEE), times=5)
+        assert bench.cycle().active == {("SWING_TIMEOUT", "LEFT_SK"): True, ("E2E_SEQUENCE", "LEFT_SK"): False}
+        assert bench.cycle().active == {}

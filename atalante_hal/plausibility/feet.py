@@ -35,6 +35,8 @@ class Feet:
         self._doubtful = False  # a cell contradicted the others at the last look
         #: A foot has stood, and since then not both have swung for long.
         self.on_ground = False
+        #: Leg that swings while the other one stands, by its place in FEET; None: none does.
+        self.swing: int | None = None
         self._swinging = 0  # cycles
         self._contradicts = [[0] * len(CELLS) for _ in FEET]
         #: Cells that contradict the others: (foot, cell) -> N.
@@ -57,6 +59,7 @@ class Feet:
             stands[foot] = sum(carries) >= 2
             if heard[foot]:
                 self._judge_cells(foot, cells, carries)
+        self.swing = None if stands[0] == stands[1] else stands.index(False)
         self._doubtful = any(map(any, self._contradicts))
         if any(stands):
             self.on_ground, self._swinging = True, 0

@@ -96,6 +96,11 @@ class Plausibility:
         self._cycle += 1
         return self.findings
 
+    @property
+    def swing(self) -> int | None:
+        """Leg that swings while the other one stands, by its place in FEET; None: none does."""
+        return self._feet.swing
+
     def _judge_feet(self, fresh: bool) -> bool:
         if fresh:
             return self._feet.judge((True, True))
