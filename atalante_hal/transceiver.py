@@ -171,7 +171,7 @@ class Transceiver:
         try:
             for _ in range(RECEIVE_BUDGET):
                 if self.bus.receive(self.scratch) < RECEIVE_BUDGET:
-                    break
+                    return
         except BusError as error:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} fails: {error}")
 

@@ -262,6 +262,7 @@ def test_torque_noise_is_seeded_and_of_the_stated_size(bench: Bench) -> None:
 class TestHeat:
     """A drive warms up, gives less when it is hot, and trips when it is too hot."""
 
+    @pytest.mark.exhaustive
     def test_winding_temperature_follows_the_closed_form(self) -> None:
         bench = Bench(SMOOTH)
         bench.enable()

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from atalante_dbc import load
+from atalante_hal import transceiver
 from atalante_hal.bus import BusDown, BusError, BusFull
+from atalante_hal.diagnostics import Dtc
 from atalante_hal.fault_memory import FaultMemory
 from atalante_hal.frame import FLAG_FDF, ID_ERROR, ID_EXTENDED, Frames, new_frames
 from atalante_hal.image import ReceiveImage, TransmitImage
@@ -18,12 +20,25 @@ OURS = NETWORK.sent_by("HAL")
 CYCLIC = [NETWORK.message(name) for name in ("LEFT_SK_STATE", "RIGHT_SK_STATE")]
 
 
+class Clock:
+    """Time goes by while a bus is waited for, and at no other time; who looks at the clock for ever is lost."""
+
+    def __init__(self) -> None:
+        self.now, self.looks = 64.0, 0
+
+    def monotonic(self) -> float:
+        self.looks += 1
+        assert self.looks < 200, "waits for ever"
+        return self.now
+
+
 class Bus:
     """A bus of lists: what is sent, and what each `receive` delivers."""
 
     name, dropped, stamps = "bench", 0, np.zeros(256, np.int64)
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
         self.sent: list[Frames] = []
         self.arrivals: list[Frames | BusError] = []
         self.timeouts: list[float] = []
@@ -37,6 +52,7 @@ class Bus:
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
         self.timeouts.append(timeout)
         if not self.arrivals:
+            self.clock.now += timeout
             return 0
         arrived = self.arrivals.pop(0)
         if isinstance(arrived, BusError):
@@ -63,7 +79,8 @@ class Tap:
 
 class Desk:
     def __init__(self) -> None:
-        self.bus, self.tap, self.memory = Bus(), Tap(), FaultMemory()
+        self.clock = Clock()
+        self.bus, self.tap, self.memory = Bus(self.clock), Tap(), FaultMemory()
         self.transceiver = Transceiver(NETWORK, "HAL", self.bus, self.tap, cyclic=len(CYCLIC), surplus=SURPLUS)
         self.cycle = 0
 
@@ -75,8 +92,16 @@ class Desk:
 
 
 @pytest.fixture
-def desk() -> Desk:
-    return Desk()
+def desk(monkeypatch: pytest.MonkeyPatch) -> Desk:
+    made = Desk()
+    monkeypatch.setattr(transceiver, "time", made.clock)
+    return made
+
+
+def test_at_rest_nothing_is_wrong(desk: Desk):
+    assert desk.transceiver.quiet is True
+    assert desk.judge() == {}
+    assert desk.transceiver.quiet is True
 
 
 def ids(*numbers: int) -> Frames:
@@ -148,7 +173,8 @@ def test_a_bus_that_is_gone_is_confirmed_at_once(desk: Desk):
     desk.bus.refuses = BusDown("gone")
     desk.transceiver.send(sync(desk))
     assert desk.judge() == {"BUS_DOWN": True}
-    assert desk.memory.events[0].text == "the bus bench refuses frames: gone"
+    event = desk.memory.events[0]
+    assert (event.text, event.value, event.node) == ("the bus bench refuses frames: gone", 0.0, "HAL")
     assert desk.tap.sent_ids == []
     assert desk.judge() == {}
 
@@ -182,7 +208,17 @@ def test_who_is_alive_is_waited_for(desk: Desk):
     desk.bus.arrivals = [ids(first), ids(7), ids(second), ids(8)]
     assert desk.transceiver.receive(0, image(0, 1), 60.0) == 3
     assert len(desk.bus.arrivals) == 1
-    assert all(0.0 < t <= 60.0 for t in desk.bus.timeouts[1:])
+    assert desk.bus.timeouts == [0.0, 60.0, 60.0]
+
+
+def test_a_wait_ends_when_patience_does(desk: Desk):
+    first = CYCLIC[0].frame_id
+    desk.bus.arrivals = [ids(first)]
+    assert desk.transceiver.receive(0, image(0, 1), 60.0) == 1
+    assert desk.bus.timeouts == [0.0, 60.0]
+    desk.bus.arrivals = [ids(first)]
+    assert desk.transceiver.receive(0, image(0, 1)) == 1
+    assert desk.bus.timeouts == [0.0, 60.0, 0.0]
 
 
 def test_frames_of_the_last_cycle_do_not_count_as_this_ones(desk: Desk):
@@ -201,13 +237,13 @@ def test_who_is_silent_is_not_waited_for(desk: Desk):
 def test_while_nobody_is_known_whoever_answers_is_taken_until_nobody_does(desk: Desk):
     desk.bus.arrivals = [ids(1), ids(2), ids(3)]
     assert desk.transceiver.receive(0, image(), 60.0) == 3
-    assert len(desk.bus.timeouts) == 4
-    assert max(desk.bus.timeouts) <= 0.1
+    assert desk.bus.timeouts == pytest.approx([0.0, 0.1, 0.1, 0.1])
 
 
 def test_without_patience_nothing_is_waited_for(desk: Desk):
     desk.bus.arrivals = [ids(1), ids(2)]
     assert desk.transceiver.receive(0, image(0, 1), 0.0) == 1
+    assert desk.bus.timeouts == [0.0]
 
 
 def test_a_cycle_takes_no_more_than_its_budget(desk: Desk):
@@ -223,7 +259,8 @@ def test_a_flood_is_confirmed_after_five_cycles_in_a_row(desk: Desk):
         desk.transceiver.receive()
         assert desk.judge() == {"BUS_FLOOD": cycle >= 5}
         assert not desk.transceiver.quiet
-    assert desk.memory.events[0].value == usual + 1
+    event = desk.memory.events[0]
+    assert (event.value, event.text) == (usual + 1, f"HAL: {Dtc.BUS_FLOOD.meaning}")
     desk.bus.arrivals = [ids(*range(usual))]
     desk.transceiver.receive()
     assert desk.judge() == {}
@@ -237,7 +274,8 @@ def test_a_bus_that_fails_while_receiving_raises_nothing(desk: Desk):
     desk.bus.arrivals = [BusDown("gone")]
     assert desk.transceiver.receive(1) == 1
     assert desk.judge() == {"BUS_DOWN": True}
-    assert desk.memory.events[0].text == "the bus bench fails: gone"
+    event = desk.memory.events[0]
+    assert (event.text, event.value, event.node) == ("the bus bench fails: gone", 0.0, "HAL")
     desk.bus.arrivals = [ids(1), BusDown("gone")]
     assert desk.transceiver.receive(0, image(0, 1), 1.0) == 0
 
@@ -297,15 +335,17 @@ def test_a_hal_that_is_there_is_heard_before_anything_is_sent(desk: Desk):
 
 def test_nodes_that_speak_are_no_hal(desk: Desk):
     desk.bus.arrivals = [ids(0x181), ids(0x7FF)]
-    desk.transceiver.listen(0.002)
+    desk.transceiver.listen(0.25)
     assert desk.bus.arrivals == []
+    assert desk.bus.timeouts == [0.25] * 3
     assert desk.judge() == {}
 
 
 def test_what_is_left_of_an_older_frame_in_the_buffer_is_not_heard(desk: Desk):
     desk.transceiver.scratch["can_id"].fill(0x10)
     desk.bus.arrivals = [ids(0x181)]
-    desk.transceiver.listen(0.002)
+    desk.transceiver.listen()
+    assert desk.bus.timeouts == pytest.approx([0.2, 0.2])
 
 
 def test_a_bus_that_is_gone_ends_the_listening(desk: Desk):
@@ -331,6 +371,8 @@ def test_dropping_from_a_bus_that_is_gone_raises_nothing(desk: Desk):
     desk.bus.arrivals = [BusDown("gone")]
     desk.transceiver.discard()
     assert desk.judge() == {"BUS_DOWN": True}
+    event = desk.memory.events[0]
+    assert (event.text, event.value) == ("the bus bench fails: gone", 0.0)
 
 
 def test_a_tap_is_not_needed(desk: Desk):

@@ -39,7 +39,9 @@ LIVES = (0, 33)
 UNKNOWN = (None, 2, 37)
 
 #: Each mutant is a pytest of its own, which spent most of its time on plugins and on collecting garbage.
-PLUGINS = "-p _hypothesis_pytestplugin -p no:cacheprovider -p no:unraisableexception -p no:threadexception"
+PLUGINS = (
+    "-p impatience -p _hypothesis_pytestplugin -p no:cacheprovider -p no:unraisableexception -p no:threadexception"
+)
 PYPROJECT = """
 [tool.pytest.ini_options]
 testpaths = ["tests"]
@@ -105,7 +107,7 @@ class Trial:
                 meta.write_text(json.dumps(said))
         environment = {
             **os.environ,
-            "PYTHONPATH": "",
+            "PYTHONPATH": str(HERE),
             "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
             "NUMBA_DISABLE_JIT": "1" if self._part in LOOPS else "0",
             "HYPOTHESIS_STORAGE_DIRECTORY": str(self._work / ".hypothesis"),
