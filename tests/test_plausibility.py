@@ -781,6 +781,18 @@ class TestContact:
             for _ in range(16):
                 assert machine.cycle() == ()
 
+    def test_who_stands_on_one_leg_swings_the_other(self):
+        machine = Machine()
+        assert machine.checks.swing is None
+        self.stand(machine, 4)
+        assert machine.checks.swing == 0
+        machine.run(4, lambda now: now.force[0, :, 2].__iadd__(200.0))
+        assert machine.checks.swing == 1
+        machine.run(4, lambda now: now.force[:, :, 2].__iadd__(200.0))
+        assert machine.checks.swing is None
+        machine.run(4)
+        assert machine.checks.swing is None
+
     def test_one_cell_is_no_foot_on_the_ground(self):
         machine = Machine()
         self.stand(machine, 100, cells=1)
