@@ -82,6 +82,12 @@ class Trial:
     def lay_out(self) -> None:
         """Copy the project; files that are as they were keep their time, and the mutants in them their verdicts."""
         self._work.mkdir(parents=True, exist_ok=True)
+        # mutmut does not copy data again that it has copied once.
+        mutants = self._work / "mutants"
+        ours = (*self._files, "mutmut-stats.json")
+        for old in mutants.rglob("*"):
+            if old.is_file() and not str(old.relative_to(mutants)).startswith(ours):
+                old.unlink()
         # The witness of the tests reads the DBC where it is in the project.
         for package in (*PACKAGES, "dbc", "tests"):
             target = self._work / Path(package).name
