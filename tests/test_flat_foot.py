@@ -10,7 +10,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from atalante_control.flat_foot import FlatFoot, Tibiae, flat_feet
+from atalante_control.flat_foot import FlatFoot, Tibiae, flat_feet, level
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import load_robot
 
@@ -51,31 +51,31 @@ def sole_normal(foot: FlatFoot, shank: np.ndarray, sagittal: float, henke: float
 def test_the_sole_is_level(foot: FlatFoot, heading: float, roll: float, pitch: float):
     r = tibia(heading, roll, pitch)
     assume(np.trace(r) > -0.9)
-    angles = foot.level(quaternion(r), STILL)[0]
+    angles = level(foot.geometry, quaternion(r), STILL)[0]
     np.testing.assert_allclose(sole_normal(foot, r, *angles), [0.0, 0.0, 1.0], atol=1e-9)
 
 
 @given(HEADING, ANGLES)
 def test_heading_does_not_matter(heading: float, pitch: float):
     assume(abs(heading) < 3.0)
-    turned, ahead = (LEFT.level(quaternion(tibia(h, 0.1, pitch)), STILL)[0] for h in (heading, 0.0))
+    turned, ahead = (level(LEFT.geometry, quaternion(tibia(h, 0.1, pitch)), STILL)[0] for h in (heading, 0.0))
     np.testing.assert_allclose(turned, ahead, atol=1e-9)
 
 
 def test_an_upright_tibia_needs_nothing_and_a_pitched_one_its_pitch():
-    np.testing.assert_allclose(LEFT.level((1.0, 0.0, 0.0, 0.0), STILL)[0], (0.0, 0.0), atol=1e-15)
+    np.testing.assert_allclose(level(LEFT.geometry, (1.0, 0.0, 0.0, 0.0), STILL)[0], (0.0, 0.0), atol=1e-15)
     straight = FlatFoot(0.0, (0.788, 0.0, 0.616))
-    np.testing.assert_allclose(straight.level(quaternion(tibia(0.0, 0.0, 0.3)), STILL)[0], (-0.3, 0.0), atol=1e-12)
+    np.testing.assert_allclose(level(straight.geometry, quaternion(tibia(0.0, 0.0, 0.3)), STILL)[0], (-0.3, 0.0), atol=1e-12)
 
 
 def test_left_and_right_are_mirror_images():
-    left = LEFT.level(quaternion(tibia(0.0, 0.1, 0.2)), STILL)[0]
-    right = RIGHT.level(quaternion(tibia(0.0, -0.1, 0.2)), STILL)[0]
+    left = level(LEFT.geometry, quaternion(tibia(0.0, 0.1, 0.2)), STILL)[0]
+    right = level(RIGHT.geometry, quaternion(tibia(0.0, -0.1, 0.2)), STILL)[0]
     np.testing.assert_allclose(right, (left[0], -left[1]), atol=1e-12)
 
 
 def test_a_tibia_leaning_too_far_gets_the_nearest_angle():
-    angles = LEFT.level(quaternion(tibia(0.0, 1.3, 0.0)), (1.0, 2.0, 3.0))[0]
+    angles = level(LEFT.geometry, quaternion(tibia(0.0, 1.3, 0.0)), (1.0, 2.0, 3.0))[0]
     assert all(math.isfinite(a) for a in angles)
     assert abs(angles[1]) == pytest.approx(math.pi / 2)
 
@@ -86,8 +86,8 @@ def test_rates_are_those_of_the_angles(heading: float, roll: float, pitch: float
     gyro, shank, step = (p, q, r), tibia(heading, 0.5 * roll, 0.5 * pitch), 1e-6
     later, before = (shank @ rotation_vector(np.array(gyro) * s) for s in (step, -step))
     for foot in (LEFT, RIGHT):
-        ahead, behind = (np.array(foot.level(quaternion(m), STILL)[0]) for m in (later, before))
-        np.testing.assert_allclose(foot.level(quaternion(shank), gyro)[1], (ahead - behind) / (2 * step), atol=1e-6)
+        ahead, behind = (np.array(level(foot.geometry, quaternion(m), STILL)[0]) for m in (later, before))
+        np.testing.assert_allclose(level(foot.geometry, quaternion(shank), gyro)[1], (ahead - behind) / (2 * step), atol=1e-6)
 
 
 def test_refuses_an_axis_it_has_no_solution_for():

@@ -24,24 +24,25 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from struct import Struct
 
 import numpy as np
 import numpy.typing as npt
 
+from atalante_control.account import TELEMETRY, HangStatistics, tell
 from atalante_control.backup import BackupPolicy
 from atalante_control.certificate import Certificate, HandOver, certify, largest_assistance
 from atalante_control.deadbeat import Deadbeat
-from atalante_control.flat_foot import Tibiae, flat_feet
+from atalante_control.flat_foot import LevelFeet
 from atalante_control.gait import PERIOD, Gait, bezier
 from atalante_control.gravity import Gravity
 from atalante_control.guide import GuideConfig, GuideFilter
 from atalante_control.guide_shapes import GuideShape
 from atalante_control.haptics import intensity, levels
-from atalante_control.idealization import AssistedInertia, Friction
+from atalante_control.idealization import AssistedInertia, Friction, Merge
 from atalante_control.impact import step_over
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_control.pid import AIR_GAINS, LEFT, RIGHT, Pid, PidGains
+from atalante_hal.compiled import compiled
 from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, MOTORS, Robot
 from atalante_hal.types import Command, State
 
@@ -49,12 +50,8 @@ Vector = npt.NDArray[np.float64]
 Pair = tuple[float, float]
 
 _LEG = len(LEG_JOINTS)
-_SH, _SK, _SA, _HA = (LEG_JOINTS.index(joint) for joint in ("SH", "SK", "SA", "HA"))
-_TAIL = Struct("16d")  # what follows q_des in the telemetry
-_STOP_MARGIN, _STOP_FADE = math.radians(1.0), math.radians(3.0)  # flat foot against the ankle's limits
+_SH, _SK, _SA = (LEG_JOINTS.index(joint) for joint in ("SH", "SK", "SA"))
 _PELVIS = IMUS.index("pelvis")
-_TIBIAE = (IMUS.index("left_tibia"), IMUS.index("right_tibia"))
-_IMU_AGE = 10  # cycles after which what an IMU said is no longer used, its timeout in the DBC
 
 
 @dataclass(frozen=True)
@@ -102,40 +99,10 @@ class HangConfig:
             raise ValueError(f"gentler are parts of guide_rate between 0 and 1, rising, not {self.gentler!r}")
 
 
-@dataclass
-class HangStatistics:
-    """What the guide did from the first completed right-stance step on."""
-
-    steps: int = 0  # completed right-stance steps
-    cycles: int = 0  # counted
-    inside: int = 0  # of them, both assisted joints in the guide
-    active: int = 0  # of them, the filter acting on one
-    max_ratio: float = 0.0  # largest |e| / q_bound
-    min_h_at_start: float = 1.0  # smallest h at a step's first cycle
-    hand_overs_exceeded: int = 0  # step changes with a deviation beyond the certified hand-over
-
-    @property
-    def inside_fraction(self) -> float:
-        """Part of the counted time with both joints in the guide; 0 before anything is counted."""
-        return self.inside / max(1, self.cycles)
-
-    @property
-    def active_fraction(self) -> float:
-        """Part of the counted time the filter acts."""
-        return self.active / max(1, self.cycles)
-
-
 def baseline_share(xi: float, fade: float) -> float:
     """w(Xi): 0 up to `fade`, smoothstep to exactly 1 at Xi = 1."""
     x = (xi - fade) / (1.0 - fade)
     return 0.0 if x <= 0.0 else 1.0 if x >= 1.0 else x * x * (3.0 - 2.0 * x)
-
-
-def _within(angle: float, rate: float, low: float, high: float) -> Pair:
-    """Angle held `_STOP_MARGIN` off the joint's limits, with a speed that fades out before it rather than at it."""
-    low, high = low + _STOP_MARGIN, high - _STOP_MARGIN
-    room = max(0.0, min(angle - low, high - angle) / _STOP_FADE)
-    return min(high, max(low, angle)), rate * min(1.0, room)
 
 
 class HangController:
@@ -144,22 +111,10 @@ class HangController:
     Attributes:
         guide: the virtual guide filter of this step, one of `guides`, which are the gentlest first.
         statistics: since `reset`.
-        telemetry, telemetry_fields: for the recording; angles in rad, stance 0 left and 1 right, phase t / T.
+        telemetry, telemetry_fields: for the recording, see `account.TELEMETRY`.
     """
 
-    telemetry_fields = (
-        ("q_des", len(JOINTS)),
-        ("error", 2),  # q - q_des of the swing leg's SH and SK
-        ("q_bound", 2),  # distance to the guide on the error's side
-        ("guide", 2),  # distances to the guide, upper and lower
-        ("h", 2),
-        ("lambda", 2),  # lambda + (1 - lambda) lambda_d
-        ("filter_active", 2),
-        ("step", 1),  # completed right-stance steps
-        ("phase", 1),
-        ("stance", 1),
-        ("assistance_factor", 1),  # Xi of this step
-    )
+    telemetry_fields = tuple((name, TELEMETRY[name].itemsize // 8) for name in TELEMETRY.names or ())
 
     def __init__(
         self,
@@ -177,8 +132,6 @@ class HangController:
         self._deadbeat = Deadbeat(gait.duration, config.alpha)
         self._gravity = Gravity(articulated)
         self._pid = Pid(config.gains)
-        self._feet, self._tibiae = flat_feet(exoskeleton), Tibiae(articulated)
-        self._ankle_low, self._ankle_high = robot.position_min.tolist(), robot.position_max.tolist()
 
         gaits = {RIGHT: gait, LEFT: gait.mirrored()}
         tables = {stance: step.tables() for stance, step in gaits.items()}
@@ -189,17 +142,19 @@ class HangController:
             rows = np.hstack([table.q, table.qd])
             rows[:, ankles] += config.ankle_offset
             self._nominal[stance] = rows
+        swinging = [self._nominal[RIGHT], self._nominal[LEFT]]  # left leg, right leg
+        self._feet = LevelFeet(robot, exoskeleton, articulated, self._deadbeat, swinging, config.ankle_offset)
         self._reference = {stance: rows.copy() for stance, rows in self._nominal.items()}
         time: Vector = np.arange(self._cycles + 1, dtype=np.float64) * PERIOD
         (c0, c1), (c0d, c1d), _ = self._deadbeat.basis(time)
         self._fading = int(np.searchsorted(time, self._deadbeat.end))
-        self._cubics = [values[: self._fading].tolist() for values in (c0, c1, c0d, c1d)]
         n = len(JOINTS)
         self._basis = np.zeros((2, self._fading, 2 * n))  # of s(0) and s'(0): added to the rows
         self._basis[0, :, :n], self._basis[0, :, n:] = c0[: self._fading, None], c0d[: self._fading, None]
         self._basis[1, :, :n], self._basis[1, :, n:] = c1[: self._fading, None], c1d[: self._fading, None]
 
         self._inertia = AssistedInertia(articulated, tables[RIGHT].q)
+        self._merge = Merge(config.friction, self._inertia, config.decoupled)
         feedforward = self._ideal_feedforward(gait) if config.feedforward else None
         self._uf: list[list[float]] | None = None
         if feedforward is not None:
@@ -229,9 +184,12 @@ class HangController:
         self._start_pose, self._start_row = np.zeros(n), np.zeros(2 * n)
         self._deviation, self._rate, self._added = np.zeros(2 * n), np.zeros(2 * n), np.zeros_like(self._basis)
         self._command = Command(self._pid.torque, np.zeros(len(MOTORS)))
-        self.telemetry = np.zeros(sum(length for _, length in self.telemetry_fields))
-        self._q_des_out = self.telemetry[:n]
-        self._tail = memoryview(self.telemetry[n:].data).cast("B")
+        self._told = np.zeros(1, TELEMETRY)
+        self.telemetry = self._told.view(np.float64)
+        self._tell, self._levels = compiled(tell), compiled(levels)
+        still, row = (0.0, 0.0), self._start_row
+        self._levels(0, still, (1.0, 1.0), 0.0, self._command.vibration)
+        self._tell(self._told, row, self.guide.joints, still, config.active, 0, 0.0, RIGHT, 1.0)
         self.statistics = HangStatistics()
         self._forget()
 
@@ -267,7 +225,6 @@ class HangController:
         self._command.vibration.fill(0.0)
         self._command.outside = False
         self.telemetry.fill(0.0)
-        self._flat_deviation = self._flat_rate = (0.0, 0.0)
         self.statistics = HangStatistics()
 
     def _guide_configs(self, robot: Robot, q: Vector) -> Iterator[GuideConfig]:
@@ -322,7 +279,7 @@ class HangController:
         row = self._reference[self._stance][cycle]
         leg = _LEG if self._stance == LEFT else 0  # first joint of the swing leg
         if self.config.flat_foot:
-            self._level_foot(state, row, cycle, leg)
+            self._feet.put(state, leg // _LEG, cycle, row)
         gravity = self._baseline(state, row)
         self._assist(state, row, cycle, leg, gravity)
         self._hand_over(cycle)
@@ -339,7 +296,7 @@ class HangController:
         row[n:] = way * (30.0 * x * x * (1.0 - x) ** 2 / duration) + speed * (x * x * (-12.0 + 28.0 * x - 15.0 * x * x))
         self._baseline(state, row)
         self._hand_over(cycle)
-        self._q_des_out[:] = row[:n]
+        self.telemetry[:n] = row[:n]
         return self._command
 
     def _change_step(self, state: State, stance: int) -> None:
@@ -371,45 +328,10 @@ class HangController:
         if exceeded and self.statistics.steps:
             self.statistics.hand_overs_exceeded += 1
         if config.flat_foot:
-            angles, speeds = self._flat_target(state, 0, leg)
-            q, qd = state.position, state.velocity
-            self._flat_deviation = (float(q[leg + _SA]) - angles[0], float(q[leg + _HA]) - angles[1])
-            self._flat_rate = (float(qd[leg + _SA]) - speeds[0], float(qd[leg + _HA]) - speeds[1])
+            self._feet.start_step(state, leg // _LEG)
+        if not self._carry:
+            self._last[:] = self._pid.torque
         self._carry = True
-
-    def _flat_target(self, state: State, cycle: int, leg: int) -> tuple[Pair, Pair]:
-        """Angles and speeds of SA and HA that hold the swing sole level, within the joints' limits.
-
-        Without the tibia's IMU its attitude comes from the joints and the pelvis IMU; without that one, too, the nominal holds.
-        """
-        low, high, imu, foot = self._ankle_low, self._ankle_high, _TIBIAE[leg > 0], self._feet[leg > 0]
-        rows = state.imu_rows
-        if not rows or state.age[rows[imu]] <= _IMU_AGE:
-            angles, speeds = foot.level(state.imu_quaternion[imu].tolist(), state.imu_gyro[imu].tolist())
-        elif state.age[rows[_PELVIS]] <= _IMU_AGE:
-            pelvis = state.imu_quaternion[_PELVIS].tolist(), state.imu_gyro[_PELVIS].tolist()
-            angles, speeds = foot.level(*self._tibiae.attitude(leg > 0, state.position, state.velocity, *pelvis))
-        else:
-            nominal = self._nominal[self._stance][cycle].tolist()
-            sa, ha, n = leg + _SA, leg + _HA, len(JOINTS)
-            return (nominal[sa], nominal[ha]), (nominal[n + sa], nominal[n + ha])
-        sagittal, henke = angles[0] + self.config.ankle_offset, angles[1]
-        sa, ha = leg + _SA, leg + _HA
-        sagittal, sagittal_rate = _within(sagittal, speeds[0], low[sa], high[sa])
-        henke, henke_rate = _within(henke, speeds[1], low[ha], high[ha])
-        return (sagittal, henke), (sagittal_rate, henke_rate)
-
-    def _level_foot(self, state: State, row: Vector, cycle: int, leg: int) -> None:
-        """Put the flat-foot targets, with their own deadbeat, in the place of the nominal ones."""
-        angles, speeds = self._flat_target(state, cycle, leg)
-        if cycle < self._fading:
-            c0, c1, c0d, c1d = (values[cycle] for values in self._cubics)
-            (d0, d1), (r0, r1) = self._flat_deviation, self._flat_rate
-            angles = (angles[0] + d0 * c0 + r0 * c1, angles[1] + d1 * c0 + r1 * c1)
-            speeds = (speeds[0] + d0 * c0d + r0 * c1d, speeds[1] + d1 * c0d + r1 * c1d)
-        n = len(JOINTS)
-        row[leg + _SA], row[leg + _HA] = angles
-        row[n + leg + _SA], row[n + leg + _HA] = speeds
 
     def _baseline(self, state: State, row: Vector) -> Vector:
         """u_t into the command: PID and the gravity of the empty exoskeleton. Returns u_g."""
@@ -420,48 +342,23 @@ class HangController:
 
     def _assist(self, state: State, row: Vector, cycle: int, leg: int, gravity: Vector) -> None:
         """Merge the assistive torque into the command of the swing leg's SH and SK; haptics, telemetry, statistics."""
-        hip, knee = leg + _SH, leg + _SK
-        q, qd, desired = state.position.tolist(), state.velocity.tolist(), row.tolist()
-        n = len(JOINTS)
-        e_hip, e_knee = q[hip] - desired[hip], q[knee] - desired[knee]
-        guide, w, config = self.guide, self._w, self.config
-        v_hip, v_knee = guide.tick(cycle, e_hip, qd[hip] - desired[n + hip], e_knee, qd[knee] - desired[n + knee])
+        hip, knee, n = leg + _SH, leg + _SK, len(JOINTS)
+        q, qd, guide, w = state.position, state.velocity, self.guide, self._w
+        errors = float(q[hip] - row[hip]), float(q[knee] - row[knee])
+        u = guide.tick(cycle, errors[0], float(qd[hip] - row[n + hip]), errors[1], float(qd[knee] - row[n + knee]))
         if w < 1.0:
             if self._uf is not None:
                 uf_hip, uf_knee = self._uf[cycle]
-                v_hip, v_knee = v_hip + uf_hip, v_knee + uf_knee
-            if config.decoupled:
-                v_hip, v_knee = self._inertia.torques(q[knee], qd[hip], qd[knee], (v_hip, v_knee))
-            friction, torque = config.friction, self._pid.torque
-            u_hip = float(gravity[hip]) + friction.torque(_SH, qd[hip]) + v_hip
-            u_knee = float(gravity[knee]) + friction.torque(_SK, qd[knee]) + v_knee
-            torque[hip] = w * float(torque[hip]) + (1.0 - w) * u_hip
-            torque[knee] = w * float(torque[knee]) + (1.0 - w) * u_knee
+                u = u[0] + uf_hip, u[1] + uf_knee
+            self._merge.merge(self._pid.torque, gravity, q, qd, leg, w, u)
 
-        upper, lower = guide.bounds
-        bounds = (upper if e_hip > 0.0 else lower, upper if e_knee > 0.0 else lower)
-        levels(leg > 0, (e_hip, e_knee), bounds, self._intensity, self._command.vibration)
-        g_hip, g_knee = guide.gates
-        acting = config.active
-        statistics = self.statistics
-        h_hip, h_knee = guide.h
-        self._command.outside = w < 1.0 and (h_hip < 0.0 or h_knee < 0.0)
-        if statistics.steps:
-            ratio = max(abs(e_hip) / bounds[0], abs(e_knee) / bounds[1])
-            statistics.cycles += 1
-            if ratio <= 1.0:
-                statistics.inside += 1
-            if ratio > statistics.max_ratio:
-                statistics.max_ratio = ratio
-            if g_hip > acting or g_knee > acting:
-                statistics.active += 1
-            if cycle == 0:
-                statistics.min_h_at_start = min(statistics.min_h_at_start, h_hip, h_knee)
-        self._q_des_out[:] = row[:n]
-        _TAIL.pack_into(
-            self._tail, 0, e_hip, e_knee, *bounds, upper, lower, h_hip, h_knee, g_hip, g_knee,
-            g_hip > acting, g_knee > acting, statistics.steps, cycle / self._cycles, self._stance, self._xi,
-        )  # fmt: skip
+        statistics, phase = self.statistics, cycle / self._cycles
+        bounds, ratio, h, acting = self._tell(
+            self._told, row, guide.joints, errors, self.config.active, statistics.steps, phase, self._stance, self._xi
+        )
+        statistics.count(cycle, ratio, h, acting)
+        self._command.outside = w < 1.0 and h < 0.0
+        self._levels(leg // _LEG, errors, bounds, self._intensity, self._command.vibration)
 
     def _hand_over(self, cycle: int) -> None:
         """Carry over what the torque would jump by at a change, and fade it out."""
@@ -471,4 +368,3 @@ class HangController:
             self._carry = False
         if cycle < len(self._blend):
             np.add(torque, self._carried * self._blend[cycle], out=torque)
-        self._last[:] = torque

@@ -185,7 +185,7 @@ def _joints(config: GuideConfig, first: int, stride: int) -> npt.NDArray[np.void
     joints["monotone"] = all(policy.monotone for policy in config.policies)
     joints["first"], joints["stride"] = first, stride
     joints["zeta"], joints["smoothing"] = config.zeta, PERIOD / (config.derivative_time + PERIOD)
-    joints["xi"], joints["h"] = math.nan, 1.0
+    joints["xi"], joints["h"], joints["upper"], joints["lower"] = math.nan, 1.0, math.inf, math.inf
     return joints
 
 

@@ -39,7 +39,8 @@ def levels(leg: int, errors: tuple[float, float], bounds: tuple[float, float], i
     Returns:
         `out`, each level in [0, 1].
     """
-    out.fill(0.0)
-    for front, error, bound in zip(_FRONT[leg], errors, bounds, strict=True):
-        out[front if error > 0.0 else front + 1] = min(1.0, abs(error) / bound * intensity)
+    out[:] = 0.0
+    for i in range(2):
+        front, share = _FRONT[leg][i], abs(errors[i]) / bounds[i]
+        out[front if errors[i] > 0.0 else front + 1] = min(1.0, share * intensity)
     return out

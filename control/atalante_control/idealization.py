@@ -21,10 +21,26 @@ import numpy.typing as npt
 import pinocchio
 
 from atalante_control.model import ArticulatedModel
+from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, LEG_JOINTS
 
 Vector = npt.NDArray[np.float64]
 Pair = tuple[float, float]
+
+_ASSISTED = (LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"))
+
+#: What the merge knows of the assisted joints, SH and SK.
+_LAW = np.dtype(
+    [
+        ("fit", np.float64, (3, 3)),
+        ("inertias", np.float64, 2),
+        ("decoupled", np.bool_),
+        ("coulomb", np.float64, 2),
+        ("viscous", np.float64, 2),
+        ("smoothing", np.float64),
+    ],
+    align=True,
+)
 
 
 @dataclass(frozen=True)
@@ -49,7 +65,7 @@ class Friction:
 
     def torque(self, joint: int, velocity: float) -> float:
         """Compensation k_d tanh(q' / v_s) + k_v q' [Nm] of one of `LEG_JOINTS` by index."""
-        return self.coulomb[joint] * math.tanh(velocity / self.smoothing) + self.viscous[joint] * velocity
+        return friction(velocity, self.coulomb[joint], self.viscous[joint], self.smoothing)
 
 
 class AssistedInertia:
@@ -60,6 +76,7 @@ class AssistedInertia:
 
     Attributes:
         inertias: J of SH and SK [kg m2], the largest diagonal of M along the swing.
+        fit: A, B, C of M11, of M12 and of M22, shape (3, 3) [kg m2].
     """
 
     def __init__(self, articulated: ArticulatedModel, swing: Vector) -> None:
@@ -84,15 +101,14 @@ class AssistedInertia:
             mass = upper + np.triu(upper, 1).T
             entries.append(mass[np.ix_(rows, rows)][[0, 0, 1], [0, 1, 1]])
         basis = np.stack([np.ones(3), np.cos(angles), np.sin(angles)], axis=1)
-        self._fit: list[list[float]] = np.linalg.solve(basis, np.array(entries)).T.tolist()
+        self.fit: Vector = np.linalg.solve(basis, np.array(entries)).T.copy()
         blocks = np.array([self.block(float(angle)) for angle in swing[:, knee]])
         self.inertias: Pair = (float(blocks[:, 0].max()), float(blocks[:, 2].max()))
 
     def block(self, knee: float) -> tuple[float, float, float]:
         """M11, M12, M22 [kg m2] at a knee angle [rad]; 1 is SH, 2 is SK."""
-        c, s = math.cos(knee), math.sin(knee)
-        (a11, b11, c11), (a12, b12, c12), (a22, b22, c22) = self._fit
-        return a11 + b11 * c + c11 * s, a12 + b12 * c + c12 * s, a22 + b22 * c + c22 * s
+        m11, m12, m22 = (self.fit[:, 0] + self.fit[:, 1] * math.cos(knee) + self.fit[:, 2] * math.sin(knee)).tolist()
+        return m11, m12, m22
 
     def torques(self, knee: float, hip_rate: float, knee_rate: float, u: Pair) -> Pair:
         """Torques of SH and SK [Nm] under which each moves as J q'' = u, while the leg's other joints rest.
@@ -104,18 +120,7 @@ class AssistedInertia:
             hip_rate, knee_rate: [rad/s].
             u: torques meant for the separate inertias `inertias` [Nm].
         """
-        c, s = math.cos(knee), math.sin(knee)
-        (a11, b11, c11), (a12, b12, c12), (a22, b22, c22) = self._fit
-        m12, m11_slope, m12_slope = a12 + b12 * c + c12 * s, c11 * c - b11 * s, c12 * c - b12 * s
-        hip_acceleration, knee_acceleration = u[0] / self.inertias[0], u[1] / self.inertias[1]
-        return (
-            (a11 + b11 * c + c11 * s) * hip_acceleration
-            + m12 * knee_acceleration
-            + (m11_slope * hip_rate + m12_slope * knee_rate) * knee_rate,
-            m12 * hip_acceleration
-            + (a22 + b22 * c + c22 * s) * knee_acceleration
-            - 0.5 * m11_slope * hip_rate * hip_rate,
-        )
+        return coupled(self.fit, self.inertias, knee, hip_rate, knee_rate, u)
 
     def ideal(self, knee: float, hip_rate: float, knee_rate: float, tau: Pair) -> Pair:
         """Inverse of `torques`: what real torques `tau` without gravity are to the separate inertias [Nm]."""
@@ -126,3 +131,65 @@ class AssistedInertia:
             self.inertias[0] * (m22 * r1 - m12 * r2) / determinant,
             self.inertias[1] * (m11 * r2 - m12 * r1) / determinant,
         )
+
+
+class Merge:
+    """Torques of the swing leg's SH and SK: w u_t + (1 - w) (u_i + u_f + u_v)."""
+
+    def __init__(self, friction: Friction, inertia: AssistedInertia, decoupled: bool) -> None:
+        """Take the parts of u_i.
+
+        Args:
+            decoupled: u_f + u_v are meant for the separate inertias and go through `AssistedInertia.torques`.
+        """
+        self._law = np.zeros(1, _LAW)
+        law = self._law[0]
+        law["fit"], law["inertias"], law["decoupled"] = inertia.fit, inertia.inertias, decoupled
+        law["coulomb"], law["viscous"] = ([row[i] for i in _ASSISTED] for row in (friction.coulomb, friction.viscous))
+        law["smoothing"] = friction.smoothing
+        self._merge = compiled(_merge)
+        nothing = np.zeros(len(JOINTS))
+        self.merge(nothing, nothing, nothing, nothing, 0, 0.0, (0.0, 0.0))
+
+    def merge(self, torque: Vector, gravity: Vector, q: Vector, qd: Vector, leg: int, w: float, u: Pair) -> None:
+        """Merge into u_t.
+
+        Args:
+            torque: u_t, shape (12,) [Nm]; those of SH and SK are overwritten.
+            gravity: u_g, shape (12,) [Nm].
+            q, qd: shape (12,) [rad], [rad/s].
+            leg: first joint of the swing leg.
+            w: share of the baseline in [0, 1).
+            u: u_f + u_v of SH and SK [Nm].
+        """
+        self._merge(self._law, torque, gravity, q, qd, leg, w, u)
+
+
+def _merge(
+    laws: npt.NDArray[np.void], torque: Vector, gravity: Vector, q: Vector, qd: Vector, leg: int, w: float, u: Pair
+) -> None:
+    law, hip, knee = laws[0], leg + _ASSISTED[0], leg + _ASSISTED[1]
+    if law["decoupled"]:
+        u = coupled(law["fit"], law["inertias"], q[knee], qd[hip], qd[knee], u)
+    for i in range(2):
+        joint = leg + _ASSISTED[i]
+        assisted = gravity[joint] + friction(qd[joint], law["coulomb"][i], law["viscous"][i], law["smoothing"]) + u[i]
+        torque[joint] = w * torque[joint] + (1.0 - w) * assisted
+
+
+def friction(velocity: float, coulomb: float, viscous: float, smoothing: float) -> float:
+    """Compensation k_d tanh(q' / v_s) + k_v q' [Nm]."""
+    return coulomb * math.tanh(velocity / smoothing) + viscous * velocity
+
+
+def coupled(fit: Vector, inertias: Vector | Pair, knee: float, hip_rate: float, knee_rate: float, u: Pair) -> Pair:
+    """As `AssistedInertia.torques`."""
+    c, s = math.cos(knee), math.sin(knee)
+    m11, m12 = fit[0, 0] + fit[0, 1] * c + fit[0, 2] * s, fit[1, 0] + fit[1, 1] * c + fit[1, 2] * s
+    m22 = fit[2, 0] + fit[2, 1] * c + fit[2, 2] * s
+    m11_slope, m12_slope = fit[0, 2] * c - fit[0, 1] * s, fit[1, 2] * c - fit[1, 1] * s
+    hip_acceleration, knee_acceleration = u[0] / inertias[0], u[1] / inertias[1]
+    return (
+        m11 * hip_acceleration + m12 * knee_acceleration + (m11_slope * hip_rate + m12_slope * knee_rate) * knee_rate,
+        m12 * hip_acceleration + m22 * knee_acceleration - 0.5 * m11_slope * hip_rate * hip_rate,
+    )
