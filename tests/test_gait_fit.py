@@ -123,6 +123,19 @@ def test_subjects_are_off_the_grid_and_the_same_for_a_seed() -> None:
     assert all(subject.patient.mass not in GRID.mass for subject in subjects)
 
 
+#: Options of a library of 81 gaits.
+SMALL = (
+    "--mass",
+    "60,70,80",
+    "--height",
+    "1.6,1.7,1.8",
+    "--step-length",
+    "0.1,0.15,0.2",
+    "--step-duration",
+    "0.8,0.9,1.0",
+)
+
+
 class TestCommand:
     """`atalante gait library`, `fit` and `check`, one after the other."""
 
@@ -158,12 +171,29 @@ class TestCommand:
             return replace(done, status="the swing clearance cannot hold") if subject.step_length == 0.2 else done
 
         monkeypatch.setattr(library_module, "solve_subject", fails)
-        result = self.run("library", "--out", str(tmp_path), "--step-length", "0.1,0.15,0.2", "--mass", "60,70,80",
-                          "--height", "1.6,1.7,1.8", "--step-duration", "0.8,0.9,1.0")  # fmt: skip
+        result = self.run("library", "--out", str(tmp_path), *SMALL)
         assert result.exit_code == 1
         assert result.stderr.count("failed: ") == 27
         assert "the swing clearance cannot hold" in result.stderr
         assert len(Library(tmp_path).failures()) == 27
+
+    @pytest.mark.parametrize(("ends", "code"), [(KeyboardInterrupt(), 130), (SystemExit(143), 143)])
+    def test_an_interrupted_library_says_how_far_it_is_and_goes_on(
+        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Any, ends: BaseException, code: int
+    ) -> None:
+        def one_and_no_more(subject: Subject) -> SolvedGait:
+            if any(tmp_path.glob("gaits/*.json")):
+                raise ends
+            return drawn(subject)
+
+        monkeypatch.setattr(library_module, "solve_subject", one_and_no_more)
+        small = ("library", "--out", str(tmp_path), *SMALL)
+        result = self.run(*small)
+        assert result.exit_code == code
+        assert result.stderr.splitlines()[-1] == "interrupted, 1 of 81 gaits solved; the same command goes on"
+        monkeypatch.setattr(library_module, "solve_subject", drawn)
+        assert self.run(*small).exit_code == 0
+        assert len(list(tmp_path.glob("gaits/*.json"))) == 81
 
     @pytest.mark.parametrize(
         ("arguments", "sentence"),

@@ -59,6 +59,7 @@ KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_hal.telemetry.process", "TelemetryError", Failed),
     ("atalante_hal.telemetry.ring", "RingError", Failed),
     ("atalante_hal.telemetry.sink", "SinkError", Failed),
+    ("atalante_control.fan_out", "FanOutError", Failed),
     ("atalante_control.gait", "GaitError", Failed),
     ("atalante_control.gait_network", "NetworkError", Failed),
     ("atalante_control.generation.library", "LibraryError", Failed),

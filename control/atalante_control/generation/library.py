@@ -8,15 +8,14 @@ all the same is what the fit shows.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
-import joblib
-
+from atalante_control.fan_out import fan_out
 from atalante_control.gait import Gait, load_gait, write_gait
 from atalante_control.generation.solve import solve
 from atalante_control.generation.solved import SolvedGait
@@ -134,24 +133,20 @@ class Library:
 
     def generate(
         self, solve: Solve, *, jobs: int = 1, cluster: str | None = None
-    ) -> Iterator[tuple[Subject, SolvedGait]]:
+    ) -> Generator[tuple[Subject, SolvedGait], None, None]:
         """Solve what is missing, and tell of each point once it is on the disk.
 
         Args:
             jobs: processes on this machine.
             cluster: address of a dask scheduler whose workers solve instead.
-        """
-        with ExitStack() as stack:
-            if cluster is not None:
-                from distributed import Client
 
-                stack.enter_context(Client(cluster))  # type: ignore[no-untyped-call]
-                stack.enter_context(joblib.parallel_config(backend="dask"))
-            parallel = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
-            tasks = (joblib.delayed(_solve)(solve, index, self.grid.subject(index)) for index in self.missing())
-            for index, solved in parallel(tasks):
-                self._keep(index, solved)
-                yield self.grid.subject(index), solved
+        Raises:
+            FanOutError: they cannot, see `fan_out`.
+        """
+        tasks = [(index, self.grid.subject(index)) for index in self.missing()]
+        for index, solved in fan_out(partial(_solve, solve), tasks, jobs=jobs, cluster=cluster):
+            self._keep(index, solved)
+            yield self.grid.subject(index), solved
 
     def _path(self, kind: str, index: Index) -> Path:
         levels = (axis[i] for axis, i in zip(self.grid.axes(), index, strict=True))
@@ -192,7 +187,8 @@ def verified(subject: Subject, solved: SolvedGait) -> SolvedGait:
     return solved
 
 
-def _solve(solve: Solve, index: Index, subject: Subject) -> tuple[Index, SolvedGait]:
+def _solve(solve: Solve, task: tuple[Index, Subject]) -> tuple[Index, SolvedGait]:
+    index, subject = task
     return index, solve(subject)
 
 

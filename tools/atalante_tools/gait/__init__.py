@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import closing
 from pathlib import Path
 
 import click
@@ -83,12 +84,18 @@ def library(
     say(f"{points} gaits in {out}, {points - todo} of them solved before")
     progress, began = Progress(), time.monotonic()
     solve = solve_compiled if machine_code else solve_subject
-    for done, (_, solved) in enumerate(collection.generate(solve, jobs=jobs, cluster=cluster), 1):
-        if as_json:
-            show_json({**solved.gait.parameters, **solved.gait.solver})
-        if progress.due():
-            left = (time.monotonic() - began) / done * (todo - done)
-            progress.show(f"{_bar(done / todo)} {done}/{todo} gaits, {_minutes(left)} left")
+    try:
+        with closing(collection.generate(solve, jobs=jobs, cluster=cluster)) as outcomes:
+            for done, (_, solved) in enumerate(outcomes, 1):
+                if as_json:
+                    show_json({**solved.gait.parameters, **solved.gait.solver})
+                if progress.due():
+                    left = (time.monotonic() - began) / done * (todo - done)
+                    progress.show(f"{_bar(done / todo)} {done}/{todo} gaits, {_minutes(left)} left")
+    except (KeyboardInterrupt, SystemExit):  # Ctrl-C, SIGTERM
+        progress.clear()
+        say(f"interrupted, {points - len(collection.missing())} of {points} gaits solved; the same command goes on")
+        raise
     progress.clear()
     failures = collection.failures()
     for index, status in failures.items():
