@@ -34,7 +34,7 @@ from atalante_emulator.pendant import Operator, PendantNode
 from atalante_hal.bus import Bus, BusFull
 from atalante_hal.codec import Codec
 from atalante_hal.e2e import Check
-from atalante_hal.frame import Frames, as_words, new_frames
+from atalante_hal.frame import FRAME_BYTES, Frames, new_frames
 from atalante_hal.image import ReceiveImage, TransmitImage
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, SIDES, Robot
 
@@ -153,7 +153,7 @@ class Emulator:
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
         self._answered = self._shares  # shares of the last imperfect cycle
         batch = new_frames(_BATCH)
-        self._batch = as_words(batch)
+        self._batch = batch.view(np.uint8).data
         self._batch_up_to = [batch[:count] for count in range(_BATCH + 1)]
 
     def _bind_commands(self) -> None:
@@ -303,11 +303,9 @@ class Emulator:
             self.frames_lost += len(frames) - error.sent
 
     def _gather(self, parts: Sequence[Frames]) -> Frames:
-        end = 0
-        for part in parts:
-            begin, end = end, end + len(part)
-            self._batch[begin:end] = as_words(part)
-        return self._batch_up_to[end]
+        octets = b"".join([part.tobytes() for part in parts])
+        self._batch[: len(octets)] = octets
+        return self._batch_up_to[len(octets) // FRAME_BYTES]
 
     # -- one cycle ---------------------------------------------------------------------------------------------------
 
