@@ -8,6 +8,7 @@ from contextlib import contextmanager
 import pytest
 from click.testing import CliRunner, Result
 
+from atalante_control.model import ExoskeletonParameters, Patient, urdf
 from atalante_dbc import Network
 from atalante_hal.bus import BusDown
 from atalante_hal.bus.pair import PairBus, lockstep_pair
@@ -15,6 +16,7 @@ from atalante_hal.frame import Frames, new_frames
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
 from atalante_hal.types import SupervisorState
+from atalante_tools import body as body_module
 from atalante_tools import emulator as emulator_module
 from atalante_tools import rig as rig_module
 from atalante_tools.cli import cli
@@ -82,6 +84,22 @@ def test_without_an_operator_the_pendant_is_somebody_elses(
     assert other.hal.state.supervisor is SupervisorState.READY
 
 
+def test_its_legs_are_those_of_the_patient_the_other_side_walks_for(
+    network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bodies: list[str] = []
+    open_described = body_module.open_described
+    monkeypatch.setattr(
+        body_module, "open_described", lambda text, pose: (bodies.append(text), open_described(text))[1]
+    )
+    for arguments in ((), ("--mass", "75", "--height", "175")):
+        result = OtherProcess(network, robot, 5, monkeypatch).run(*arguments)
+        assert result.exit_code == 130, result.stderr
+    exoskeleton = ExoskeletonParameters()
+    assert bodies == [urdf(exoskeleton, robot), urdf(exoskeleton.fitted(Patient(75.0, 1.75)), robot)]
+    assert "atalante hang -i virtual -c test --mass 75 --height 1.75\n" in result.stderr
+
+
 def test_one_seed_is_one_robot(network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     def measured(seed: str) -> bytes:
         other = OtherProcess(network, robot, 50, monkeypatch)
@@ -110,6 +128,7 @@ def test_the_status_line_counts_cycles_frames_and_drives(
     [
         (["-i", "virtual", "-c", "x", "--no-operator", "--xi", "0.5"], "--xi is what the operator sets"),
         (["-i", "virtual", "-c", "x", "--xi", "2"], "2.0 is not in the range"),
+        (["-i", "virtual", "-c", "x", "--mass", "75"], "a patient needs --mass and --height"),
         (["-i", "embedded"], "this needs a bus that other processes are on"),
         ([], "socketcan needs a channel: -c vcan0"),
     ],

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from atalante_tools.options import Target, target_options
+from atalante_tools.options import Target, patient_options, target_options
 from atalante_tools.signals import StopRequest, stop_requested
 from atalante_tools.terminal import Progress, say
 
 if TYPE_CHECKING:
+    from atalante_control.model import Patient
     from atalante_emulator.emulator import Emulator
     from atalante_tools.emulator_line import Line
 
@@ -32,23 +33,33 @@ LOOK_UP: Final = 0.1
     help="Hold the pendant too and press START when the HAL is ready; otherwise that is `atalante pendant`.",
 )
 @click.option("--xi", type=click.FloatRange(0.0, 1.0), help="Assistance factor the operator sets, 0 to 1.")
-def command(target: Target, seed: int, operator: bool, xi: float | None) -> None:
+@patient_options(legs=False)
+def command(target: Target, seed: int, operator: bool, xi: float | None, patient: Patient | None) -> None:
     """Be the robot on a bus: drives, IMUs, feet, motors and, unless told otherwise, the operator's pendant.
 
     With --wall a millisecond is a millisecond, HAL or not; with --lockstep time goes on with each SYNC alone.
 
+    With --mass and --height its legs are as long as that patient needs them, as `atalante hang` with the same two expects.
+    Nobody is in it: it hangs in the air and weighs what it weighs empty.
+
     \b
     Example: atalante emulator -i socketcan -c vcan0
+             atalante emulator -i socketcan -c vcan0 --mass 75 --height 175
     """
     if xi is not None and not operator:
         raise click.UsageError("--xi is what the operator sets: leave --no-operator out, or use `atalante pendant xi`")
     import atalante_dbc
+    from atalante_control.model import ExoskeletonParameters
     from atalante_hal.robot import load_robot
     from atalante_tools.body import open_body
     from atalante_tools.rig import join, open_buses
 
-    network, robot = atalante_dbc.load(), load_robot()
-    with stop_requested() as stop, open_body(robot) as body:
+    network, robot, exoskeleton = atalante_dbc.load(), load_robot(), ExoskeletonParameters()
+    other_side = f"atalante hang {target.arguments}"
+    if patient is not None:
+        exoskeleton = exoskeleton.fitted(patient)
+        other_side += f" --mass {patient.mass:g} --height {patient.height:g}"
+    with stop_requested() as stop, open_body(robot, exoskeleton=exoskeleton) as body:
         from atalante_emulator.emulator import Emulator
         from atalante_emulator.pendant import Operator
         from atalante_tools.emulator_line import Line
@@ -57,7 +68,7 @@ def command(target: Target, seed: int, operator: bool, xi: float | None) -> None
         try:
             pendant = Operator(xi) if operator else None
             emulator = Emulator(network, robot, body, bus, seed=seed, operator=pendant)
-            say(f"the robot is on {target}; now, in another terminal: atalante hang {target.arguments}")
+            say(f"the robot is on {target}; now, in another terminal: {other_side}")
             if not operator:
                 say(f"its operator is you: atalante pendant start {target.arguments}")
             answer(emulator, target, over(stop, emulator, bus))
