@@ -118,8 +118,9 @@ class Drives:
         Args:
             fresh: per leg, whether a valid new command came since the last cycle.
             controlword: shape (12,), `Controlword` values.
-            target: shape (12,) [Nm at the joint]; read again in every `drive` until the next command, as is
-            limit: shape (12,) [Nm], the HAL's MaxTorque; the drive's own limit holds anyway.
+            target: shape (12,) [Nm at the joint].
+            limit: shape (12,) [Nm], the HAL's MaxTorque; the drive's own limit holds anyway. Both are read again in every
+                `drive` until the next command.
         """
         missed = self.missed
         for leg in (0, 1):

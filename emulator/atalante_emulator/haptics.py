@@ -25,7 +25,7 @@ class HapticsParameters:
 
 
 def _follow(amplitude: Vector, level: Vector, keep: float, gain: float) -> None:
-    """Shape (8,) each."""
+    """One step of the first-order lag. Shape (8,) each."""
     for i in range(len(amplitude)):
         amplitude[i] = keep * amplitude[i] + gain * level[i]
 
