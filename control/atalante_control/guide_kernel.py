@@ -1,9 +1,8 @@
 """A cycle of the virtual guide filter: `e, e' of a joint, tables of the step -> h -> lambda -> u_v`, as machine code.
 
 `GuideFilter` prepares the tables and runs `tick` compiled. The flow of the backup policy is linear as long as the drive
-gives the torque it asks for (`_linear`). Where it does not, the torque is constant and the error a known drift plus a
-parabola: the cycle at which the drive comes off its limit is found, with the largest error until then, and from there on
-the flow is linear again (`limited`). A rollout that saturates a second time goes on cycle by cycle.
+gives the torque it asks for (`_linear`). Where it does not, the rollout goes cycle by cycle (`limited`): the torque is constant
+and the error a known drift plus a parabola, until the drive comes off its limit and the flow is linear for the rest.
 
 Everything is of one joint here: its row of JOINT; `flow`, one row a cycle ahead, shape (horizon + 1, 9); and `step`, one
 row a cycle since the step change, shape (horizon + 1, 6).
@@ -52,7 +51,6 @@ ERROR, ERROR_ADDED, TORQUE, TORQUE_ADDED, STEADY = 0, 2, 4, 6, 8
 P, DRIFT, BOUND = 0, 2, 4
 
 _HOPELESS = 2.0  # |e| / q_bound from which a rollout is left: lambda is 1 from 1 on
-_TRIALS = 12  # for the cycle at which the drive comes off its limit
 
 
 def tick(
@@ -158,86 +156,25 @@ def limited(joint: Any, flow: Vector, step: Vector, side: int, cycle: int, e: fl
     sign, external = (-1.0, joint["down"]) if side else (1.0, joint["up"])
     limit, horizon, start, worst, linear = joint["counted"], len(step) - 1, cycle, 0.0, False
     while cycle < horizon and worst < _HOPELESS:
-        u = -joint["kp"] * e - joint["kd"] * ed
+        u, now, then = -joint["kp"] * e - joint["kd"] * ed, step[cycle], step[cycle + 1]
         if -limit <= u <= limit:
             if not linear:
                 ratios, torques = _linear(joint, flow, step, cycle, e, ed)
                 if torques[side] <= 1.0:
                     return max(worst, ratios[side])
             linear = True
-            y, yd = e - step[cycle, P], ed - step[cycle, P + 1]
-            cycle += 1
-            e = step[cycle, P] + joint["phi11"] * y + joint["phi12"] * yd + joint["s1"] * external
-            ed = step[cycle, P + 1] + joint["phi21"] * y + joint["phi22"] * yd + joint["s2"] * external
+            y, yd = e - now[P], ed - now[P + 1]
+            e = then[P] + joint["phi11"] * y + joint["phi12"] * yd + joint["s1"] * external
+            ed = then[P + 1] + joint["phi21"] * y + joint["phi22"] * yd + joint["s2"] * external
         else:
             linear = False
-            e, ed, cycle, peak = _off_limit(joint, step, side, cycle, e, ed, math.copysign(limit, u) + external)
-            worst = max(worst, peak)
+            gained = (math.copysign(limit, u) + external) / joint["inertia"] * PERIOD
+            y, yd = e - now[DRIFT], ed - now[DRIFT + 1]
+            e = then[DRIFT] + y + (yd + 0.5 * gained) * PERIOD
+            ed = then[DRIFT + 1] + yd + gained
+        cycle += 1
         # What the worst disturbance adds to a constant extreme: nothing in a monotone loop.
         ahead = flow[cycle - start]
         allowance = ahead[ERROR_ADDED + side] - sign * external * ahead[STEADY]
-        worst = max(worst, (sign * e + allowance) / step[cycle, BOUND + side])
+        worst = max(worst, (sign * e + allowance) / then[BOUND + side])
     return worst
-
-
-def _off_limit(
-    joint: Any, step: Vector, side: int, cycle: int, e: float, ed: float, force: float
-) -> tuple[float, float, int, float]:
-    """The cycle at which a saturated rollout comes off the limit, by false position on the excess torque.
-
-    Args:
-        force: torque until then, limit and disturbance together [Nm].
-
-    Returns:
-        e, e', cycle there, and the largest ratio where the error turns in between (0: it does not).
-    """
-    limit, a = joint["counted"], force / joint["inertia"]
-    e0, ed0 = e - step[cycle, DRIFT], ed - step[cycle, DRIFT + 1]
-    way = 1.0 if _asked(joint, e, ed) > 0.0 else -1.0
-    # g, what is asked for beyond the limit: g > 0 at `inner`, still saturated; g <= 0 at `outer`, off the limit.
-    inner, g, last = 0, way * _asked(joint, e, ed) - limit, len(step) - 1 - cycle
-    outer, g_outer = 0, 0.0
-    then, rate = _pushed(step, cycle, e0, ed0, a, 1)
-    slope = g - (way * _asked(joint, then, rate) - limit)
-    reach = 4 * joint["stride"]
-    for trial in range(_TRIALS):
-        if outer:
-            # False position, and halving now and then: g bends where the error turns.
-            part = g / (g - g_outer) if trial % 3 else 0.5
-            n = inner + min(max(1, round((outer - inner) * part)), outer - inner - 1)
-        else:
-            n = min(last, inner + (math.ceil(g / slope) if slope * reach > g else reach))
-        then, rate = _pushed(step, cycle, e0, ed0, a, n)
-        more = way * _asked(joint, then, rate) - limit
-        if more <= 0.0:
-            outer, g_outer = n, more
-        else:
-            slope, inner, g = (g - more) / (n - inner), n, more
-        if inner == last or outer - inner == 1:
-            break
-    end = outer if outer else inner
-    found, rate_found = _pushed(step, cycle, e0, ed0, a, end)
-
-    peak, sign = 0.0, -1.0 if side else 1.0
-    if sign * ed > 0.0 > sign * rate_found:
-        # Where e' is zero, by false position: the maximum is flat, twice is enough.
-        left, right, rate_left, rate_right = 0, end, ed, rate_found
-        for _ in range(2):
-            turn = left + round((right - left) * rate_left / (rate_left - rate_right))
-            then, rate = _pushed(step, cycle, e0, ed0, a, turn)
-            peak = max(peak, sign * then / step[cycle + turn, BOUND + side])
-            if sign * rate > 0.0:
-                left, rate_left = turn, rate
-            else:
-                right, rate_right = turn, rate
-    return found, rate_found, cycle + end, peak
-
-
-def _asked(joint: Any, e: float, ed: float) -> float:
-    return float(joint["kp"] * e + joint["kd"] * ed)
-
-
-def _pushed(step: Vector, cycle: int, e: float, ed: float, a: float, n: int) -> Pair:
-    """e, e' after n cycles under a constant acceleration a [rad/s2], from e, e' beside the drift."""
-    tau, drift = n * PERIOD, step[cycle + n]
-    return e + ed * tau + 0.5 * a * tau * tau + drift[DRIFT], ed + a * tau + drift[DRIFT + 1]
