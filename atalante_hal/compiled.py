@@ -52,14 +52,20 @@ def _compiled(function: FunctionType) -> Any:
 
 def _twin(function: FunctionType) -> FunctionType:
     """A copy of the function whose callees are compiled ones."""
-    import numba
-
     names = {name: value for name, value in function.__globals__.items() if name != function.__name__}
     for name, callee in _callees(function):
-        names[name] = numba.njit(boundscheck=True)(_twin(callee))
+        names[name] = _callee(callee)
     twin = FunctionType(function.__code__, names, function.__name__, function.__defaults__)
     twin.__module__, twin.__qualname__ = function.__module__, function.__qualname__
     return twin
+
+
+@cache
+def _callee(function: FunctionType) -> Any:
+    """A compiled callee, one for all its callers."""
+    import numba
+
+    return numba.njit(boundscheck=True)(_twin(function))
 
 
 def _names(code: CodeType) -> Iterator[str]:
