@@ -65,7 +65,9 @@ def test_heading_does_not_matter(heading: float, pitch: float):
 def test_an_upright_tibia_needs_nothing_and_a_pitched_one_its_pitch():
     np.testing.assert_allclose(level(LEFT.geometry, (1.0, 0.0, 0.0, 0.0), STILL)[0], (0.0, 0.0), atol=1e-15)
     straight = FlatFoot(0.0, (0.788, 0.0, 0.616))
-    np.testing.assert_allclose(level(straight.geometry, quaternion(tibia(0.0, 0.0, 0.3)), STILL)[0], (-0.3, 0.0), atol=1e-12)
+    np.testing.assert_allclose(
+        level(straight.geometry, quaternion(tibia(0.0, 0.0, 0.3)), STILL)[0], (-0.3, 0.0), atol=1e-12
+    )
 
 
 def test_left_and_right_are_mirror_images():
@@ -87,7 +89,9 @@ def test_rates_are_those_of_the_angles(heading: float, roll: float, pitch: float
     later, before = (shank @ rotation_vector(np.array(gyro) * s) for s in (step, -step))
     for foot in (LEFT, RIGHT):
         ahead, behind = (np.array(level(foot.geometry, quaternion(m), STILL)[0]) for m in (later, before))
-        np.testing.assert_allclose(level(foot.geometry, quaternion(shank), gyro)[1], (ahead - behind) / (2 * step), atol=1e-6)
+        np.testing.assert_allclose(
+            level(foot.geometry, quaternion(shank), gyro)[1], (ahead - behind) / (2 * step), atol=1e-6
+        )
 
 
 def test_refuses_an_axis_it_has_no_solution_for():
