@@ -91,6 +91,7 @@ class Hal:
             network, "HAL", bus, tap, cyclic=len(self.messages), surplus=robot.thresholds.surplus_frames
         )
         self._limiter = Limiter(robot, PERIOD)
+        self.state.torque_sent = self._limiter.last
         self._commands = Commands(network, self._transceiver, self._parts, self._limiter.limit)
         self._status = StatusReport(network, self._transceiver, robot.hash32, gait_hash)
         self._steady = False  # a perfect cycle would change nothing

@@ -52,6 +52,7 @@ class State:
     age: npt.NDArray[np.int64]  # (messages,) cycles between the SYNC the data answers and the last one
     joints_valid: bool  # all twelve joint states are fresh
     imu_rows: tuple[int, ...] = ()  # places of the IMUs' messages in `valid` and `age`; empty: their age is not known
+    torque_sent: Vector | None = None  # (12,) Nm, what the limits left of the last command; None: it is not known
 
 
 @dataclass(slots=True)

@@ -141,6 +141,25 @@ def test_a_step_takes_the_gentlest_gains_that_are_certified_with_a_margin(shape:
     assert [controller.certificate(xi).certified for xi in (0.5, 0.93)] == stiffest
 
 
+def test_a_joint_whose_torque_is_cut_winds_no_integral_up():
+    controllers = hang(), hang()
+    joint, commands = JOINTS.index("right_FH"), []
+    for controller, cut in zip(controllers, (0.0, 1.0), strict=True):
+        state = blank_state(1.0)
+        state.position[:] = START
+        state.torque_sent = np.zeros(12)
+        controller.reset(state)
+        for _ in range(STARTUP // 2):
+            state.cycle += 1
+            torque = controller.update(state).torque
+            state.torque_sent[:] = torque
+            state.torque_sent[joint] -= math.copysign(cut, controller.telemetry[joint] - START[joint])  # q_des - q
+        commands.append(torque.copy())
+    free, limited = commands
+    assert abs(free[joint]) > abs(limited[joint]) + 1e-3
+    assert np.array_equal(np.delete(free, joint), np.delete(limited, joint))
+
+
 @pytest.mark.parametrize("shape", CERTIFIED)
 def test_a_certified_guide_is_kept_by_the_coupled_leg(shape: str):
     controller = hang(shape)

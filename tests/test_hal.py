@@ -315,6 +315,18 @@ def test_a_torque_that_is_cut_for_long_leads_the_assistance_factor_to_one(make_r
     assert hal.reason == "the limiter cuts the torque"
 
 
+def test_a_controller_is_told_what_the_limits_left_of_its_last_command(rig):
+    rig.until(S.ACTIVE)
+    state = rig.hal.read()
+    asked = state.torque_sent + 1e3
+    rig.hal.write(Command(asked, np.zeros(8)))
+    assert (rig.hal.read().torque_sent < asked).all()
+    assert np.array_equal(state.torque_sent, rig.hal._limiter.last)
+    little = state.torque_sent - 0.1
+    rig.hal.write(Command(little, np.zeros(8)))
+    assert rig.hal.read().torque_sent.tobytes() == little.tobytes()
+
+
 def into_full_assist(rig):
     rig.until(S.ACTIVE)
     rig.hal._report(Dtc.FOOT_CELL, "a cell is stuck")

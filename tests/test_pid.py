@@ -60,6 +60,30 @@ def test_integral_does_not_wind_up_past_its_limit():
     assert cycles <= GAINS.integral_limit / slowest + 1
 
 
+@pytest.mark.parametrize("cut", [2.0, -2.0])
+@pytest.mark.parametrize("error", [0.01, -0.01])
+def test_a_torque_that_was_cut_grows_no_integral_in_the_direction_it_was_cut_in(cut: float, error: float):
+    pid, zero, row = Pid(GAINS), np.zeros(12), desired(np.full(12, error), np.zeros(12))
+    before = pid.update(row, zero, zero).copy()
+    sent = before.copy()
+    sent[3] -= cut
+    after = pid.update(row, zero, zero, sent)
+    step = error * np.array([*GAINS.swing.ki, *GAINS.stance.ki]) * 1e-3
+    step[3] *= cut * error < 0.0
+    np.testing.assert_allclose(after - before, step, rtol=1e-9, atol=1e-15)
+    assert after[3] == before[3] or cut * error < 0.0
+
+
+def test_a_torque_that_left_as_it_was_asked_for_changes_nothing_to_the_last_bit():
+    one, other = Pid(GAINS), Pid(GAINS)
+    for _ in range(100):
+        q_des, qd_des, q, qd = RNG.normal(size=(4, 12))
+        row = desired(q_des, qd_des)
+        for pid in (one, other):
+            pid.torque += 3.0  # gravity
+        assert one.update(row, q, qd).tobytes() == other.update(row, q, qd, other.torque.copy()).tobytes()
+
+
 def test_a_joint_with_no_share_does_not_integrate():
     pid, share = Pid(GAINS), np.ones(12)
     share[2] = 0.0

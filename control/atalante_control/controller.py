@@ -214,6 +214,8 @@ class HangController:
         self._changed_at = state.cycle
         self._start_pose[:] = state.position
         self._last[:] = state.torque
+        if state.torque_sent is not None:
+            self._pid.torque[:] = state.torque_sent
         self._carry = True
 
     def _forget(self) -> None:
@@ -336,7 +338,7 @@ class HangController:
     def _baseline(self, state: State, row: Vector) -> Vector:
         """u_t into the command: PID and the gravity of the empty exoskeleton. Returns u_g."""
         gravity = self._gravity.torque(state.position, state.imu_quaternion[_PELVIS].tolist())
-        torque = self._pid.update(row, state.position, state.velocity)
+        torque = self._pid.update(row, state.position, state.velocity, state.torque_sent)
         np.add(torque, gravity, out=torque)
         return gravity
 

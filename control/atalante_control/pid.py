@@ -1,7 +1,8 @@
 """Joint PID of the baseline controller: `q_des, q_des' and measured q, q' -> tracking torque u_t` of twelve joints.
 
-Each leg has the gains of its role, stance or swing. The integral is a torque with a small limit of its own, so that it
-cannot wind up; a joint led by the virtual guide integrates only as far as the baseline acts on it.
+Each leg has the gains of its role, stance or swing. The integral is a torque with a small limit of its own, and that of a joint
+whose torque was cut grows no further in the direction it was cut in, so that it cannot wind up; a joint led by the virtual guide
+integrates only as far as the baseline acts on it.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ class Pid:
     """The twelve PIDs. Call `start_step` at each step change, then `update` once a cycle.
 
     Attributes:
-        torque: last result, shape (12,) [Nm], overwritten by the next `update`.
+        torque: last result, shape (12,) [Nm], overwritten by the next `update`; whoever asks for more than this adds it in place.
     """
 
     def __init__(self, gains: PidGains) -> None:
@@ -108,26 +109,30 @@ class Pid:
         self._gains = self._gains_of[stance].copy()
         self._gains[2] *= share
 
-    def update(self, desired: Vector, q: Vector, qd: Vector) -> Vector:
+    def update(self, desired: Vector, q: Vector, qd: Vector, sent: Vector | None = None) -> Vector:
         """u_t of one cycle.
 
         Args:
             desired: q_des [rad], then q_des' [rad/s], shape (24,).
             q: shape (12,) [rad].
             qd: shape (12,) [rad/s].
+            sent: what the limits left of `torque` as it is now, shape (12,) [Nm]; None: all of it.
 
         Returns:
             `torque`.
         """
-        self._kernel(desired, q, qd, self._gains, self._limit, self._integral, self.torque)
+        sent = self.torque if sent is None else sent
+        self._kernel(desired, q, qd, self._gains, self._limit, sent, self._integral, self.torque)
         return self.torque
 
 
 def _update(
-    desired: Vector, q: Vector, qd: Vector, gains: Vector, limit: float, integral: Vector, torque: Vector
+    desired: Vector, q: Vector, qd: Vector, gains: Vector, limit: float, sent: Vector, integral: Vector, torque: Vector
 ) -> None:
     n = len(q)
     for joint in range(n):
         error, rate = desired[joint] - q[joint], desired[n + joint] - qd[joint]
-        integral[joint] = min(max(integral[joint] + error * gains[2, joint], -limit), limit)
+        growth = error * gains[2, joint]
+        if (torque[joint] - sent[joint]) * growth <= 0.0:
+            integral[joint] = min(max(integral[joint] + growth, -limit), limit)
         torque[joint] = error * gains[0, joint] + rate * gains[1, joint] + integral[joint]
