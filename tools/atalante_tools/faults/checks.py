@@ -6,6 +6,7 @@ import math
 from typing import Final
 
 from atalante_hal.cia402 import DriveState
+from atalante_hal.diagnostics import Dtc
 from atalante_hal.robot import JOINTS, LEG_JOINTS
 from atalante_hal.types import SupervisorState
 from atalante_tools.faults.observation import Observation
@@ -41,6 +42,18 @@ def not_enabled_in_motion(seen: Observation) -> str | None:
     """The left knee's drive, once off, stays off until the operator starts again."""
     enabled = seen.drive_state[seen.first : seen.quiet, _KNEE] == DriveState.OPERATION_ENABLED
     return f"the drive was enabled in cycle {seen.first + 1 + int(enabled.argmax())}" if enabled.any() else None
+
+
+def drives_notice_two_senders(seen: Observation) -> str | None:
+    """Not the HAL alone: a drive of the left leg tells that it hears two sources of commands."""
+    told = [event.node for event in seen.events if event.code == Dtc.HAL_DUPLICATE and event.node.startswith("LEFT_")]
+    return None if told else "no drive of the left leg told that it hears two sources of commands"
+
+
+def full_queue_is_confirmed(seen: Observation) -> str | None:
+    """The full queue itself is a reason to hold, and not only the silence that follows from it."""
+    loud = any(event.code == Dtc.BUS_TX_FULL and event.severity == Dtc.BUS_TX_FULL.severity for event in seen.events)
+    return None if loud else "the full queue was noticed and never confirmed"
 
 
 def left_leg_holds_by_itself(seen: Observation) -> str | None:

@@ -150,7 +150,7 @@ SCENARIOS: Final = (
             Case(
                 "battery removed",
                 (Fault("battery_removed", "battery", 0, 300),),
-                dtc="SUPPLY_LOW|UNDER_VOLTAGE",
+                dtc="SUPPLY_LOW",
                 noticed=150,
                 reacted=200,
             ),

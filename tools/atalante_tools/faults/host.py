@@ -6,6 +6,7 @@ import math
 from typing import Final
 
 from atalante_hal.types import SupervisorState
+from atalante_tools.faults.checks import full_queue_is_confirmed
 from atalante_tools.faults.scenario import Case, Host, Scenario
 
 _ACTIVE: Final = SupervisorState.ACTIVE
@@ -34,8 +35,8 @@ SCENARIOS: Final = (
         "F17",
         (
             Case("for 1 cycle", (Host("bus_full", 0, 1),), state=_ACTIVE),
-            Case("for 5 cycles", (Host("bus_full", 0, 5),)),
-            Case("for 200 cycles", (Host("bus_full", 0, 200),)),
+            Case("for 5 cycles", (Host("bus_full", 0, 5),), checks=(full_queue_is_confirmed,)),
+            Case("for 200 cycles", (Host("bus_full", 0, 200),), checks=(full_queue_is_confirmed,)),
         ),
         lasting=Case("full", (Host("bus_full", 0, None),)),
     ),

@@ -5,9 +5,14 @@ from __future__ import annotations
 from typing import Final
 
 from atalante_emulator.faults import Fault
-from atalante_hal.robot import JOINTS
+from atalante_hal.robot import CELLS, JOINTS
 from atalante_hal.types import SupervisorState
-from atalante_tools.faults.checks import data_stays_fresh, guide_kept, left_leg_holds_by_itself
+from atalante_tools.faults.checks import (
+    data_stays_fresh,
+    drives_notice_two_senders,
+    guide_kept,
+    left_leg_holds_by_itself,
+)
 from atalante_tools.faults.scenario import Case, Scenario
 
 _HOLD: Final = SupervisorState.HOLD
@@ -73,7 +78,30 @@ SCENARIOS: Final = (
     Scenario("F03", tuple(_lost(f"{n} frames", _STATE, n, node=_KNEE) for n in range(1, 5))),
     Scenario(
         "F04",
-        tuple(_lost(drive, f"{drive}_STATE", 5, node=drive) for drive in _DRIVES),
+        (
+            *(_lost(drive, f"{drive}_STATE", 5, node=drive) for drive in _DRIVES),
+            # On one leg: the other one is put down first.
+            *(
+                Case(
+                    f"{frames or 'all'} frames of a leg that swings",
+                    (
+                        Fault("value", "FOOT_RIGHT_STATE", 0, None, **{f"{cell}_ForceZ": 150.0 for cell in CELLS}),
+                        Fault("drop", _STATE, 20, frames),
+                    ),
+                    begins=20,
+                    state=state,
+                    dtc=dtc,
+                    node=_KNEE,
+                    reacted=reacted,
+                    recovers=False,
+                    watched=40,  # cells without noise are found out after a hundred
+                )
+                for frames, state, dtc, reacted in (
+                    (5, SupervisorState.FINISH_STEP, "SWING_TIMEOUT", 5),
+                    (None, _HOLD, "NODE_TIMEOUT", 10),
+                )
+            ),
+        ),
         lasting=_lost("for good", _STATE, None, node=_KNEE, recovers=False),
     ),
     Scenario(
@@ -202,7 +230,7 @@ SCENARIOS: Final = (
             Case(
                 "right counter, 200 Nm",
                 (Fault("inject", _COMMAND, 0, 20, SK_TargetTorque=200.0),),
-                checks=(left_leg_holds_by_itself,),
+                checks=(left_leg_holds_by_itself, drives_notice_two_senders),
             ),
             Case("counter 5 ahead", (Fault("inject", _COMMAND, 0, 20, ahead=5, SK_TargetTorque=-200.0),)),
             Case("one frame", (Fault("inject", _COMMAND, 0, 1, SK_TargetTorque=200.0),)),

@@ -36,12 +36,21 @@ SCENARIOS: Final = (
                 Case(node, (Fault("encoder_stuck", node, 0, 200),), node=node)
                 for node in ("LEFT_SH", _KNEE, "RIGHT_SH")
             ),
-            Case(
-                "RIGHT_SK, which has little to do",
-                (Fault("encoder_stuck", "RIGHT_SK", 0, 200),),
-                node="RIGHT_SK",
-                noticed=150,
-                reacted=150,
+            *(
+                Case(
+                    f"{node}, which has little to do",
+                    (Fault("encoder_stuck", node, 0, 300),),
+                    node=node,
+                    noticed=within,
+                    reacted=within,
+                )
+                for node, within in (
+                    ("RIGHT_SK", 150),
+                    ("RIGHT_TH", 240),
+                    ("RIGHT_FH", 260),
+                    ("RIGHT_SA", 80),
+                    ("LEFT_HA", 200),
+                )
             ),
         ),
     ),
