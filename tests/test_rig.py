@@ -220,7 +220,11 @@ def test_what_a_run_waits_for_is_said_with_what_to_type(network: Network, robot:
         for _ in range(150):
             rig.hal.hold()
             rig.hal.read()
-        assert waiting_for(rig).startswith("READY: waiting for the operator, who is `atalante pendant start ")
+        assert waiting_for(rig) == "READY: waiting for the operator of the embedded robot"
+        rig.target = target
+        assert waiting_for(rig) == (
+            "READY: waiting for the operator, who is `atalante pendant start -i virtual -c rig-alone`"
+        )
 
 
 def test_the_wall_clock_asks_for_real_time_rights_and_runs(

@@ -85,7 +85,9 @@ def load_telemetry_file(path: Path) -> dict[str, Any]:
     """
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+    except OSError as error:
+        raise AccessError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
         raise AccessError(f"{path}: {error}") from error
     for key, value in document.items():
         if key not in (*_TEXTS, *_FILES):

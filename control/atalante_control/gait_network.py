@@ -127,7 +127,9 @@ def load_network(path: Path | None = None) -> GaitNetwork:
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = dict(file)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except OSError as error:
+        raise NetworkError(f"{path} cannot be read: {error.strerror or error}") from error
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
         raise NetworkError(f"{path}: {error}") from error
     if str(arrays.pop("format", "")) != FORMAT or arrays.pop("inputs", np.array([])).tolist() != list(INPUTS):
         raise NetworkError(f"{path}: format is {FORMAT!r} with the inputs {', '.join(INPUTS)}")

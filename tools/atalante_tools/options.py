@@ -22,8 +22,8 @@ EMBEDDED: Final = "embedded"
 json_option = click.option("--json", "as_json", is_flag=True, help="JSON objects on stdout, one a line.")
 
 
-#: From here on a length means centimetres: nobody is 3 m tall, and no thigh or step is under 3 cm.
-_CENTIMETRES: Final = 3.0
+#: From here on a length means centimetres: nobody is 5 m tall, and no thigh or step is under 5 cm.
+_CENTIMETRES: Final = 5.0
 
 
 #: Length [m] and duration [s] of a step when a patient is given and his step is not.

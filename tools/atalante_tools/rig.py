@@ -205,5 +205,9 @@ def waiting_for(rig: Rig) -> str:
         if hal.silent:
             return f"no node answers on {target}; an emulated robot is `atalante emulator {target.arguments}`"
         return f"waiting for {', '.join(missing)}" if missing else "the nodes are there"
-    state = hal.state.supervisor.name
-    return f"{state}: waiting for the operator, who is `atalante pendant start {target.arguments}`"
+    waits = f"{hal.state.supervisor.name}: waiting for the operator"
+    return (
+        f"{waits} of the embedded robot"
+        if target.embedded
+        else f"{waits}, who is `atalante pendant start {target.arguments}`"
+    )

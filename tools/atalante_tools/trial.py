@@ -186,9 +186,11 @@ class _Walk:
 
     def _describe(self, state: State) -> str:
         statistics = self._controller.statistics
+        # Counted from the first completed step on.
+        largest = f"   largest |e|/q_bound {statistics.max_ratio:.2f}" if statistics.cycles else ""
         return (
             f"{self._name:<11} step {statistics.steps:3d}/{self._steps}   t {state.time:6.1f} s   "
-            f"Xi {state.assistance_factor:.2f}   largest |e|/q_bound {statistics.max_ratio:.2f}"
+            f"Xi {state.assistance_factor:.2f}{largest}"
         )
 
 
