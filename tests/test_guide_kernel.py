@@ -124,6 +124,36 @@ def test_p_and_drift_are_linear_in_the_deviations():
     np.testing.assert_allclose(np.hstack(list(GUIDE.step[:, :, 2:4])), DRIFT, atol=1e-12)
 
 
+def test_p_and_drift_count_on_the_feedforward():
+    uf = np.random.default_rng(6).normal(size=(2, 8)) * 10.0
+    f = GuideFilter(
+        GuideConfig(POLICIES, DISTURBANCE),
+        SHAPE,
+        DEADBEAT,
+        GAIT.coefficients[2:4],
+        GAIT.mirrored().coefficients[2:4],
+        uf,
+    )
+    f.start_step(XI, DEVIATION, RATE)
+    pushed = [(*curve, f.time, u) for curve, u in zip(CURVES, uf, strict=True)]
+    for first, respond in ((0, forced_response), (2, free_drift)):
+        expected = table([respond(p, DEADBEAT, q, after, time, u) for p, q, after, time, u in pushed])
+        np.testing.assert_allclose(np.hstack(list(f.step[:, :, first : first + 2])), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("points", "stride", "first", "horizon"),
+    [(100, 8, 0, 904), (300, 3, 2, 902), (800, 1, 0, 900), (5000, 1, 0, 900), (2, 400, 0, 1200)],
+)
+def test_the_grid_ends_where_the_step_does_and_goes_on_beyond(points: int, stride: int, first: int, horizon: int):
+    f = tube(points=points)
+    assert (f.cycles, f.stride, f.horizon) == (800, stride, horizon)
+    assert f.grid.tolist() == list(range(first, horizon + 1, stride))
+    assert f.time.tolist() == [cycle * PERIOD for cycle in range(horizon + 1)]
+    assert f.joints["first"].tolist() == [first] * 2
+    assert f.joints["stride"].tolist() == [stride] * 2
+
+
 def test_the_width_is_that_of_the_assistance_factor():
     assert SHAPE.bounds(np.zeros(1), XI)[0] == pytest.approx((0.07, 0.05))
     f = guide()

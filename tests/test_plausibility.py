@@ -21,7 +21,7 @@ from atalante_hal.e2e import Check
 from atalante_hal.image import ReceiveImage
 from atalante_hal.plausibility import Finding, Plausibility
 from atalante_hal.plausibility.finding import Signals, measured, signals_of
-from atalante_hal.plausibility.legs import hip_angles
+from atalante_hal.plausibility.legs import _Contradiction, _forgotten, hip_angles
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, load_robot
 
 NETWORK = atalante_dbc.load()
@@ -317,6 +317,18 @@ class TestVelocity:
             machine.missing = {row("right_HA")} if cycle % 16 < 4 else set()
             assert machine.cycle(lambda now: now.velocity.__setitem__(5, 1000.0)) == ()
 
+    def test_three_wrong_comparisons_on_end_are_needed(self):
+        """A sample is compared with the one before and with the one after it."""
+        machine = Machine(amplitude=0.0)
+
+        def wrong(now: Signals) -> None:
+            now.velocity[5] = 10.0 * ROBOT.sensors.velocity_error * GEAR[5]
+
+        for _ in range(4):
+            assert machine.run(16, wrong) == ()
+            assert machine.run(32) == ()
+        machine.until_found(Dtc.ENC_VELOCITY, 48, wrong)
+
     def test_it_follows_the_way_of_the_encoder(self):
         machine = Machine(amplitude=0.0)
 
@@ -456,8 +468,11 @@ class TestDrift:
         named = JOINTS[joint].replace("SK", "SH")
         assert finding.node == named.upper()
         assert finding.value == pytest.approx(offset, rel=1e-5)
-        assert f"{math.degrees(offset):+.1f} degrees off" in finding.text
-        assert JOINTS[joint] in finding.text
+        side, axis = JOINTS[joint].split("_")
+        told = f"{side}_SH and {side}_SK" if axis in ("SH", "SK") else JOINTS[joint]
+        assert finding.text == (
+            f"encoder of {told}: {math.degrees(offset):+.1f} degrees off what pelvis and tibia IMU say"
+        )
         machine.missing = {row("pendant")}
         assert only(machine.run(40, off)) is finding
         machine.missing = set()
@@ -573,7 +588,9 @@ class TestStandingEncoder:
         machine.until_found(Dtc.ENC_STUCK, 80, stick)
         finding = only(machine.checks.findings)
         assert finding.node == JOINTS[joint].upper()
-        assert f"encoder of {JOINTS[joint]} stands still while its leg turned by" in finding.text
+        assert finding.text == (
+            f"the encoder of {JOINTS[joint]} stands still while its leg turned by {math.degrees(finding.value):+.2f} degrees"
+        )
         machine.missing = {row("pendant")}
         assert only(machine.run(40, stick)) is finding
 
@@ -595,6 +612,18 @@ class TestStandingEncoder:
         assert [f.value for f in machine.checks.findings] == pytest.approx([sign * 1.01 * self.allowed] * len(pair))
         turn(0.0)
         assert machine.run(33, self.still) == ()
+
+    @pytest.mark.parametrize("axis", range(3))
+    @pytest.mark.parametrize(
+        ("change", "way"), [(0.5, 2e-5), (2.1e-5, 2e-5), (1e-5, 1e-5), (-1e-5, -1e-5), (-0.5, -2e-5)]
+    )
+    def test_what_changes_slowly_is_forgotten(self, axis: int, change: float, way: float):
+        moved = _Contradiction((1.0, 2.0, 3.0), (0.1, 0.2, 0.3))
+        now = _forgotten(moved, axis, change)
+        assert now.angles == moved.angles
+        errors = list(moved.errors)
+        errors[axis] += way
+        assert now.errors == tuple(errors)
 
     def test_one_sample_is_a_stray(self):
         machine, turn = self.standing(JOINTS.index("left_TH"))

@@ -1,8 +1,13 @@
-"""A pytest plugin for mutants: a test that takes much longer than it used to fails, where mutmut would wait for minutes."""
+"""A pytest plugin for mutants, so that they die soon.
+
+A test that takes much longer than it used to fails, where mutmut would wait for minutes. And of a test with many parameters one
+comes first, then another one of each: most mutants are noticed by some test, whatever its parameters.
+"""
 
 from __future__ import annotations
 
 import signal
+from collections import Counter
 from collections.abc import Iterator
 
 import pytest
@@ -10,6 +15,16 @@ from mutmut.state import state
 
 #: CPU time [s] a test may take, and times its usual duration on top.
 AT_LEAST, TIMES = 2.0, 4.0
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    before: Counter[str] = Counter()
+    rank = {}
+    for item in items:
+        name = item.nodeid.partition("[")[0]
+        rank[item] = before[name]
+        before[name] += 1
+    items.sort(key=rank.__getitem__)
 
 
 def _fail(number: int, frame: object) -> None:
