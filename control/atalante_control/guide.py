@@ -91,7 +91,7 @@ class GuideFilter:
         beyond = math.ceil(round(config.overlap / PERIOD) / self.stride) * self.stride
         self.horizon = self.cycles + beyond
         self.grid = np.arange(self.cycles % self.stride, self.horizon + 1, self.stride)
-        self.time: Vector = np.arange(self.horizon + 1) * PERIOD
+        self.time: Vector = np.arange(self.horizon + 1, dtype=np.float64) * PERIOD
 
         ufs = (None, None) if feedforward is None else (feedforward[0], feedforward[1])
         parts = list(zip(config.policies, nominal, following, ufs, strict=True))
