@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from atalante_control.backup import BackupPolicy, forced_response, free_drift
+from atalante_control.backup import BackupPolicy, ForcedResponse, forced_response, free_drift
 from atalante_control.deadbeat import Deadbeat
 from atalante_control.gait import PERIOD
 from atalante_control.guide_kernel import BOUND, JOINT, P, errors_ahead, tick
@@ -93,15 +93,15 @@ class GuideFilter:
         self.grid = np.arange(self.cycles % self.stride, self.horizon + 1, self.stride)
         self.time: Vector = np.arange(self.horizon + 1, dtype=np.float64) * PERIOD
 
-        ufs = (None, None) if feedforward is None else (feedforward[0], feedforward[1])
-        parts = list(zip(config.policies, nominal, following, ufs, strict=True))
-        self.forced = [forced_response(p, deadbeat, q, after, self.time, uf) for p, q, after, uf in parts]
-        drifts = [free_drift(p, deadbeat, q, after, self.time, uf) for p, q, after, uf in parts]
-        #: First columns of `step`: of the nominal, per deviation, per rate. Each of shape (2, horizon + 1, 4).
-        self._parts = [
-            np.array([np.hstack(joint) for joint in zip(*both, strict=True)])
-            for both in zip(zip(*self.forced, strict=True), zip(*drifts, strict=True), strict=True)
-        ]
+        self.forced: list[ForcedResponse] = []
+        tables = []
+        for joint, policy in enumerate(config.policies):
+            uf = None if feedforward is None else feedforward[joint]
+            curve = policy, deadbeat, nominal[joint], following[joint], self.time, uf
+            self.forced.append(forced_response(*curve))
+            tables.append(np.concatenate([self.forced[joint], free_drift(*curve)], axis=2))
+        #: First columns of `step`: of the nominal, per deviation, per rate. Shape (3, 2, horizon + 1, 4).
+        self._parts = np.stack(tables, axis=1)
         self.flow = np.array([_flow(config, joint, self.time) for joint in (0, 1)])
         self.step = np.empty((2, self.horizon + 1, 6))
         self.joints = _joints(config, int(self.grid[0]), self.stride)
@@ -162,11 +162,12 @@ class GuideFilter:
             Shape (4, n) [rad]: of SH the largest e and the largest -e under the disturbance bounds, then of SK.
         """
         points = self.grid[self.grid >= cycle].tolist()
-        rolled: list[tuple[float, ...]] = []
-        for flow, step, e, ed in zip(self.flow, self.step, (e_hip, e_knee), (ed_hip, ed_knee), strict=True):
+        rolled = []
+        for joint, (e, ed) in enumerate(((e_hip, ed_hip), (e_knee, ed_knee))):
+            flow, step = self.flow[joint], self.step[joint]
             y, yd = e - step[cycle, P], ed - step[cycle, P + 1]
-            rolled += zip(*(errors_ahead(flow[point - cycle], step[point], y, yd) for point in points), strict=True)
-        return np.array(rolled)
+            rolled.append([errors_ahead(flow[point - cycle], step[point], y, yd) for point in points])
+        return np.array(rolled).swapaxes(1, 2).reshape(4, len(points))
 
     def solution(self) -> Vector:
         """P of this step on the cycle grid, (e, e') of SH then of SK. Shape (horizon + 1, 4) [rad, rad/s]."""
@@ -176,7 +177,8 @@ class GuideFilter:
 
 def _joints(config: GuideConfig, first: int, stride: int) -> npt.NDArray[np.void]:
     joints, one = np.zeros(2, JOINT), np.array([PERIOD])
-    for joint, policy, (low, high) in zip(joints, config.policies, config.disturbance, strict=True):
+    for i, policy in enumerate(config.policies):
+        joint, (low, high) = joints[i], config.disturbance[i]
         joint["kp"], joint["kd"], joint["inertia"] = policy.kp, policy.kd, policy.inertia
         joint["limit"], joint["counted"] = policy.torque_limit, (1.0 - config.reserve) * policy.torque_limit
         joint["up"], joint["down"] = high, low
