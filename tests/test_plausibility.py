@@ -20,6 +20,7 @@ from atalante_hal.diagnostics import Dtc
 from atalante_hal.e2e import Check
 from atalante_hal.image import ReceiveImage
 from atalante_hal.plausibility import Finding, Plausibility
+from atalante_hal.plausibility.feet import Feet
 from atalante_hal.plausibility.finding import Signals, measured, signals_of
 from atalante_hal.plausibility.legs import _Contradiction, _forgotten, hip_angles
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, load_robot
@@ -530,6 +531,21 @@ class TestStuckEncoder:
         assert machine.until_found(Dtc.ENC_STUCK, 16, hold) <= 16
         assert only(machine.checks.findings).value == pytest.approx(ROBOT.breakaway[joint], rel=1e-5)
 
+    @signs
+    def test_the_torque_before_it_moved_does_not_count(self, sign: float):
+        machine, torque = Machine(amplitude=0.0), 0.0
+
+        def push(now: Signals) -> None:
+            now.torque[:] = torque
+
+        def move(now: Signals) -> None:
+            push(now)
+            now.position[:] += 1e-5 * machine.cycles * GEAR
+
+        for torque in (sign * 100.0, -sign * 100.0, 0.0):  # noqa: B007 - read by `push`
+            assert machine.run(32, move) == ()
+            assert machine.run(96, push) == ()
+
     @joints
     @pytest.mark.parametrize("limit", ["position_min", "position_max"])
     def test_a_joint_at_its_stop_may_stand_still(self, joint: int, limit: str):
@@ -776,6 +792,82 @@ class TestForceCells:
     def test_two_cells_are_a_foot_that_rocks(self):
         machine = Machine()
         assert machine.run(600, lambda now: now.force[0, :2, 2].__iadd__(200.0)) == ()
+
+
+class Plates:
+    """The feet alone, looked at in every cycle."""
+
+    def __init__(self) -> None:
+        self.now = signals_of(CODEC, np.zeros(CODEC.size))
+        self.feet = Feet(ROBOT, self.now, 1)
+
+    def judge(self, left: list[float], right: list[float], heard: tuple[bool, bool] = (True, True)) -> bool:
+        self.now.force[:, :, 2] = left, right
+        return self.feet.judge(heard)
+
+
+NOTHING, EVEN = [0.0] * 4, [100.0] * 4
+
+
+class TestPlates:
+    def test_at_first_nothing_is_known(self):
+        feet = Plates().feet
+        assert (feet.on_ground, feet.swing, feet.cells, feet.findings()) == (False, None, {}, ())
+
+    @pytest.mark.parametrize("foot", [0, 1])
+    @pytest.mark.parametrize("cell", range(4))
+    def test_a_cell_alone_contradicts_the_others_after_256_cycles_on_end(self, foot: int, cell: int):
+        plates, loads = Plates(), [NOTHING, NOTHING]
+        loads[foot] = [-200.0 if c == cell else 0.0 for c in range(4)]
+        for _ in range(2):
+            assert [plates.judge(*loads) for _ in range(257)] == [False] * 255 + [True] * 2
+            assert plates.feet.cells == {(foot, cell): -200.0}
+            told = f"force cell {CELLS[cell]} of the {FEET[foot]} foot says -200 N, which contradicts the other three"
+            node = f"FOOT_{FEET[foot].upper()}"
+            assert plates.feet.findings() == (Finding(Dtc.FOOT_CELL, node, -200.0, True, told),)
+            # What is not heard is as it was.
+            heard = foot == 1, foot == 0
+            assert plates.judge(NOTHING, NOTHING, heard)
+            assert not plates.judge(NOTHING, NOTHING)
+            assert plates.feet.cells == {}
+
+    def test_a_free_cell_contradicts_three_that_carry_more_than_the_load(self):
+        loaded, free = ROBOT.sensors.cell_loaded, ROBOT.sensors.cell_free
+        third = loaded / 3.0
+        for others, found in (
+            ([third] * 3, False),
+            ([third, third, third + 1.0], True),
+            ([loaded, loaded, free], False),
+        ):
+            plates = Plates()
+            for _ in range(256):
+                last = plates.judge([*others, free], EVEN)
+            assert last is found
+
+    def test_two_cells_stand_and_one_does_not(self):
+        free = ROBOT.sensors.cell_free
+        plates = Plates()
+        for cells, stands in (([free + 1.0, free, 0.0, 0.0], False), ([free + 1.0, -free - 1.0, 0.0, 0.0], True)):
+            plates.judge(cells, NOTHING)
+            assert plates.feet.on_ground is stands
+            assert plates.feet.swing == (1 if stands else None)
+        plates.judge(NOTHING, EVEN)
+        assert plates.feet.swing == 0
+        plates.judge(EVEN, EVEN)
+        assert plates.feet.swing is None
+
+    def test_both_swing_from_the_twentieth_cycle_to_the_hundredth(self):
+        plates = Plates()
+        for _ in range(2):
+            assert not plates.judge(EVEN, NOTHING)
+            assert [plates.judge(NOTHING, NOTHING) for _ in range(100)] == [False] * 19 + [True] * 80 + [False]
+            assert not plates.feet.on_ground
+        plates.judge(EVEN, NOTHING)
+        for _ in range(20):
+            plates.judge(NOTHING, NOTHING)
+        assert [f.text for f in plates.feet.findings()] == ["both feet say that they swing on the ground"]
+        assert not plates.judge(EVEN, NOTHING)
+        assert plates.feet.findings() == ()
 
 
 class TestContact:
