@@ -10,15 +10,21 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from atalante_control.flat_foot import FlatFoot, Tibiae, flat_feet, level
+from atalante_control.deadbeat import Deadbeat
+from atalante_control.flat_foot import FlatFoot, LevelFeet, Tibiae, flat_feet, level, put_level
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import load_robot
+from atalante_hal.types import State, SupervisorState
 
 ANGLES = st.floats(-0.6, 0.6)
 STILL = (0.0, 0.0, 0.0)
 HEADING = st.floats(-math.pi, math.pi)
 LEFT, RIGHT = flat_feet(ExoskeletonParameters())
-TIBIAE = Tibiae(pinocchio_model(urdf(ExoskeletonParameters(), load_robot())))
+ROBOT = load_robot()
+MODEL = pinocchio_model(urdf(ExoskeletonParameters(), ROBOT))
+TIBIAE = Tibiae(MODEL)
+DEADBEAT = Deadbeat(0.8, 0.4)
+OFFSET = math.radians(1.0)
 
 
 def rotation(axis: tuple[float, float, float], angle: float) -> np.ndarray:
@@ -124,3 +130,54 @@ def test_the_joints_say_what_the_tibias_imu_would(
     dt = 1e-6
     later = shank(position + velocity * dt, pelvis @ rotation_vector(turning * dt))
     np.testing.assert_allclose(rotation_vector(np.array(gyro) * dt), r.T @ later, atol=1e-9)
+
+
+# -- in the place of the nominal -------------------------------------------------------------------------------------
+
+
+def feet() -> LevelFeet:
+    return LevelFeet(ROBOT, ExoskeletonParameters(), MODEL, DEADBEAT, [np.zeros((801, 24))] * 2, OFFSET)
+
+
+def put(f: LevelFeet, side: int, cycle: int, r: np.ndarray, gyro: tuple[float, float, float] = STILL) -> np.ndarray:
+    row = np.arange(24.0)
+    put_level(row, f.ankles, side, f.cubics, cycle, np.array(quaternion(r)), np.array(gyro))
+    return row
+
+
+@pytest.mark.parametrize(("side", "foot"), [(0, LEFT), (1, RIGHT)])
+def test_the_targets_of_the_swing_ankle_replace_the_nominal_ones(side: int, foot: FlatFoot):
+    r, gyro, sa = tibia(0.4, 0.02, 0.1), (0.1, -0.2, 0.3), 6 * side + 4
+    row = put(feet(), side, 500, r, gyro)
+    angles, rates = level(foot.geometry, quaternion(r), gyro)
+    np.testing.assert_allclose(row[[sa, sa + 1]], (angles[0] + OFFSET, angles[1]), atol=1e-15)
+    np.testing.assert_allclose(row[[sa + 12, sa + 13]], rates, atol=1e-15)
+    others = [i for i in range(24) if i % 12 not in (sa, sa + 1)]
+    np.testing.assert_array_equal(row[others], others)
+
+
+@pytest.mark.parametrize("pitch", [-1.2, 1.2])
+def test_the_ankle_stays_off_its_limits_and_does_not_rush_into_them(pitch: float):
+    row = put(feet(), 0, 500, tibia(0.0, 0.0, pitch), (0.0, 1.0, 0.0))
+    margin = math.radians(1.0)
+    limit = ROBOT.position_max[4] - margin if pitch < 0.0 else ROBOT.position_min[4] + margin
+    assert row[4] == pytest.approx(limit)
+    assert row[16] == 0.0
+    near = -(limit - OFFSET - math.copysign(math.radians(1.5), limit))  # half the way of the fade
+    row = put(feet(), 0, 500, tibia(0.0, 0.0, near), (0.0, 1.0, 0.0))
+    rate = level(LEFT.geometry, quaternion(tibia(0.0, 0.0, near)), (0.0, 1.0, 0.0))[1][0]
+    assert row[16] == pytest.approx(0.5 * rate, rel=0.1)
+
+
+def test_a_step_begins_where_the_ankle_is_and_meets_the_target_when_the_deadbeat_ends():
+    f, r = feet(), tibia(0.0, 0.02, 0.1)
+    attitudes = np.tile(quaternion(r), (4, 1))
+    state = State(
+        0, 0.0, SupervisorState.ACTIVE, 0.5, np.full(12, 0.05), np.full(12, 0.2), *np.zeros((3, 12)), attitudes,
+        np.zeros((4, 3)), np.zeros((4, 3)), np.zeros((2, 4, 3)), np.zeros(8), np.ones(24, bool), np.zeros(24, int), True,
+    )  # fmt: skip
+    target = put(f, 0, 0, r)
+    f.start_step(state, 0)
+    first, late = put(f, 0, 0, r), put(f, 0, 321, r)
+    np.testing.assert_allclose(first[[4, 5, 16, 17]], (0.05, 0.05, 0.2, 0.2), atol=1e-12)
+    np.testing.assert_array_equal(late, target)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from atalante_control.gait import HANG_GAIT, load_gait
-from atalante_control.idealization import AssistedInertia, Friction
+from atalante_control.idealization import AssistedInertia, Friction, law_of, merge
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import JOINTS, load_robot
 
@@ -85,3 +85,21 @@ def test_ideal_is_the_inverse_of_torques(knee: float, hip_rate: float, knee_rate
     inertia = AssistedInertia(MODEL, SWING)
     tau = inertia.torques(knee, hip_rate, knee_rate, (u1, u2))
     np.testing.assert_allclose(inertia.ideal(knee, hip_rate, knee_rate, tau), (u1, u2), atol=1e-8)
+
+
+@pytest.mark.parametrize("leg", [0, 6])
+@pytest.mark.parametrize("decoupled", [False, True])
+def test_the_merge_is_a_mean_of_baseline_and_assistance(leg: int, decoupled: bool):
+    friction, inertia, rng = Friction(), AssistedInertia(MODEL, SWING), np.random.default_rng(11)
+    law, u = law_of(friction, inertia, decoupled), (30.0, -20.0)
+    baseline, gravity, q, qd = rng.normal(size=(4, 12))
+    hip, knee = leg + HIP, leg + KNEE
+    real = inertia.torques(q[knee], qd[hip], qd[knee], u) if decoupled else u
+    for w in (0.0, 0.3, 1.0):
+        torque = baseline.copy()
+        merge(law, torque, gravity, q, qd, leg, w, u)
+        expected = baseline.copy()
+        for i, joint in enumerate((hip, knee)):
+            assisted = gravity[joint] + friction.torque(joint % 6, qd[joint]) + real[i]
+            expected[joint] = w * baseline[joint] + (1.0 - w) * assisted
+        np.testing.assert_allclose(torque, expected, atol=1e-12)

@@ -74,7 +74,7 @@ def tell(
     stance: int,
     xi: float,
 ) -> tuple[Pair, float, float, bool]:
-    """Write the telemetry of a cycle; runs compiled.
+    """Write the telemetry of a cycle.
 
     Args:
         telemetry: shape (1,), of `TELEMETRY`.

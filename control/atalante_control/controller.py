@@ -24,21 +24,23 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from atalante_control.account import TELEMETRY, HangStatistics, tell
+from atalante_control.account import TELEMETRY, HangStatistics
 from atalante_control.backup import BackupPolicy
 from atalante_control.certificate import Certificate, HandOver, certify, largest_assistance
+from atalante_control.cycle import STEP, hand_over, run
 from atalante_control.deadbeat import Deadbeat
 from atalante_control.flat_foot import LevelFeet
 from atalante_control.gait import PERIOD, Gait, bezier
 from atalante_control.gravity import Gravity
 from atalante_control.guide import GuideConfig, GuideFilter
 from atalante_control.guide_shapes import GuideShape
-from atalante_control.haptics import intensity, levels
-from atalante_control.idealization import AssistedInertia, Friction, Merge
+from atalante_control.haptics import intensity
+from atalante_control.idealization import AssistedInertia, Friction, law_of
 from atalante_control.impact import step_over
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_control.pid import AIR_GAINS, LEFT, RIGHT, Pid, PidGains
@@ -154,11 +156,8 @@ class HangController:
         self._basis[1, :, :n], self._basis[1, :, n:] = c1[: self._fading, None], c1d[: self._fading, None]
 
         self._inertia = AssistedInertia(articulated, tables[RIGHT].q)
-        self._merge = Merge(config.friction, self._inertia, config.decoupled)
         feedforward = self._ideal_feedforward(gait) if config.feedforward else None
-        self._uf: list[list[float]] | None = None
-        if feedforward is not None:
-            self._uf = bezier(feedforward, time / gait.duration).tolist()
+        uf: Vector = np.zeros((len(time), 2)) if feedforward is None else bezier(feedforward, time / gait.duration)
         swing = [_SH, _SK]
         self.guides = [
             GuideFilter(
@@ -177,19 +176,28 @@ class HangController:
         self._taken_to = [largest_assistance(guide, config.guide_margin, config.hand_over) for guide in gentler]
 
         ramp = np.arange(round(config.blend / PERIOD)) * (PERIOD / config.blend)
-        self._blend: list[float] = (0.5 + 0.5 * np.cos(math.pi * ramp)).tolist()
+        self._blend: Vector = 0.5 + 0.5 * np.cos(math.pi * ramp)
         self._startup_cycles = round(config.startup / PERIOD)
 
         self._last, self._carried, self._share = np.zeros(n), np.zeros(n), np.ones(n)
         self._start_pose, self._start_row = np.zeros(n), np.zeros(2 * n)
         self._deviation, self._rate, self._added = np.zeros(2 * n), np.zeros(2 * n), np.zeros_like(self._basis)
         self._command = Command(self._pid.torque, np.zeros(len(MOTORS)))
-        self._told = np.zeros(1, TELEMETRY)
-        self.telemetry = self._told.view(np.float64)
-        self._tell, self._levels = compiled(tell), compiled(levels)
-        still, row = (0.0, 0.0), self._start_row
-        self._levels(0, still, (1.0, 1.0), 0.0, self._command.vibration)
-        self._tell(self._told, row, self.guide.joints, still, config.active, 0, 0.0, RIGHT, 1.0)
+        told = np.zeros(1, TELEMETRY)
+        self.telemetry = told.view(np.float64)
+        self._step = np.zeros(1, STEP)
+        self._step["cycles"], self._step["acting"] = self._cycles, config.active
+        pid, feet, law = self._pid, self._feet, law_of(config.friction, self._inertia, config.decoupled)
+        #: What `cycle.run` works on from `steps` on, but for the guide of the step, which comes last.
+        self._kept: tuple[Any, ...] = (
+            self._step, feet.ankles, feet.cubics, self._gravity.links, np.zeros(n),
+            pid.gains, pid.limit, pid.integral, pid.torque, np.ascontiguousarray(uf), law,
+            self._last, self._carried, self._blend, self._command.vibration, told,
+        )  # fmt: skip
+        self._run = compiled(run)
+        self._tables: tuple[Any, ...] = (*self._kept, *self.guide.tables)
+        still, attitudes, gyros = self._start_pose, np.zeros((len(IMUS), 4)), np.zeros((len(IMUS), 3))
+        self._run(0, False, self._start_row, still, still, attitudes, gyros, still, *self._tables)
         self.statistics = HangStatistics()
         self._forget()
 
@@ -216,11 +224,11 @@ class HangController:
         self._last[:] = state.torque
         if state.torque_sent is not None:
             self._pid.torque[:] = state.torque_sent
-        self._carry = True
+        self._step["carry"] = True
 
     def _forget(self) -> None:
-        self._walking, self._stance, self._xi, self._w = False, RIGHT, 1.0, 1.0
-        self._intensity, self._changed_at, self._carry = 0.0, 0, False
+        self._walking, self._stance, self._w, self._changed_at = False, RIGHT, 1.0, 0
+        self._step["carry"] = False
         self._pid.reset()
         self._share.fill(1.0)
         self._pid.start_step(RIGHT, self._share)
@@ -264,7 +272,7 @@ class HangController:
     # -- one cycle ---------------------------------------------------------------------------------------------------
 
     def update(self, state: State) -> Command:
-        """One cycle."""
+        """One cycle: the step switch, then everything else in machine code (`cycle.run`)."""
         cycle = state.cycle - self._changed_at
         if self._walking:
             if step_over(cycle, self._cycles):
@@ -278,13 +286,15 @@ class HangController:
             self._walking = True
             self._change_step(state, RIGHT)
             cycle = 0
-        row = self._reference[self._stance][cycle]
-        leg = _LEG if self._stance == LEFT else 0  # first joint of the swing leg
-        if self.config.flat_foot:
-            self._feet.put(state, leg // _LEG, cycle, row)
-        gravity = self._baseline(state, row)
-        self._assist(state, row, cycle, leg, gravity)
-        self._hand_over(cycle)
+        row, side = self._reference[self._stance][cycle], 1 - self._stance
+        level = self.config.flat_foot and self._feet.heard(state, side)
+        if self.config.flat_foot and not level:
+            self._feet.put(state, side, cycle, row)
+        sent = self._pid.torque if state.torque_sent is None else state.torque_sent
+        sensed = state.position, state.velocity, state.imu_quaternion, state.imu_gyro, sent
+        ratio, h, acting = self._run(cycle, level, row, *sensed, *self._tables)
+        self.statistics.count(cycle, ratio, h, acting)
+        self._command.outside = self._w < 1.0 and h < 0.0
         return self._command
 
     def _move_to_start(self, state: State, cycle: int) -> Command:
@@ -296,8 +306,9 @@ class HangController:
         row[:n] = self._start_pose + way * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x))
         row[:n] += speed * (duration * x**3 * (-4.0 + 7.0 * x - 3.0 * x * x))
         row[n:] = way * (30.0 * x * x * (1.0 - x) ** 2 / duration) + speed * (x * x * (-12.0 + 28.0 * x - 15.0 * x * x))
-        self._baseline(state, row)
-        self._hand_over(cycle)
+        torque = self._pid.update(row, state.position, state.velocity, state.torque_sent)
+        torque += self._gravity.torque(state.position, state.imu_quaternion[_PELVIS].tolist())
+        hand_over(self._step, cycle, torque, self._last, self._carried, self._blend)
         self.telemetry[:n] = row[:n]
         return self._command
 
@@ -305,8 +316,8 @@ class HangController:
         self._changed_at, self._stance = state.cycle, stance
         self._command.step = (self._command.step or 0) + 1
         config, n = self.config, len(JOINTS)
-        self._xi = xi = min(1.0, max(0.0, state.assistance_factor))
-        self._w, self._intensity = baseline_share(xi, config.fade), intensity(xi)
+        xi = min(1.0, max(0.0, state.assistance_factor))
+        self._w = baseline_share(xi, config.fade)
         leg = _LEG if stance == LEFT else 0
         self._share.fill(1.0)
         self._share[[leg + _SH, leg + _SK]] = self._w
@@ -325,48 +336,15 @@ class HangController:
         deviations, rates = (float(deviation[hip]), float(deviation[knee])), (float(rate[hip]), float(rate[knee]))
         self.guide = self.guide_at(xi)
         self.guide.start_step(xi, deviations, rates)
+        self._tables = (*self._kept, *self.guide.tables)
         largest = config.hand_over
         exceeded = max(map(abs, deviations)) > largest.deviation or max(map(abs, rates)) > largest.rate
         if exceeded and self.statistics.steps:
             self.statistics.hand_overs_exceeded += 1
         if config.flat_foot:
-            self._feet.start_step(state, leg // _LEG)
-        if not self._carry:
+            self._feet.start_step(state, 1 - stance)
+        step = self._step[0]
+        if not step["carry"]:
             self._last[:] = self._pid.torque
-        self._carry = True
-
-    def _baseline(self, state: State, row: Vector) -> Vector:
-        """u_t into the command: PID and the gravity of the empty exoskeleton. Returns u_g."""
-        gravity = self._gravity.torque(state.position, state.imu_quaternion[_PELVIS].tolist())
-        torque = self._pid.update(row, state.position, state.velocity, state.torque_sent)
-        np.add(torque, gravity, out=torque)
-        return gravity
-
-    def _assist(self, state: State, row: Vector, cycle: int, leg: int, gravity: Vector) -> None:
-        """Merge the assistive torque into the command of the swing leg's SH and SK; haptics, telemetry, statistics."""
-        hip, knee, n = leg + _SH, leg + _SK, len(JOINTS)
-        q, qd, guide, w = state.position, state.velocity, self.guide, self._w
-        errors = float(q[hip] - row[hip]), float(q[knee] - row[knee])
-        u = guide.tick(cycle, errors[0], float(qd[hip] - row[n + hip]), errors[1], float(qd[knee] - row[n + knee]))
-        if w < 1.0:
-            if self._uf is not None:
-                uf_hip, uf_knee = self._uf[cycle]
-                u = u[0] + uf_hip, u[1] + uf_knee
-            self._merge.merge(self._pid.torque, gravity, q, qd, leg, w, u)
-
-        statistics, phase = self.statistics, cycle / self._cycles
-        bounds, ratio, h, acting = self._tell(
-            self._told, row, guide.joints, errors, self.config.active, statistics.steps, phase, self._stance, self._xi
-        )
-        statistics.count(cycle, ratio, h, acting)
-        self._command.outside = w < 1.0 and h < 0.0
-        self._levels(leg // _LEG, errors, bounds, self._intensity, self._command.vibration)
-
-    def _hand_over(self, cycle: int) -> None:
-        """Carry over what the torque would jump by at a change, and fade it out."""
-        torque = self._pid.torque
-        if self._carry:
-            np.subtract(self._last, torque, out=self._carried)
-            self._carry = False
-        if cycle < len(self._blend):
-            np.add(torque, self._carried * self._blend[cycle], out=torque)
+        step["stance"], step["completed"], step["carry"] = stance, self.statistics.steps, True
+        step["xi"], step["share"], step["intensity"] = xi, self._w, intensity(xi)

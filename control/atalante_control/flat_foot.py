@@ -20,7 +20,6 @@ import pinocchio
 from atalante_control.deadbeat import Deadbeat
 from atalante_control.gait import PERIOD
 from atalante_control.model import ArticulatedModel, ExoskeletonParameters, imu_link
-from atalante_hal.compiled import compiled
 from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, SIDES, Robot
 from atalante_hal.types import State
 
@@ -117,7 +116,11 @@ def flat_feet(parameters: ExoskeletonParameters) -> tuple[FlatFoot, FlatFoot]:
 class LevelFeet:
     """Flat-foot targets in the place of the nominal ones of the swing ankle, with a deadbeat of their own.
 
-    Call `start_step` at each step change, then `put` once a cycle.
+    Call `start_step` at each step change, then `put_level` once a cycle, or `put` where the tibia's IMU is not heard.
+
+    Attributes:
+        ankles: left and right, rows of ANKLE.
+        cubics: c0, c1 of the deadbeat and their derivatives, a row a cycle until it ends.
     """
 
     def __init__(
@@ -137,63 +140,60 @@ class LevelFeet:
             offset: added to SA [rad].
         """
         self._nominal, self._tibiae = nominal, Tibiae(articulated)
-        self._ankles = np.zeros(len(SIDES), ANKLE)
-        self._ankles["offset"] = offset
-        for side, (ankle, foot) in enumerate(zip(self._ankles, flat_feet(exoskeleton), strict=True)):
+        self.ankles = np.zeros(len(SIDES), ANKLE)
+        self.ankles["offset"] = offset
+        for side, (ankle, foot) in enumerate(zip(self.ankles, flat_feet(exoskeleton), strict=True)):
             joints = [side * len(LEG_JOINTS) + joint for joint in (_SA, _HA)]
             ankle["geometry"], ankle["joints"] = foot.geometry, joints
             ankle["low"] = robot.position_min[joints] + _STOP_MARGIN
             ankle["high"] = robot.position_max[joints] - _STOP_MARGIN
         time: Vector = np.arange(len(nominal[0]), dtype=np.float64) * PERIOD
         (c0, c1), (c0d, c1d), _ = deadbeat.basis(time[: np.searchsorted(time, deadbeat.end)])
-        self._cubics = np.column_stack([c0, c1, c0d, c1d])
-        self._put_level = compiled(_put_level)
-        upright, row = np.array([1.0, 0.0, 0.0, 0.0]), nominal[0][0].copy()
-        self._put_level(row, self._ankles, 0, self._cubics, 0, upright, np.zeros(3))
+        self.cubics = np.column_stack([c0, c1, c0d, c1d])
 
     def start_step(self, state: State, side: int) -> None:
         """Leave what the ankle of the leg that swings now (0 left, 1 right) is off its target to the deadbeat."""
-        ankle, tibia = self._ankles[side], self._tibia(state, side)
-        angles, rates = self._nominal_target(side, 0) if tibia is None else _target(ankle, *tibia)
+        ankle, (angles, rates) = self.ankles[side], self._target(state, side, 0)
         ankle["deviation"] = state.position[ankle["joints"]] - angles
         ankle["rate"] = state.velocity[ankle["joints"]] - rates
 
+    def heard(self, state: State, side: int) -> bool:
+        """The tibia's IMU speaks: `put_level` may follow it."""
+        return not state.imu_rows or bool(state.age[state.imu_rows[_TIBIAE[side]]] <= _IMU_AGE)
+
     def put(self, state: State, side: int, cycle: int, row: Vector) -> None:
-        """The targets into a row (q_des, q_des') of shape (24,).
+        """Targets without the tibia's IMU into a row (q_des, q_des') of shape (24,).
 
-        Without the tibia's IMU its attitude comes from the joints and the pelvis IMU; without that one, too, the nominal
-        holds.
+        Its attitude comes from the joints and the pelvis IMU; without that one, too, the nominal holds.
         """
-        tibia = self._tibia(state, side)
-        if tibia is None:
-            _put(row, self._ankles[side], self._cubics, cycle, *self._nominal_target(side, cycle))
-        else:
-            self._put_level(row, self._ankles, side, self._cubics, cycle, *tibia)
+        _put(row, self.ankles[side], self.cubics, cycle, *self._target(state, side, cycle))
 
-    def _tibia(self, state: State, side: int) -> tuple[Vector, Vector] | None:
-        rows, imu = state.imu_rows, _TIBIAE[side]
-        if not rows or state.age[rows[imu]] <= _IMU_AGE:
-            return state.imu_quaternion[imu], state.imu_gyro[imu]
-        if state.age[rows[_PELVIS]] <= _IMU_AGE:
+    def _target(self, state: State, side: int, cycle: int) -> tuple[Pair, Pair]:
+        ankle, imu = self.ankles[side], _TIBIAE[side]
+        if self.heard(state, side):
+            return _target(ankle, state.imu_quaternion[imu], state.imu_gyro[imu])
+        if state.age[state.imu_rows[_PELVIS]] <= _IMU_AGE:
             pelvis = state.imu_quaternion[_PELVIS].tolist(), state.imu_gyro[_PELVIS].tolist()
-            attitude, gyro = self._tibiae.attitude(side, state.position, state.velocity, *pelvis)
-            return np.array(attitude), np.array(gyro)
-        return None
-
-    def _nominal_target(self, side: int, cycle: int) -> tuple[Pair, Pair]:
-        row, (sa, ha), n = self._nominal[side][cycle].tolist(), self._ankles[side]["joints"], len(JOINTS)
+            return _target(ankle, *self._tibiae.attitude(side, state.position, state.velocity, *pelvis))
+        row, (sa, ha), n = self._nominal[side][cycle].tolist(), ankle["joints"], len(JOINTS)
         return (row[sa], row[ha]), (row[n + sa], row[n + ha])
 
 
-def _put_level(
+def put_level(
     row: Vector, ankles: npt.NDArray[np.void], side: int, cubics: Vector, cycle: int, tibia: Vector, gyro: Vector
 ) -> None:
+    """The targets of the swing leg's ankle (0 left, 1 right) into a row (q_des, q_des') of shape (24,).
+
+    Args:
+        ankles, cubics: of `LevelFeet`.
+        tibia, gyro: as in `level`.
+    """
     angles, rates = _target(ankles[side], tibia, gyro)
     _put(row, ankles[side], cubics, cycle, angles, rates)
 
 
 def _put(row: Vector, ankle: Any, cubics: Vector, cycle: int, angles: Pair, rates: Pair) -> None:
-    """Targets with what their deadbeat adds. Rows of `cubics`: c0, c1 and their derivatives."""
+    """Targets with what their deadbeat adds."""
     n = len(row) // 2
     for i in range(2):
         angle, rate, joint = angles[i], rates[i], ankle["joints"][i]
@@ -204,7 +204,7 @@ def _put(row: Vector, ankle: Any, cubics: Vector, cycle: int, angles: Pair, rate
         row[joint], row[n + joint] = angle, rate
 
 
-def _target(ankle: Any, tibia: Vector, gyro: Vector) -> tuple[Pair, Pair]:
+def _target(ankle: Any, tibia: Sequence[float] | Vector, gyro: Sequence[float] | Vector) -> tuple[Pair, Pair]:
     """Angles and rates of SA and HA that hold the sole level, with the offset, within the joints' limits."""
     (sagittal, henke), rates = level(ankle["geometry"], tibia, gyro)
     low, high = ankle["low"], ankle["high"]
@@ -219,7 +219,7 @@ def _within(angle: float, rate: float, low: float, high: float) -> Pair:
     return min(high, max(low, angle)), rate * min(1.0, room)
 
 
-def level(geometry: Vector, tibia: Vector, gyro: Vector) -> tuple[Pair, Pair]:
+def level(geometry: Vector, tibia: Sequence[float] | Vector, gyro: Sequence[float] | Vector) -> tuple[Pair, Pair]:
     """SA and HA that level the sole, or the nearest HA where the tibia leans too far sideways for it.
 
     Args:

@@ -43,12 +43,16 @@ LINK = np.dtype(
 
 
 class Gravity:
-    """u_g: generalized gravity of the empty exoskeleton, hanging from a pelvis of known attitude."""
+    """u_g: generalized gravity of the empty exoskeleton, hanging from a pelvis of known attitude.
+
+    Attributes:
+        links: the tree `hold` works on.
+    """
 
     def __init__(self, articulated: ArticulatedModel) -> None:
         """Take a model with the pelvis fixed."""
-        self._links, self._torque = _links(articulated), np.zeros(len(JOINTS))
-        self._hold = compiled(_hold)
+        self.links, self._torque = _links(articulated), np.zeros(len(JOINTS))
+        self._hold = compiled(hold)
         self.torque(np.zeros(len(JOINTS)), (1.0, 0.0, 0.0, 0.0))
 
     def torque(self, position: Vector, pelvis: Sequence[float]) -> Vector:
@@ -62,7 +66,7 @@ class Gravity:
             Shape (12,) [Nm], overwritten by the next call.
         """
         w, x, y, z = pelvis
-        self._hold(self._links, position, w, x, y, z, self._torque)
+        self._hold(self.links, position, w, x, y, z, self._torque)
         return self._torque
 
 
@@ -83,9 +87,8 @@ def _links(articulated: ArticulatedModel) -> npt.NDArray[np.void]:
     return links
 
 
-def _hold(
-    links: npt.NDArray[np.void], position: Vector, w: float, x: float, y: float, z: float, torque: Vector
-) -> None:
+def hold(links: npt.NDArray[np.void], position: Vector, w: float, x: float, y: float, z: float, torque: Vector) -> None:
+    """u_g into `torque`. Args: `links`, rows of LINK; attitude of the pelvis, wxyz."""
     down = links[0]["down"]
     down[0], down[1] = -_GRAVITY * 2.0 * (x * z - w * y), -_GRAVITY * 2.0 * (y * z + w * x)
     down[2] = -_GRAVITY * (1.0 - 2.0 * (x * x + y * y))

@@ -136,6 +136,11 @@ class GuideFilter:
         return self._tick(self.joints, self.flow, self.step, cycle, e_hip, ed_hip, e_knee, ed_knee)
 
     @property
+    def tables(self) -> tuple[npt.NDArray[np.void], Vector, Vector]:
+        """`joints`, `flow` and `step`."""
+        return self.joints, self.flow, self.step
+
+    @property
     def h(self) -> list[float]:
         """Safe backward image function at the last tick, SH and SK; at least 0 inside it."""
         return list(self.joints["h"].tolist())

@@ -21,7 +21,6 @@ import numpy.typing as npt
 import pinocchio
 
 from atalante_control.model import ArticulatedModel
-from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, LEG_JOINTS
 
 Vector = npt.NDArray[np.float64]
@@ -30,7 +29,7 @@ Pair = tuple[float, float]
 _ASSISTED = (LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"))
 
 #: What the merge knows of the assisted joints, SH and SK.
-_LAW = np.dtype(
+LAW = np.dtype(
     [
         ("fit", np.float64, (3, 3)),
         ("inertias", np.float64, 2),
@@ -133,41 +132,34 @@ class AssistedInertia:
         )
 
 
-class Merge:
-    """Torques of the swing leg's SH and SK: w u_t + (1 - w) (u_i + u_f + u_v)."""
+def law_of(friction: Friction, inertia: AssistedInertia, decoupled: bool) -> npt.NDArray[np.void]:
+    """What `merge` knows, shape (1,).
 
-    def __init__(self, friction: Friction, inertia: AssistedInertia, decoupled: bool) -> None:
-        """Take the parts of u_i.
-
-        Args:
-            decoupled: u_f + u_v are meant for the separate inertias and go through `AssistedInertia.torques`.
-        """
-        self._law = np.zeros(1, _LAW)
-        law = self._law[0]
-        law["fit"], law["inertias"], law["decoupled"] = inertia.fit, inertia.inertias, decoupled
-        law["coulomb"], law["viscous"] = ([row[i] for i in _ASSISTED] for row in (friction.coulomb, friction.viscous))
-        law["smoothing"] = friction.smoothing
-        self._merge = compiled(_merge)
-        nothing = np.zeros(len(JOINTS))
-        self.merge(nothing, nothing, nothing, nothing, 0, 0.0, (0.0, 0.0))
-
-    def merge(self, torque: Vector, gravity: Vector, q: Vector, qd: Vector, leg: int, w: float, u: Pair) -> None:
-        """Merge into u_t.
-
-        Args:
-            torque: u_t, shape (12,) [Nm]; those of SH and SK are overwritten.
-            gravity: u_g, shape (12,) [Nm].
-            q, qd: shape (12,) [rad], [rad/s].
-            leg: first joint of the swing leg.
-            w: share of the baseline in [0, 1).
-            u: u_f + u_v of SH and SK [Nm].
-        """
-        self._merge(self._law, torque, gravity, q, qd, leg, w, u)
+    Args:
+        decoupled: u_f + u_v are meant for the separate inertias and go through `AssistedInertia.torques`.
+    """
+    laws = np.zeros(1, LAW)
+    law = laws[0]
+    law["fit"], law["inertias"], law["decoupled"] = inertia.fit, inertia.inertias, decoupled
+    law["coulomb"], law["viscous"] = ([row[i] for i in _ASSISTED] for row in (friction.coulomb, friction.viscous))
+    law["smoothing"] = friction.smoothing
+    return laws
 
 
-def _merge(
+def merge(
     laws: npt.NDArray[np.void], torque: Vector, gravity: Vector, q: Vector, qd: Vector, leg: int, w: float, u: Pair
 ) -> None:
+    """w u_t + (1 - w) (u_i + u_f + u_v) on SH and SK of the swing leg.
+
+    Args:
+        laws: of `law_of`.
+        torque: u_t, shape (12,) [Nm]; those of SH and SK are overwritten.
+        gravity: u_g, shape (12,) [Nm].
+        q, qd: shape (12,) [rad], [rad/s].
+        leg: first joint of the swing leg.
+        w: share of the baseline in [0, 1).
+        u: u_f + u_v of SH and SK [Nm].
+    """
     law, hip, knee = laws[0], leg + _ASSISTED[0], leg + _ASSISTED[1]
     if law["decoupled"]:
         u = coupled(law["fit"], law["inertias"], q[knee], qd[hip], qd[knee], u)

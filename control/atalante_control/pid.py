@@ -78,26 +78,28 @@ class Pid:
 
     Attributes:
         torque: last result, shape (12,) [Nm], overwritten by the next `update`; whoever asks for more than this adds it in place.
+        gains: Kp, Kd and what the integral grows by in a cycle, shape (3, 12).
+        integral: shape (12,) [Nm]; `limit`: the largest of it.
     """
 
     def __init__(self, gains: PidGains) -> None:
         stance, swing = gains.stance, gains.swing
         roles = {LEFT: (stance, swing), RIGHT: (swing, stance)}  # left leg, right leg
-        #: Kp, Kd and what the integral grows by in a cycle, shape (3, 12).
         self._gains_of = {
             s: np.array([(*left.kp, *right.kp), (*left.kd, *right.kd), (*left.ki, *right.ki)])
             * [[1.0], [1.0], [PERIOD]]
             for s, (left, right) in roles.items()
         }
         n = len(JOINTS)
-        self._limit, self._integral, self.torque = gains.integral_limit, np.zeros(n), np.zeros(n)
+        self.limit, self.gains = gains.integral_limit, np.zeros((3, n))
+        self.integral, self.torque = np.zeros(n), np.zeros(n)
         self.start_step(RIGHT, np.ones(n))
-        self._kernel = compiled(_update)
+        self._kernel = compiled(control)
         self.update(np.zeros(2 * n), np.zeros(n), np.zeros(n))
 
     def reset(self) -> None:
         """Empty the integrals."""
-        self._integral[:] = 0.0
+        self.integral[:] = 0.0
 
     def start_step(self, stance: int, share: Vector) -> None:
         """Give each leg the gains of its role.
@@ -106,8 +108,8 @@ class Pid:
             stance: LEFT or RIGHT.
             share: how far the baseline acts on each joint, shape (12,) in [0, 1]; scales what is integrated.
         """
-        self._gains = self._gains_of[stance].copy()
-        self._gains[2] *= share
+        self.gains[:] = self._gains_of[stance]
+        self.gains[2] *= share
 
     def update(self, desired: Vector, q: Vector, qd: Vector, sent: Vector | None = None) -> Vector:
         """u_t of one cycle.
@@ -122,13 +124,14 @@ class Pid:
             `torque`.
         """
         sent = self.torque if sent is None else sent
-        self._kernel(desired, q, qd, self._gains, self._limit, sent, self._integral, self.torque)
+        self._kernel(desired, q, qd, self.gains, self.limit, sent, self.integral, self.torque)
         return self.torque
 
 
-def _update(
+def control(
     desired: Vector, q: Vector, qd: Vector, gains: Vector, limit: float, sent: Vector, integral: Vector, torque: Vector
 ) -> None:
+    """u_t into `torque`, as in `Pid.update`."""
     n = len(q)
     for joint in range(n):
         error, rate = desired[joint] - q[joint], desired[n + joint] - qd[joint]

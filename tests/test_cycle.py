@@ -1,0 +1,86 @@
+"""The controller's cycle as machine code against the same source run by Python, and the hand-over."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from atalante_control.controller import HangConfig, HangController
+from atalante_control.cycle import STEP, hand_over
+from atalante_control.gait import HANG_GAIT, load_gait
+from atalante_control.guide_shapes import SHAPES
+from atalante_hal.robot import load_robot
+from atalante_hal.types import State, SupervisorState
+
+ROBOT = load_robot()
+GAIT = load_gait(HANG_GAIT, ROBOT)
+STARTUP = 20  # cycles
+
+
+def controller() -> HangController:
+    return HangController(ROBOT, GAIT, SHAPES["pinched"], HangConfig(startup=STARTUP * 1e-3))
+
+
+def states(xi: float) -> list[State]:
+    """A robot that follows the gait badly, with noise in every sensor; some cycles of each part of two steps."""
+    rng, tables, result = np.random.default_rng(2), GAIT.tables(), []
+    attitude = np.zeros((4, 4))
+    attitude[:, 0] = 1.0
+    zeros = [np.zeros(n) for n in (12, 12, 12)]
+    for since in [*range(STARTUP + 12), *range(400, 410), *range(STARTUP + 795, STARTUP + 812)]:
+        at = (since - STARTUP) % 800
+        q, qd = tables.q[at] + rng.normal(size=12) * 0.02, tables.qd[at] + rng.normal(size=12) * 0.2
+        tilted = attitude + rng.normal(size=(4, 4)) * 0.05
+        tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
+        sensors = [tilted, rng.normal(size=(4, 3)), np.zeros((4, 3)), np.zeros((2, 4, 3)), np.zeros(8)]
+        valid, age = np.ones(24, bool), np.zeros(24, int)
+        result.append(State(since, since * 1e-3, SupervisorState.ACTIVE, xi, q, qd, *zeros, *sensors, valid, age, True))
+    return result
+
+
+@pytest.mark.parametrize("xi", [0.5, 0.95, 1.0])
+def test_the_machine_code_does_what_its_source_does(monkeypatch: pytest.MonkeyPatch, xi: float):
+    machine = controller()
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    source = controller()
+    walked = states(xi)
+    machine.reset(walked[0])
+    source.reset(walked[0])
+    for state in walked:
+        one, other = machine.update(state), source.update(state)
+        np.testing.assert_allclose(one.torque, other.torque, rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(one.vibration, other.vibration, rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(machine.telemetry, source.telemetry, rtol=1e-11, atol=1e-9)
+        assert one.outside == other.outside
+    assert machine.statistics.steps == source.statistics.steps == 1
+
+
+def test_nothing_follows_the_swing_foot_where_that_is_switched_off():
+    walked = states(0.5)[: STARTUP + 10]
+    level, free = (
+        controller(),
+        HangController(ROBOT, GAIT, SHAPES["pinched"], replace(controller().config, flat_foot=False)),
+    )
+    for one in (level, free):
+        one.reset(walked[0])
+        for state in walked:
+            one.update(state)
+    targets = [one.telemetry[[4, 5, 10, 11]] for one in (level, free)]
+    assert (targets[0][:2] != targets[1][:2]).all()  # the left leg swings
+    np.testing.assert_array_equal(targets[0][2:], targets[1][2:])
+
+
+def test_a_torque_that_would_jump_goes_on_from_the_last_one():
+    step, blend = np.zeros(1, STEP), np.array([1.0, 0.5, 0.25])
+    last, carried = np.full(12, 7.0), np.zeros(12)
+    step["carry"] = True
+    sent = []
+    for cycle in range(5):
+        torque = np.full(12, 3.0)
+        hand_over(step, cycle, torque, last, carried, blend)
+        assert (torque == torque[0]).all()
+        sent.append(torque[0])
+    assert sent == [7.0, 5.0, 4.0, 3.0, 3.0]
+    assert not step["carry"][0]
