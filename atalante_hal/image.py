@@ -139,8 +139,8 @@ class ReceiveImage:
 
     def awaited(self) -> set[int]:
         """Identifiers of the messages whose senders are alive: heard within the DBC's timeout."""
-        ages = zip(self.codec.messages, self.age.tolist(), strict=True)
-        return {message.frame_id for message, age in ages if age <= message.timeout_ms}
+        ages = self.age.tolist()
+        return {m.frame_id for row, m in enumerate(self.codec.messages) if ages[row] <= m.timeout_ms}
 
     def _received_in(self, frames: Frames) -> _Received:
         if self._received.frames is not frames:

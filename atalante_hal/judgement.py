@@ -53,7 +53,7 @@ class Judgement:
         self._timeouts = [m.timeout_ms for m in messages]
         kinds = [network.node(m.sender).kind for m in messages]
         self._invalid = [Dtc.IMU_INVALID if kind == "imu" else Dtc.SIGNAL_RANGE for kind in kinds]
-        self._legs = [_leg(m.sender) if kind == "drive" else None for m, kind in zip(messages, kinds, strict=True)]
+        self._legs = [_leg(self._senders[row]) if kind == "drive" else None for row, kind in enumerate(kinds)]
         self._joint_rows = [row for row, kind in enumerate(kinds) if kind == "drive"]
         self._confirms = [kind != "pendant" for kind in kinds]
         self._needed = [row for row, kind in enumerate(kinds) if kind != "pendant"]
@@ -87,11 +87,10 @@ class Judgement:
             dtc = self._invalid[row] if why is Check.INVALID else PENDING[why]
             value = ages[row] if ages[row] < NEVER else 0
             memory.raise_dtc(cycle, dtc, self._senders[row], value=value, confirmed=False)
-        for row, (check, age) in enumerate(zip(checks, ages, strict=True)):
-            if check or age or self.qualification[row] is not SETTLED:
-                self._judge_row(cycle, memory, row, Check(check), age, swing)
-        trusted = [q.trusted for q in self.qualification]
-        self.valid[:] = [check <= _FRESH and good for check, good in zip(checks, trusted, strict=True)]
+        for row, check in enumerate(checks):
+            if check or ages[row] or self.qualification[row] is not SETTLED:
+                self._judge_row(cycle, memory, row, Check(check), ages[row], swing)
+        self.valid[:] = [check <= _FRESH and self.trusts(row) for row, check in enumerate(checks)]
         self.joints_valid = bool(self.valid[self._joint_rows].all())
         self.settled = image.all_fresh and all(q is SETTLED for q in self.qualification)
 

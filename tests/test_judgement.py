@@ -359,6 +359,7 @@ class TestSwingLeg:
         for _ in range(5):
             bench.cycle(lose(KNEE))
             assert bench.active == {("SWING_TIMEOUT", "LEFT_SK"): True, ("NODE_TIMEOUT", "LEFT_SK"): False}
+            assert {entry.value for entry in bench.memory.active.values()} == {bench.image.age[KNEE]}
         assert bench.cycle(lose(KNEE)).active == {("NODE_TIMEOUT", "LEFT_SK"): True}
 
     def test_a_joint_of_the_leg_it_stands_on_is_held_at_once(self, bench: Bench):

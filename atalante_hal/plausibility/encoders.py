@@ -95,9 +95,7 @@ class Encoders:
         return bool(self._wrong_findings)
 
     def _count_wrong(self) -> None:
-        self._wrong = [
-            0 if right else wrong + 1 for right, wrong in zip(self._right.tolist(), self._wrong, strict=True)
-        ]
+        self._wrong = [0 if right else self._wrong[joint] + 1 for joint, right in enumerate(self._right.tolist())]
         self._wrong_findings = tuple(
             self._wrong_velocity(joint, 0.5 * float(self._error[joint]))
             for joint, wrong in enumerate(self._wrong)
