@@ -59,6 +59,7 @@ class Codec:
         self.signals: tuple[tuple[Message, Signal], ...] = tuple((m, s) for _, m, s in entries)
         self.size = len(entries)
         self._index = {(m.name, s.name): i for i, (m, s) in enumerate(self.signals)}
+        self._groups = [group_of(s.name) for _, s in self.signals]
         #: Row of each decoded value.
         self.row_of = np.array([row for row, _, _ in entries], dtype=np.intp)
         self._compile([s for _, _, s in entries])
@@ -109,10 +110,9 @@ class Codec:
         Raises:
             KeyError: no such quantity, or it is signed in one message and unsigned in another.
         """
-        places = [i for i, (_, s) in enumerate(self.signals) if group_of(s.name) == group]
+        places = [i for i, name in enumerate(self._groups) if name == group]
         if not places or places[-1] - places[0] + 1 != len(places):
-            known = dict.fromkeys(group_of(s.name) for _, s in self.signals)
-            raise KeyError(f"no contiguous quantity {group!r}; there are {', '.join(known)}")
+            raise KeyError(f"no contiguous quantity {group!r}; there are {', '.join(dict.fromkeys(self._groups))}")
         return slice(places[0], places[-1] + 1)
 
     def template(self) -> Frames:
