@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,8 @@ from atalante_hal.hal import Hal
 from atalante_hal.loop import LockStep, run
 from atalante_hal.robot import JOINTS
 from atalante_hal.telemetry.schema import message_class
+from atalante_tools import trial
+from atalante_tools.trial import Result
 
 ATALANTE = str(Path(sys.executable).with_name("atalante"))
 KEYS = [
@@ -33,6 +36,14 @@ KEYS = [
 
 def atalante(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([ATALANTE, *arguments], capture_output=True, text=True, timeout=300)
+
+
+def test_the_table_judges_no_guide_by_a_single_step() -> None:
+    walked = Result("pinched", True, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0)
+    head, two, one = trial._table([walked, replace(walked, steps=1)]).splitlines()
+    assert head.split("  ")[0].strip() == "shape"
+    assert two.split() == ["pinched", "yes", "2", "0.93", "99.9", "50.0", "4697", "6.2", "90000", "0"]
+    assert one.split() == ["pinched", "yes", "1", "-", "-", "-", "4697", "6.2", "90000", "0"]
 
 
 @pytest.fixture(scope="module")

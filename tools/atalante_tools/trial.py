@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import functools
 import json
-import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -64,8 +63,8 @@ class Result:
     certified: bool
     steps: int  # completed right-stance steps
     max_ratio: float  # largest |e| / q_bound from the first completed step on
-    inside: float  # share of the time both assisted joints were in the guide
-    filter_active: float  # share of the time the filter acted
+    inside: float  # share of that time both assisted joints were in the guide
+    filter_active: float  # share of that time the filter acted
     cycles: int
     real_time_factor: float
     frames: int
@@ -318,11 +317,7 @@ def _result(name: str, certified: bool, controller: HangController, hal: Hal, st
 def _conclude(options: Options, results: Sequence[Result], *, as_json: bool) -> None:
     """Summary, figure, table."""
     summary = {
-        **{
-            key: value
-            for key, value in asdict(replace(options, out=options.out)).items()
-            if key not in ("out", "can_log")
-        },
+        **{key: value for key, value in asdict(options).items() if key not in ("out", "can_log")},
         "version": version("atalante-hal"),
         "shapes": [asdict(result) for result in results],
     }
@@ -352,9 +347,7 @@ def _table(results: Sequence[Result]) -> str:
             r.shape,
             "yes" if r.certified else "NO",
             str(r.steps),
-            f"{r.max_ratio:.2f}" if math.isfinite(r.max_ratio) else "-",
-            f"{100 * r.inside:.1f}",
-            f"{100 * r.filter_active:.1f}",
+            *_judged(r),
             str(r.cycles),
             f"{r.real_time_factor:.1f}",
             str(r.frames),
@@ -363,3 +356,10 @@ def _table(results: Sequence[Result]) -> str:
         for r in results
     ]
     return table([head, *rows])
+
+
+def _judged(result: Result) -> tuple[str, str, str]:
+    """What became of the guide, from the first completed step on: of a single step there is nothing to say."""
+    if result.steps < 2:
+        return "-", "-", "-"
+    return f"{result.max_ratio:.2f}", f"{100 * result.inside:.1f}", f"{100 * result.filter_active:.1f}"
