@@ -124,6 +124,16 @@ def test_p_and_drift_are_linear_in_the_deviations():
     np.testing.assert_allclose(np.hstack(list(GUIDE.step[:, :, 2:4])), DRIFT, atol=1e-12)
 
 
+def test_at_first_the_step_is_one_without_assistance_and_without_a_deviation():
+    f, started = (
+        GuideFilter(GuideConfig(POLICIES, DISTURBANCE), SHAPE, DEADBEAT, *(GAIT.coefficients[2:4],) * 2) for _ in "ab"
+    )
+    assert (f.h, f.gates, f.stepped) == ([1.0, 1.0], [0.0, 0.0], 0)
+    started.start_step(0.0, (0.0, 0.0), (0.0, 0.0))
+    assert np.array_equal(f.step, started.step)
+    assert f.joints["xi"].tolist() == [0.0, 0.0]
+
+
 def test_p_and_drift_count_on_the_feedforward():
     uf = np.random.default_rng(6).normal(size=(2, 8)) * 10.0
     f = GuideFilter(
