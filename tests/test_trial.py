@@ -25,6 +25,7 @@ from atalante_hal.hal import Hal
 from atalante_hal.loop import LockStep, run
 from atalante_hal.robot import JOINTS
 from atalante_hal.telemetry.schema import message_class
+from atalante_hal.types import State
 from atalante_tools import trial
 from atalante_tools.trial import Result
 
@@ -143,10 +144,11 @@ class CommandFrames:
 
 
 class Baseline(HangController):
-    """The same controller without the assistance."""
+    """The same controller without the assistance; its guide says nothing that could be merged."""
 
-    def _assist(self, *arguments: object) -> None:
-        pass
+    def _change_step(self, state: State, stance: int) -> None:
+        super()._change_step(state, stance)
+        self._step["share"], self.guide.joints["kp"] = 1.0, np.nan
 
 
 @pytest.mark.parametrize(("xi", "equal"), [(1.0, True), (0.99, False)])
