@@ -326,8 +326,7 @@ class TestVelocity:
             now.velocity[5] = 10.0 * ROBOT.sensors.velocity_error * GEAR[5]
 
         for _ in range(4):
-            assert machine.run(16, wrong) == ()
-            assert machine.run(32) == ()
+            assert [machine.run(16, wrong), machine.run(16), machine.run(16)] == [()] * 3
         machine.until_found(Dtc.ENC_VELOCITY, 48, wrong)
 
     def test_it_follows_the_way_of_the_encoder(self):
@@ -532,7 +531,7 @@ class TestStuckEncoder:
         assert only(machine.checks.findings).value == pytest.approx(ROBOT.breakaway[joint], rel=1e-5)
 
     @signs
-    def test_the_torque_before_it_moved_does_not_count(self, sign: float):
+    def test_the_torque_counts_from_where_it_stood_first(self, sign: float):
         machine, torque = Machine(amplitude=0.0), 0.0
 
         def push(now: Signals) -> None:
@@ -545,6 +544,11 @@ class TestStuckEncoder:
         for torque in (sign * 100.0, -sign * 100.0, 0.0):  # noqa: B007 - read by `push`
             assert machine.run(32, move) == ()
             assert machine.run(96, push) == ()
+        torque = sign * 100.0
+        machine.run(32, move)
+        assert machine.run(16, push) == ()  # one sample
+        torque = 0.0
+        assert machine.until_found(Dtc.ENC_STUCK, 48, push) > 16
 
     @joints
     @pytest.mark.parametrize("limit", ["position_min", "position_max"])
