@@ -10,8 +10,10 @@ import os
 import shutil
 import signal
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Self
 
@@ -20,6 +22,9 @@ import pytest
 from atalante_hal.bus import BusAbsent
 from atalante_hal.bus.socketcan import SocketCanBus, require_channel
 from atalante_hal.frame import FLAG_BRS, FLAG_FDF, new_frames
+from atalante_hal.hal import Hal
+from atalante_hal.types import SupervisorState
+from atalante_tools.pose_hold import PoseHold
 
 #: Ends a candump log: an identifier the robot's network does not use.
 END_ID = 0x7FF
@@ -57,6 +62,50 @@ def spare_vcan(vcan: str) -> Iterator[str]:
     as_root("ip", "link", "set", channel, "mtu", "72", "up")
     yield channel
     as_root("ip", "link", "del", channel)
+
+
+@contextmanager
+def repeated(work: Callable[[], object]) -> Iterator[None]:
+    """`work` again and again in a thread of its own."""
+    over = threading.Event()
+
+    def run() -> None:
+        while not over.is_set():
+            work()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+class Loop:
+    """A HAL and the pose it found, one cycle after the other; `each` is called at the end of every cycle."""
+
+    def __init__(self, hal: Hal, each: Callable[[], object] = lambda: None) -> None:
+        self._hal, self._each = hal, each
+        self._controller = PoseHold(hal.robot)
+        self._moved = False
+
+    def cycles(self, count: int, wanted: SupervisorState | None = None) -> SupervisorState:
+        """So many cycles, or up to the first one in a state."""
+        hal = self._hal
+        for _ in range(count):
+            state = hal.read()
+            if hal.moving:
+                if not self._moved:
+                    self._controller.reset(state)
+                hal.write(self._controller.update(state))
+            else:
+                hal.hold()
+            self._moved = hal.moving
+            self._each()
+            if state.supervisor is wanted:
+                break
+        return hal.state.supervisor
 
 
 class Candump:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 
 from atalante_dbc import Network
 from atalante_emulator.body import PyBulletBody
@@ -17,27 +15,7 @@ from atalante_hal.robot import Robot
 from atalante_hal.types import SupervisorState
 from atalante_tools.observer import Observer
 from atalante_tools.pendant_node import PendantNode, Request
-from atalante_tools.pose_hold import PoseHold
-
-PATIENCE = 60.0  # s
-
-
-@contextmanager
-def repeated(work: Callable[[], object]) -> Iterator[None]:
-    """`work` again and again in a thread of its own."""
-    over = threading.Event()
-
-    def run() -> None:
-        while not over.is_set():
-            work()
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
+from tests.vcan.conftest import PATIENCE, Loop, repeated
 
 
 def test_a_second_pendant_takes_over_and_holds(vcan: str, network: Network, robot: Robot, urdf_text: str) -> None:
@@ -55,28 +33,12 @@ def test_a_second_pendant_takes_over_and_holds(vcan: str, network: Network, robo
         first, second = PendantNode(network, socket()), PendantNode(network, socket())
         listening, block = socket(), new_frames(256)
         listener = Observer(network, robot, time.monotonic())
-        controller = PoseHold(robot)
         first.dead_man = True
         first.speak()
         for work in (lambda: emulator.poll(0.05), lambda: first.poll(0.05), lambda: second.poll(0.05)):
             stack.enter_context(repeated(work))
 
-        def cycles(count: int, wanted: SupervisorState | None = None) -> SupervisorState:
-            active = hal.state.supervisor is SupervisorState.ACTIVE
-            for _ in range(count):
-                state = hal.read()
-                if state.supervisor is SupervisorState.ACTIVE:
-                    if not active:
-                        controller.reset(state)
-                    hal.write(controller.update(state))
-                else:
-                    hal.hold()
-                active = state.supervisor is SupervisorState.ACTIVE
-                listener.take(block, listening.receive(block), time.monotonic())
-                if state.supervisor is wanted:
-                    break
-            return hal.state.supervisor
-
+        cycles = Loop(hal, lambda: listener.take(block, listening.receive(block), time.monotonic())).cycles
         assert cycles(400, SupervisorState.READY) is SupervisorState.READY, hal.missing()
         first.press(Request.START)
         assert cycles(60, SupervisorState.ACTIVE) is SupervisorState.ACTIVE, hal.reason

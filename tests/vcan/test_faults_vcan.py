@@ -1,0 +1,136 @@
+"""Faults of the wire on real SocketCAN: a flood by another process, a second HAL."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from atalante_dbc import Network
+from atalante_emulator.body import PyBulletBody
+from atalante_emulator.emulator import Emulator
+from atalante_emulator.pendant import Operator
+from atalante_hal.bus.socketcan import SocketCanBus
+from atalante_hal.cia402 import DriveState
+from atalante_hal.frame import new_frames
+from atalante_hal.hal import Hal
+from atalante_hal.robot import Robot
+from atalante_hal.transceiver import RECEIVE_BUDGET
+from atalante_hal.types import SupervisorState
+from tests.vcan.conftest import PATIENCE, Loop, repeated
+
+S = SupervisorState
+ATALANTE = str(Path(sys.executable).with_name("atalante"))
+
+
+@dataclass
+class Line:
+    """A HAL and a robot, each on a socket of its own, the robot in a thread of its own."""
+
+    hal: Hal
+    loop: Loop
+    emulator: Emulator
+    operator: Operator
+    stack: ExitStack  # ends what belongs to it
+
+    def socket(self) -> SocketCanBus:
+        """One more socket on the same wire."""
+        bus = SocketCanBus(self.hal.bus.name)
+        self.stack.callback(bus.close)
+        return bus
+
+    @property
+    def drives_hold(self) -> bool:
+        return set(self.emulator.drives.state) == {DriveState.QUICK_STOP_ACTIVE}
+
+    def start(self) -> None:
+        """To ACTIVE, on the operator's word."""
+        self.operator.start()
+        assert self.loop.cycles(100, S.ACTIVE) is S.ACTIVE, self.hal.reason
+
+    def codes(self) -> list[str]:
+        return [event.code for event in self.hal.events]
+
+
+@pytest.fixture
+def walking(network: Network, robot: Robot, urdf_text: str) -> Iterator[type]:
+    """`with walking(channel) as line`: ACTIVE."""
+
+    @contextmanager
+    def on(channel: str) -> Iterator[Line]:
+        with ExitStack() as stack:
+            buses = [SocketCanBus(channel) for _ in range(2)]
+            for bus in buses:
+                stack.callback(bus.close)
+            body = PyBulletBody(urdf_text)
+            stack.callback(body.close)
+            operator = Operator(0.5, starts=False)
+            emulator = Emulator(network, robot, body, buses[0], operator=operator)
+
+            hal = Hal(network, robot, buses[1], patience=PATIENCE)
+            line = Line(hal, Loop(hal), emulator, operator, stack)
+            stack.enter_context(repeated(lambda: emulator.poll(0.05)))
+            assert line.loop.cycles(400, S.READY) is S.READY, hal.missing()
+            line.start()
+            yield line
+
+    return on
+
+
+def test_f13_a_flood_of_another_process_ends_in_hold_within_five_cycles(vcan: str, walking) -> None:
+    with walking(vcan) as line:
+        listening, block = line.socket(), new_frames(256)
+        flood = subprocess.Popen(["cangen", vcan, "-g", "0", "-i", "-I", "000", "-L", "8", "-D", "00", "-f"])
+        try:
+            heard = 0
+            while heard < 10 * RECEIVE_BUDGET:  # so much waits for the HAL, too
+                heard += listening.receive(block, PATIENCE)
+                assert flood.poll() is None
+            before, frames = line.hal.state.cycle, line.hal.layout["frames"]
+            received = [float(line.hal.record[frames][0])]
+            for _ in range(5):
+                line.loop.cycles(1)
+                received.append(float(line.hal.record[frames][0]))
+            assert line.hal.state.supervisor is S.HOLD
+            assert "BUS_FLOOD" in line.codes()
+            line.loop.cycles(30)
+        finally:
+            flood.kill()
+            flood.wait()
+        # What a cycle reads is bounded, so it ends: no cycle was lost to the flood.
+        assert line.hal.state.cycle == before + 35
+        assert max(after - before for before, after in pairwise(received)) <= RECEIVE_BUDGET
+        assert line.loop.cycles(200) is S.HOLD  # and stays there when the wire is quiet again
+        assert line.drives_hold
+        line.start()
+
+
+def test_f14_a_second_hal_refuses_to_start_and_leaves_the_first_alone(vcan: str, walking) -> None:
+    with walking(vcan) as line:
+        command = [ATALANTE, "jog", "left_SK", "--to", "3", "-i", "socketcan", "-c", vcan, "--lockstep"]
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as second:
+            while second.poll() is None:
+                assert line.loop.cycles(1) is S.ACTIVE, line.hal.reason
+            assert second.stderr is not None
+            assert "another HAL is at work on vcan0" in second.stderr.read()
+        assert second.returncode == 1
+
+
+def test_f14_a_running_hal_holds_in_the_cycle_in_which_it_hears_another(
+    vcan: str, walking, network: Network, robot: Robot
+) -> None:
+    with walking(vcan) as line:
+        line.loop.cycles(20)
+        heard = line.hal.state.cycle + 1
+        Hal(network, robot, line.socket(), patience=0.0).read()  # one that did not listen
+        assert line.loop.cycles(1) is S.HOLD
+        assert [(e.cycle, e.code) for e in line.hal.events if e.code == "HAL_DUPLICATE"] == [(heard, "HAL_DUPLICATE")]
+        assert line.loop.cycles(100) is S.HOLD
+        assert line.drives_hold
+        line.start()
