@@ -286,9 +286,13 @@ def test_where_the_loop_rings_what_the_worst_disturbance_adds_counts_from_the_st
         assert limited(*of(f, 0), side, start, *state) == pytest.approx(expected, abs=1e-12)
 
 
+WEAK = tuple(replace(p, torque_limit=limit) for p, limit in zip(POLICIES, (75.0, 50.0), strict=True))
+
+
 def expected_tick(f: GuideFilter, joint: int, cycle: int, e: float, ed: float) -> tuple[float, int]:
     """Ratio of one joint, and the rollouts that are stepped."""
-    policy, (low, high), limit = f.config.policies[joint], f.config.disturbance[joint], LIMITS[joint]
+    policy, (low, high) = f.config.policies[joint], f.config.disturbance[joint]
+    limit = (1.0 - RESERVE) * policy.torque_limit
     points = f.grid[f.grid >= cycle]
     tau = (points - cycle) * PERIOD
     p = f.step[joint][:, :2]
@@ -314,7 +318,7 @@ def expected_tick(f: GuideFilter, joint: int, cycle: int, e: float, ed: float) -
     return worst, stepped
 
 
-@pytest.mark.parametrize("policies", [POLICIES, RINGING], ids=["monotone", "ringing"])
+@pytest.mark.parametrize("policies", [POLICIES, WEAK, RINGING], ids=["monotone", "weak", "ringing"])
 def test_a_tick_is_the_papers_law_of_the_largest_ratio(policies):
     f = tube(policies, zeta=0.02, derivative_time=0.004)
     h, rate, fresh, steps = [1.0, 1.0], [0.0, 0.0], True, [0, 0]
@@ -344,3 +348,30 @@ def test_a_tick_is_the_papers_law_of_the_largest_ratio(policies):
         assert not f.joints["fresh"].any()
         fresh = False
     assert min(steps) >= 3
+
+
+@pytest.mark.parametrize(
+    ("weight", "rate", "zeta", "damped"),
+    [
+        (0.5, 3.0, 0.125, 0.5),
+        (0.5, 0.0, 0.125, 0.5),
+        (0.5, -2.0, 0.125, 0.625),
+        (0.5, -7.0, 0.125, 0.9375),
+        (0.5, -8.0, 0.125, 1.0),
+        (0.5, -12.0, 0.125, 1.0),
+        (0.5, -800.0, 0.125, 1.0),
+        (0.0, -4.0, 0.125, 0.5),
+        (1.0, -4.0, 0.125, 1.0),
+        (0.25, -4.0, 0.0, 0.25),
+    ],
+)
+def test_a_falling_h_takes_the_rest_of_the_weight_in_proportion(weight: float, rate: float, zeta: float, damped: float):
+    assert damped_gate(weight, rate, zeta) == damped
+
+
+@pytest.mark.parametrize(
+    ("h", "xi", "weight"),
+    [(-1.0, 0.0, 1.0), (0.0, 0.0, 1.0), (0.5, 0.0, 0.125), (1.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1.5, 0.0, 0.0)],
+)
+def test_the_gate_of_the_paper(h: float, xi: float, weight: float):
+    assert gate(h, xi) == weight

@@ -22,7 +22,7 @@ from atalante_hal.image import ReceiveImage
 from atalante_hal.plausibility import Finding, Plausibility
 from atalante_hal.plausibility.feet import Feet
 from atalante_hal.plausibility.finding import Signals, measured, signals_of
-from atalante_hal.plausibility.legs import _Contradiction, _forgotten, hip_angles
+from atalante_hal.plausibility.legs import Legs, _Contradiction, _forgotten, hip_angles
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, load_robot
 
 NETWORK = atalante_dbc.load()
@@ -479,6 +479,29 @@ class TestDrift:
         offset = 0.0
         assert machine.run(33, off) == ()
 
+    @pytest.mark.parametrize("leg", [0, 1])
+    def test_an_angle_and_the_same_a_turn_on_agree(self, leg: int):
+        now = signals_of(CODEC, np.zeros(CODEC.size))
+        now.quaternion[:, 0] = 1.0
+        legs = Legs(ROBOT, now, np.zeros(12, np.int64))
+        for turn in (0.0, 2.0 * math.pi, -2.0 * math.pi):
+            now.position[:] = (turn + np.array([0.05, -0.04, 0.03, 0.0] * 3)) * GEAR
+            hip = 6 * leg
+            now.position[hip : hip + 4] = (turn + np.array([0.05, -0.04, 0.03, -turn])) * GEAR[hip : hip + 4]
+            assert legs._compare(leg).errors == pytest.approx((0.05, -0.04, 0.03), abs=1e-9)
+
+    @pytest.mark.parametrize("leg", [0, 1])
+    @pytest.mark.parametrize("axis", range(3))
+    def test_four_samples_beyond_the_threshold_itself_are_a_drift(self, leg: int, axis: int):
+        legs = Legs(ROBOT, signals_of(CODEC, np.zeros(CODEC.size)), np.zeros(12, np.int64))
+        allowed = ROBOT.sensors.attitude_error
+        for size, found in ((allowed, False), (np.nextafter(allowed, 1.0), True)):
+            errors = [0.0] * 3
+            errors[axis] = -float(size)
+            for samples in range(1, 6):
+                legs._judge_drift(leg, _Contradiction((0.0, 0.0, 0.0), (errors[0], errors[1], errors[2])))
+                assert bool(legs.findings()) is (found and samples >= 4)
+
     @pytest.mark.parametrize("rate", [0.035, 0.05, 0.2])
     def test_a_slow_drift_is_found_within_a_thousand_cycles(self, rate: float):
         machine = Machine()
@@ -566,6 +589,36 @@ class TestStuckEncoder:
             machine.run(100, push)
             stuck = [f.node for f in machine.checks.findings if f.dtc is Dtc.ENC_STUCK]
             assert stuck == ([JOINTS[joint].upper()] if found else [])
+
+    @pytest.mark.parametrize("end", ["_low_stop", "_high_stop"])
+    def test_the_stop_itself_belongs_to_the_stop(self, end: str):
+        machine, at = Machine(amplitude=0.0), {}
+        for joint, stop in enumerate(getattr(machine.checks._stillness, end)):
+            to_joint = ROBOT.polarity[joint] / ROBOT.gear[joint]
+            near = stop / to_joint + np.spacing(stop / to_joint) * np.arange(-8, 9)
+            at.update((joint, value) for value in near[near * to_joint == stop].tolist())
+        assert len(at) >= 8  # of the others no number is the stop itself
+
+        def push(now: Signals) -> None:
+            for joint, value in at.items():
+                now.position[joint] = value
+                now.torque[joint] = 20.0 * math.sin(50.0 * machine.time)
+
+        push(machine.now)
+        assert machine.run(100, push) == ()
+
+    def test_a_torque_that_swings_by_the_breakaway_is_enough(self):
+        machine, torque = Machine(amplitude=0.0), np.zeros(12)
+
+        def hold(now: Signals) -> None:
+            now.torque[:] = torque
+
+        machine.run(64, lambda now: (hold(now), now.position.__iadd__(1e-5 * machine.cycles)))
+        assert machine.run(64, hold) == ()
+        torque[:] = ROBOT.breakaway
+        machine.run(16, hold)
+        assert [f.node for f in machine.checks.findings] == [joint.upper() for joint in JOINTS]
+        assert [f.value for f in machine.checks.findings] == ROBOT.breakaway.tolist()
 
     def test_who_is_not_heard_is_not_stuck(self):
         machine = Machine()

@@ -110,9 +110,9 @@ class Stillness:
         pushed = self._torque_high - self._torque_low >= self._breakaway
         free = (angle > self._low_stop) & (angle < self._high_stop)
         self.encoders = np.flatnonzero((self.standing >= self._to_stuck) & pushed & free).tolist()
-        frozen = (self._gyros.reshape(len(IMUS), -1) >= self._to_freeze).all(axis=1)
+        frozen = (self._gyros.reshape(len(IMUS), 3) >= self._to_freeze).all(axis=1)
         self.imus = np.flatnonzero(frozen).tolist()
-        dead = (self._cells.reshape(len(FEET), len(CELLS), -1) >= self._to_freeze).any(axis=2)
+        dead = (self._cells.reshape(len(FEET), len(CELLS), 3) >= self._to_freeze).any(axis=2)
         self.cells = [(foot, cell) for foot, cell in np.argwhere(dead).tolist()]
 
     def findings(self) -> tuple[Finding, ...]:
