@@ -15,6 +15,7 @@ from atalante_hal.codec import Codec
 from atalante_hal.e2e import Check
 from atalante_hal.frame import as_words, new_frames
 from atalante_hal.image import ReceiveImage, TransmitImage
+from atalante_hal.robot import JOINTS
 from atalante_hal.types import SupervisorState
 
 NETWORK = atalante_dbc.load()
@@ -91,8 +92,7 @@ def test_a_drive_without_its_own_limit_is_found(monkeypatch: pytest.MonkeyPatch)
 
     def command_without_limit(drives: Drives, *arguments: Any) -> None:
         command(drives, *arguments)
-        drives._upper.fill(1e6)
-        drives._lower.fill(-1e6)
+        drives._limit = drives._own_limit = np.full(len(JOINTS), 1e6)
 
     monkeypatch.setattr(Drives, "command", command_without_limit)
     with fuzzed_robot(seed=2) as robot, pytest.raises(Finding, match="a drive exerts"):

@@ -78,17 +78,15 @@ def library_two_processes(effort: Effort) -> Measurement:
 
 def _library(effort: Effort, jobs: int) -> Measurement:
     """The fan-out of a library, from when every process has built its programme and made a gait, to the last gait."""
-    import joblib
-
+    from atalante_control.fan_out import fan_out
     from atalante_control.generation.deviation import random_subjects
     from atalante_control.generation.library import solve_subject
 
     count = (2 if effort.quick else 12) * jobs
     network = load_network()
     subjects = random_subjects(network.low, network.high, count + jobs, seed=0)
-    parallel = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
     began = 0.0
-    for done, solved in enumerate(parallel(joblib.delayed(solve_subject)(subject) for subject in subjects), 1 - jobs):
+    for done, solved in enumerate(fan_out(solve_subject, subjects, jobs=jobs), 1 - jobs):
         require(solved.solved, solved.status)
         if done == 0:
             began = time.perf_counter()
