@@ -686,6 +686,46 @@ class TestStandingEncoder:
         turn(0.0)
         assert machine.run(33, self.still) == ()
 
+    @pytest.mark.parametrize("leg", [0, 1])
+    @pytest.mark.parametrize(("place", "axis"), [(0, 0), (1, 1), (2, 2), (3, 2)])
+    def test_two_samples_in_which_the_leg_turned_and_the_encoder_did_not(self, leg: int, place: int, axis: int):
+        standing = np.zeros(12, np.int64)
+        legs, joint = Legs(ROBOT, signals_of(CODEC, np.zeros(CODEC.size)), standing), 6 * leg + place
+
+        def say(turned: float, change: float) -> list[float]:
+            angles, errors = [0.1, -0.2, 0.3], [0.05, 0.06, -0.07]
+            angles[axis] -= turned
+            errors[axis] += change
+            legs._judge_standstill(leg, _Contradiction(tuple(angles), tuple(errors)))  # type: ignore[arg-type]
+            found = legs.findings()
+            assert {f.node for f in found} <= {JOINTS[joint].upper()}
+            return [f.value for f in found]
+
+        for _ in range(2):
+            standing[joint] = 0
+            assert [say(0.5, 0.5), say(0.0, 0.0)] == [[], []]  # it moves
+            standing[joint] = 1
+            assert say(0.02, 0.02) == []
+            assert say(0.02, 0.02) == pytest.approx([-0.02])
+            assert say(-0.03, -0.03) == pytest.approx([0.03])
+            assert [say(0.0, 0.0), say(0.02, 0.02)] == [[], []]
+            # Neither a change without a turn nor a turn without a change is a standstill.
+            assert [say(0.0, 0.5), say(0.0, 0.5), say(0.0, 0.5)] == [[]] * 3
+            assert [say(0.5, 0.0), say(0.5, 0.0), say(0.5, 0.0)] == [[]] * 3
+
+    def test_what_a_turn_may_change_is_tight(self):
+        sensors, standing = ROBOT.sensors, np.zeros(12, np.int64)
+        for turned in (0.0, 0.125, 0.5):
+            allowed = sensors.attitude_change + sensors.misalignment * turned
+            for change, found in ((allowed, False), (np.nextafter(allowed, 1.0), turned > 0.0)):
+                legs = Legs(ROBOT, signals_of(CODEC, np.zeros(CODEC.size)), standing)
+                standing[0] = 0
+                legs._judge_standstill(0, _Contradiction((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+                standing[0] = 1
+                for _ in range(2):
+                    legs._judge_standstill(0, _Contradiction((0.0, turned, 0.0), (float(change), 0.0, 0.0)))
+                assert bool(legs.findings()) is found
+
     @pytest.mark.parametrize("axis", range(3))
     @pytest.mark.parametrize(
         ("change", "way"), [(0.5, 2e-5), (2.1e-5, 2e-5), (1e-5, 1e-5), (-1e-5, -1e-5), (-0.5, -2e-5)]

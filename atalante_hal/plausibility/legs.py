@@ -120,7 +120,7 @@ class Legs:
                 self._moved[joint], self._turned[joint] = said, 0
                 continue
             change = said.errors[axis] - moved.errors[axis]
-            turned = max(abs(now - then) for now, then in zip(said.angles, moved.angles, strict=True))
+            turned = max(abs(angle - moved.angles[i]) for i, angle in enumerate(said.angles))
             # Who changed while the leg did not turn is no encoder that stands still, but one that jumped or drifted before.
             if min(abs(change), turned) <= self._attitude_change + self._misalignment * turned:
                 self._turned[joint] = 0
