@@ -17,13 +17,11 @@ from atalante_hal.frame import FLAG_BRS, FLAG_FDF, WORDS, Frames, new_frames
 
 Vector = npt.NDArray[np.float64]
 Words = npt.NDArray[np.int64]
-Plan = npt.NDArray[np.void]
 
-#: What is done with a signal: where it stands, which codes it may have, and what they mean: (code + base) * factor + offset.
-PLAN = np.dtype(
-    [(name, np.int64) for name in ("word", "place", "mask", "largest", "low", "high", "invalid")]
-    + [(name, np.float64) for name in ("base", "factor", "offset")]
-)
+#: Rows of a plan, one column a signal: where it stands and which codes it may have.
+WORD, PLACE, MASK, LARGEST, LOW, HIGH, INVALID = range(7)
+#: Rows of the scales: what a code means, (code + base) * factor + offset.
+BASE, FACTOR, OFFSET = range(3)
 #: In the place of an invalid code, or of a signal: there is none.
 NO_CODE = -1
 #: Adding this to a float and taking it away again rounds it to an integer.
@@ -65,28 +63,28 @@ class Codec:
         self._compile([s for _, _, s in entries])
 
     def _compile(self, signals: list[Signal]) -> None:
-        plan = self.plan = np.zeros(len(signals), PLAN)
-        for entry, row, s in zip(plan, self.row_of.tolist(), signals, strict=True):
-            entry["word"], entry["place"] = row * WORDS + 1 + s.start // 64, s.start % 64
-            entry["mask"], entry["largest"] = (1 << s.length) - 1, (1 << s.length - s.signed) - 1
-            entry["low"], entry["high"] = sorted(round((x - s.offset) / s.factor) for x in (s.minimum, s.maximum))
-            entry["invalid"] = NO_CODE if s.invalid_raw is None else s.invalid_raw
+        plan, scales = [], []
+        for row, s in zip(self.row_of.tolist(), signals, strict=True):
+            low, high = sorted(round((x - s.offset) / s.factor) for x in (s.minimum, s.maximum))
+            mask, largest = (1 << s.length) - 1, (1 << s.length - s.signed) - 1
+            invalid = NO_CODE if s.invalid_raw is None else s.invalid_raw
+            plan.append((row * WORDS + 1 + s.start // 64, s.start % 64, mask, largest, low, high, invalid))
             # An offset that is a whole number of codes is added to the code, which is exact.
             code = s.offset / s.factor
             exact = code == round(code) and round(code) * s.factor == s.offset
-            entry["base"], entry["factor"], entry["offset"] = (
-                (code, s.factor, 0.0) if exact else (0.0, s.factor, s.offset)
-            )
+            scales.append((code, s.factor, 0.0) if exact else (0.0, s.factor, s.offset))
+        #: For the loops below: shapes (7, size) and (3, size).
+        self.plan: Words = np.array(plan, np.int64).T.copy()
+        self.scales: Vector = np.array(scales).T.copy()
         #: Payload words that carry a signal.
-        self.words = np.unique(plan["word"])
+        self.words: Words = np.unique(self.plan[WORD])
         #: Raw code of every signal, of the last `decode` or `encode`.
         self.codes = np.zeros(self.size, np.int64)
         self._decode, self._encode = compiled(decode), compiled(encode)
         # Decoding one row alone: place of the value, bits, largest code, range, scale.
         self._one_by_one: list[list[tuple[int, int, int, int, int, int, float, float]]] = [[] for _ in self.messages]
-        columns = (plan[name].tolist() for name in ("mask", "largest", "low", "high"))
-        for i, (row, s, *codes) in enumerate(zip(self.row_of.tolist(), signals, *columns, strict=True)):
-            mask, largest, low, high = codes
+        for i, (row, s, codes) in enumerate(zip(self.row_of.tolist(), signals, plan, strict=True)):
+            mask, largest, low, high = codes[MASK : HIGH + 1]
             self._one_by_one[row].append((i, s.start, mask, largest, low, high, s.factor, s.offset))
         self._invalid_codes = [
             [(s.start, (1 << s.length) - 1, s.invalid_raw) for s in m.signals if s.invalid_raw is not None]
@@ -129,11 +127,11 @@ class Codec:
         Returns:
             Whether every signal is inside its DBC range (an invalid code is outside it).
         """
-        return self._decode(frames.view(np.int64), self.plan, self.codes, out)
+        return self._decode(frames.view(np.int64), self.plan, self.scales, self.codes, out)
 
     def rows_outside(self) -> list[int]:
         """Rows with a signal outside its range, of the last `decode`."""
-        outside = (self.codes < self.plan["low"]) | (self.codes > self.plan["high"])
+        outside = (self.codes < self.plan[LOW]) | (self.codes > self.plan[HIGH])
         return sorted(set(self.row_of[outside].tolist()))
 
     def decode_row(self, row: int, payload: bytes, out: Vector) -> bool:
@@ -172,7 +170,8 @@ class Codec:
         Raises:
             ValueError: NaN for a signal without an invalid code.
         """
-        self.require_code(self._encode(values, self.plan, self.words, self.codes, frames.view(np.int64)))
+        words = frames.view(np.int64)
+        self.require_code(self._encode(values, self.plan, self.scales, self.words, self.codes, words))
 
     def require_code(self, nameless: int) -> None:
         """Raise `ValueError` for what `encode` returned, unless every value had a code."""
@@ -181,38 +180,41 @@ class Codec:
             raise ValueError(f"{message.name}.{signal.name} is NaN and has no invalid code in the DBC")
 
 
-def decode(words: Words, plan: Plan, codes: Words, values: Vector) -> bool:
+def decode(words: Words, plan: Words, scales: Vector, codes: Words, values: Vector) -> bool:
     """Raw codes and physical values of all signals; returns whether every code is in its range.
 
     Args:
         words: flat view of the frames, shape (rows * 9,).
-        plan: shape (size,), like `codes` and `values`, which are rewritten.
+        plan, scales: of the codec.
+        codes, values: shape (size,), rewritten.
     """
     inside = read_codes(words, plan, codes)
-    scale(codes, plan, values)
+    scale(codes, scales, values)
     return inside
 
 
-def read_codes(words: Words, plan: Plan, codes: Words) -> bool:
+def read_codes(words: Words, plan: Words, codes: Words) -> bool:
     """First half of decoding: raw codes; returns whether every one is in its range."""
+    word, place, mask, largest = plan[WORD], plan[PLACE], plan[MASK], plan[LARGEST]
+    low, high = plan[LOW], plan[HIGH]
     inside = True
-    for i in range(len(plan)):
-        signal = plan[i]
-        code = words[signal["word"]] >> signal["place"] & signal["mask"]
-        if code > signal["largest"]:  # of a signed signal: negative
-            code -= signal["mask"] + 1
+    for i in range(len(codes)):
+        code = words[word[i]] >> place[i] & mask[i]
+        if code > largest[i]:  # of a signed signal: negative
+            code -= mask[i] + 1
         codes[i] = code
-        inside &= signal["low"] <= code <= signal["high"]
+        inside &= low[i] <= code <= high[i]
     return inside
 
 
-def scale(codes: Words, plan: Plan, values: Vector) -> None:
+def scale(codes: Words, scales: Vector, values: Vector) -> None:
     """Second half of decoding: raw codes to physical values."""
-    for i in range(len(plan)):
-        values[i] = (codes[i] + plan[i]["base"]) * plan[i]["factor"] + plan[i]["offset"]
+    base, factor, offset = scales[BASE], scales[FACTOR], scales[OFFSET]
+    for i in range(len(codes)):
+        values[i] = (codes[i] + base[i]) * factor[i] + offset[i]
 
 
-def encode(values: Vector, plan: Plan, targets: Words, codes: Words, words: Words) -> int:
+def encode(values: Vector, plan: Words, scales: Vector, targets: Words, codes: Words, words: Words) -> int:
     """Physical values into the payload words; values outside their range as the nearest valid code, NaN as the invalid one.
 
     Args:
@@ -222,23 +224,24 @@ def encode(values: Vector, plan: Plan, targets: Words, codes: Words, words: Word
     Returns:
         `NO_CODE`; or a signal that is NaN and has no invalid code, and then nothing was written.
     """
-    for i in range(len(plan)):
-        signal, value = plan[i], values[i]
+    base, factor, offset = scales[BASE], scales[FACTOR], scales[OFFSET]
+    low, high, invalid = plan[LOW], plan[HIGH], plan[INVALID]
+    for i in range(len(codes)):
         # Rounds to even; infinities and NaN stay what they are.
-        code = ((value - signal["offset"]) / signal["factor"] + (_ROUND - signal["base"])) - _ROUND
-        if signal["low"] <= code <= signal["high"]:
+        code = ((values[i] - offset[i]) / factor[i] + (_ROUND - base[i])) - _ROUND
+        if low[i] <= code <= high[i]:
             codes[i] = int(code)
-        elif code < signal["low"]:
-            codes[i] = signal["low"]
-        elif code > signal["high"]:
-            codes[i] = signal["high"]
-        elif signal["invalid"] == NO_CODE:
+        elif code < low[i]:
+            codes[i] = low[i]
+        elif code > high[i]:
+            codes[i] = high[i]
+        elif invalid[i] == NO_CODE:
             return i
         else:
-            codes[i] = signal["invalid"]
+            codes[i] = invalid[i]
     for target in targets:
         words[target] = 0
-    for i in range(len(plan)):
-        signal = plan[i]
-        words[signal["word"]] |= (codes[i] & signal["mask"]) << signal["place"]
+    word, place, mask = plan[WORD], plan[PLACE], plan[MASK]
+    for i in range(len(codes)):
+        words[word[i]] |= (codes[i] & mask[i]) << place[i]
     return NO_CODE

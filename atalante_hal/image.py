@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc import Message
-from atalante_hal.codec import NO_CODE, Codec, Plan, Vector, Words, encode, read_codes, scale
+from atalante_hal.codec import NO_CODE, Codec, Vector, Words, encode, read_codes, scale
 from atalante_hal.compiled import compiled
 from atalante_hal.e2e import (
     COUNTER_BYTE,
@@ -157,6 +157,7 @@ class ReceiveImage:
             self._counters,
             _NO_TAG if tag is None else tag,
             self.codec.plan,
+            self.codec.scales,
             self.codec.codes,
             self.values,
             self.values_before,
@@ -239,7 +240,8 @@ def accept_exact(
     spans: Words,
     counters: Words,
     tag: int,
-    plan: Plan,
+    plan: Words,
+    scales: Vector,
     codes: Words,
     values: Vector,
     values_before: Vector,
@@ -253,7 +255,7 @@ def accept_exact(
         spans: of `e2e.protected_spans`.
         counters: of the last frames, and the next ones, shape (2, rows); moved on.
         tag: counter all have to carry, or `_NO_TAG`.
-        plan, codes: of the codec.
+        plan, scales, codes: of the codec.
         values, values_before: shape (size,); the new ones, and what they were.
         kept: the last good frames, shape (rows * 9,); rewritten.
 
@@ -266,7 +268,7 @@ def accept_exact(
     if not (intact(octets, spans, counters[1]) and read_codes(words, plan, codes)):
         return False
     values_before[:] = values
-    scale(codes, plan, values)
+    scale(codes, scales, values)
     kept[:] = words
     for row in range(len(headers)):
         counters[0, row] = counters[1, row]
@@ -305,6 +307,7 @@ class TransmitImage:
         nameless = self._seal(
             self.values,
             codec.plan,
+            codec.scales,
             codec.words,
             codec.codes,
             self._words,
@@ -348,7 +351,8 @@ class TransmitImage:
 
 def seal(
     values: Vector,
-    plan: Plan,
+    plan: Words,
+    scales: Vector,
     targets: Words,
     codes: Words,
     words: Words,
@@ -362,7 +366,7 @@ def seal(
     Args:
         counter: of every row, or `_NO_TAG`: one more than its last.
     """
-    nameless = encode(values, plan, targets, codes, words)
+    nameless = encode(values, plan, scales, targets, codes, words)
     if nameless == NO_CODE:
         for row in range(len(counters)):
             counters[row] = counters[row] + 1 & 0xFF if counter == _NO_TAG else counter
