@@ -441,6 +441,17 @@ class TestDrift:
             turned = hip_angles((-quaternions[IMUS.index("pelvis")]).tolist(), quaternions[tibia].tolist())
             assert turned == pytest.approx(expected, abs=1e-9)
 
+    @pytest.mark.parametrize("heading", [(0.5, 0.5, 0.5, 0.5), (0.5, -0.5, 0.5, 0.5), (0.1, 0.7, -0.1, 0.7)])
+    def test_angles_between_two_attitudes_are_the_same_wherever_both_point(self, heading: tuple[float, ...]):
+        """The robot of the tests hangs with its pelvis straight; a wearer walks where he likes."""
+        position = np.array([0.2, -0.3, 0.5, 0.4, 0.0, 0.0] * 2)
+        whole = pinocchio.Quaternion(np.array(heading)).normalized()
+        quaternions = []
+        for w, x, y, z in attitudes(position)[[IMUS.index("pelvis"), IMUS.index("left_tibia")]]:
+            x, y, z, w = (whole * pinocchio.Quaternion(np.array([x, y, z, w]))).coeffs()
+            quaternions.append([w, x, y, z])
+        assert hip_angles(*quaternions) == pytest.approx((0.2, -0.3, 0.9), abs=1e-9)
+
     def test_a_sine_beyond_one_is_a_right_angle(self):
         half = math.sqrt(0.5) * (1.0 + 1e-5)
         assert hip_angles([1.0, 0.0, 0.0, 0.0], [half, 0.0, 0.0, half])[1] == math.pi / 2.0
