@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
@@ -227,10 +228,16 @@ def _announce(controller: HangController, xi: float) -> bool:
     return certificate.certified
 
 
+#: Processor cores for HAL, telemetry and a robot in a process of its own.
+_CORES = 3
+
+
 def _start_robot(target: Target, stack: ExitStack) -> EmbeddedRobot | None:
+    """A process for the embedded robot, where it gets a core of its own: sharing one, each waits for the other."""
     from atalante_tools.embedded import EmbeddedRobot
 
-    return stack.enter_context(EmbeddedRobot()) if target.embedded else None
+    apart = target.embedded and len(os.sched_getaffinity(0)) >= _CORES
+    return stack.enter_context(EmbeddedRobot()) if apart else None
 
 
 def _open(
