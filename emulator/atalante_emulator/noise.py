@@ -11,18 +11,11 @@ from atalante_emulator.drive import Drives
 from atalante_emulator.foot import Feet
 from atalante_emulator.imu import Imus
 from atalante_hal.codec import Codec
-from atalante_hal.compiled import compiled
 
 Vector = npt.NDArray[np.float64]
 
 #: Cycles drawn at once.
 NOISE_CYCLES: Final = 128
-
-
-def _add(noise: Vector, row: int, truth: Vector, values: Vector) -> None:
-    """The truth and one row of the noise, in `values`. Shapes (cycles, n), (n,), (n,)."""
-    for i in range(len(values)):
-        values[i] = truth[i] + noise[row, i]
 
 
 class SensorNoise:
@@ -39,12 +32,10 @@ class SensorNoise:
             np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3)
         )
         self._bias = imus.draw_bias(self._of_imus)
-        self._add = compiled(_add)
-        self.add(0, np.zeros(codec.size), np.zeros(codec.size))  # is compiled now, not in the first cycle
 
     def add(self, cycle: int, truth: Vector, values: Vector) -> None:
         """What the sensors say in a cycle, in `values`: the truth and its noise. Shape (codec.size,)."""
-        self._add(self._noise, cycle % NOISE_CYCLES, truth, values)
+        np.add(truth, self._noise[cycle % NOISE_CYCLES], values)
 
     def draw(self) -> None:
         """The next `NOISE_CYCLES` cycles."""
