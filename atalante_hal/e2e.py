@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc import Message
-from atalante_hal.frame import FRAME_BYTES
+from atalante_hal.frame import FRAME_BYTES, HEADER_BYTES
 
 Octets = npt.NDArray[np.uint8]
 Words = npt.NDArray[np.int64]
@@ -66,14 +66,13 @@ def crc(protected: bytes | memoryview, data_id: bytes) -> int:
 
 #: What a byte at the head of the CRC makes of it.
 _TABLE = np.array([crc_hqx(bytes([octet]), 0) for octet in range(256)], np.int64)
-_PAYLOAD = 8  # first byte of the payload in a frame
 
 
 def protected_spans(messages: Sequence[Message]) -> Words:
     """Where the payload of each row of frames begins and ends, and its Data ID. Shape (rows, 3)."""
     spans = []
     for row, message in enumerate(messages):
-        begin = row * FRAME_BYTES + _PAYLOAD
+        begin = row * FRAME_BYTES + HEADER_BYTES
         spans.append((begin, begin + message.length, message.data_id))
     return np.array(spans)
 

@@ -14,6 +14,8 @@ import numpy.typing as npt
 #: `struct canfd_frame` of linux/can.h.
 FRAME = np.dtype([("can_id", "<u4"), ("len", "u1"), ("flags", "u1"), ("res", "u1", 2), ("data", "u1", 64)])
 FRAME_BYTES = FRAME.itemsize
+#: Bytes of a record before its payload.
+HEADER_BYTES = FRAME_BYTES - FRAME["data"].itemsize
 #: A record as nine 64-bit words: one header word, eight payload words.
 WORDS = FRAME_BYTES // 8
 _WORD = np.dtype("<u8")

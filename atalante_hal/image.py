@@ -27,9 +27,8 @@ from atalante_hal.e2e import (
     protect,
     protected_spans,
 )
-from atalante_hal.frame import WORDS, Frames, as_words, new_frames
+from atalante_hal.frame import HEADER_BYTES, WORDS, Frames, as_words, new_frames
 
-_HEADER_BYTES = 8
 #: In the place of a counter: nothing was ever received.
 _NOTHING = -1
 #: In the place of a cycle tag: the senders count for themselves.
@@ -76,8 +75,8 @@ class ReceiveImage:
         self._data_ids = [data_id_bytes(m.data_id) for m in self.codec.messages]
         self._lengths = [m.length for m in self.codec.messages]
         self._spans = protected_spans(self.codec.messages)
-        #: Counter of the last frame of each row, and what it should be next.
-        self._counters: Words = np.full((2, count), _NOTHING)
+        #: Counter the next frame of each row should carry.
+        self._expected: Words = np.full(count, _NOTHING)
         #: The values before the last `accept`.
         self.values_before = self.values.copy()
         self._age_before: npt.NDArray[np.int64] = self.age.copy()
@@ -154,7 +153,7 @@ class ReceiveImage:
             received.octets,
             self._headers,
             self._spans,
-            self._counters,
+            self._expected,
             _NO_TAG if tag is None else tag,
             self.codec.plan,
             self.codec.scales,
@@ -189,7 +188,7 @@ class ReceiveImage:
                 else:
                     self._refuse_frame(row, Check.LENGTH)
                 continue
-            payload = words[place].tobytes()[_HEADER_BYTES : _HEADER_BYTES + self._lengths[row]]
+            payload = words[place].tobytes()[HEADER_BYTES : HEADER_BYTES + self._lengths[row]]
             result = self._judge(row, payload, tag)
             if result <= _FRESH and not self.codec.decode_row(row, payload, self.values):
                 result = Check.INVALID if self.codec.says_invalid(row, payload) else Check.RANGE
@@ -210,15 +209,15 @@ class ReceiveImage:
         if crc(payload[CRC_BYTES:], self._data_ids[row]) != int.from_bytes(payload[:CRC_BYTES], "little"):
             self.crc_errors += 1
             return Check.CRC
-        counter, last = payload[COUNTER_BYTE], int(self._counters[0, row])
-        known = last != _NOTHING
-        result = check_counter(last if known else None, counter)
+        counter, expected = payload[COUNTER_BYTE], int(self._expected[row])
+        last = None if expected == _NOTHING else expected - 1 & 0xFF
+        result = check_counter(last, counter)
         if tag is not None and result is not Check.REPEATED:
             # An answer to no SYNC of the last cycles, or older than what is known already, says nothing about what comes next.
-            behind = known and counter - last & 0xFF >= _HALF_TURN
+            behind = last is not None and counter - last & 0xFF >= _HALF_TURN
             if tag - counter & 0xFF >= LATEST or behind:
                 return Check.WRONG_SEQUENCE
-        self._counters[:, row] = counter, counter + 1 & 0xFF
+        self._expected[row] = counter + 1 & 0xFF
         return Check.SOME_LOST if result is Check.WRONG_SEQUENCE and self._restarts else result
 
 
@@ -238,7 +237,7 @@ def accept_exact(
     octets: Octets,
     headers: Words,
     spans: Words,
-    counters: Words,
+    expected: Words,
     tag: int,
     plan: Words,
     scales: Vector,
@@ -253,7 +252,7 @@ def accept_exact(
         words, octets: views of the frames received, shapes (rows * 9,) and (rows * 72,).
         headers: first word of each message, shape (rows,).
         spans: of `e2e.protected_spans`.
-        counters: of the last frames, and the next ones, shape (2, rows); moved on.
+        expected: counter of each row, shape (rows,); moved on.
         tag: counter all have to carry, or `_NO_TAG`.
         plan, scales, codes: of the codec.
         values, values_before: shape (size,); the new ones, and what they were.
@@ -263,16 +262,15 @@ def accept_exact(
         Whether they were; if not, nothing was changed.
     """
     for row in range(len(headers)):
-        if words[row * WORDS] != headers[row] or (tag != _NO_TAG and counters[1, row] != tag):
+        if words[row * WORDS] != headers[row] or (tag != _NO_TAG and expected[row] != tag):
             return False
-    if not (intact(octets, spans, counters[1]) and read_codes(words, plan, codes)):
+    if not (intact(octets, spans, expected) and read_codes(words, plan, codes)):
         return False
     values_before[:] = values
     scale(codes, scales, values)
     kept[:] = words
     for row in range(len(headers)):
-        counters[0, row] = counters[1, row]
-        counters[1, row] = counters[1, row] + 1 & 0xFF
+        expected[row] = expected[row] + 1 & 0xFF
     return True
 
 

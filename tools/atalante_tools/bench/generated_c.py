@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from atalante_dbc import DBC_FILE, Message
 from atalante_hal.codec import Codec
-from atalante_hal.frame import FRAME_BYTES, Frames
+from atalante_hal.frame import FRAME_BYTES, HEADER_BYTES, Frames
 
 Vector = npt.NDArray[np.float64]
 
@@ -31,7 +31,6 @@ COMPILER = "gcc"
 #: -Bsymbolic: calls inside the library are direct, as in a program of its own.
 OPTIONS = ("-O2", "-fPIC")
 LINK_OPTIONS = ("-shared", "-Wl,-Bsymbolic")
-_HEADER = 8  # bytes of a frame record before the payload
 
 _TIMED = """
 int64_t {name}({parameters}, int64_t repetitions)
@@ -144,7 +143,7 @@ def _encode_one(codec: Codec, row: int, message: Message) -> str:
 
 
 def _payload(row: int) -> int:
-    return row * FRAME_BYTES + _HEADER
+    return row * FRAME_BYTES + HEADER_BYTES
 
 
 def _c_name(name: str) -> str:

@@ -24,7 +24,7 @@ from atalante_dbc import Message, Network
 from atalante_hal.bus import Stamps
 from atalante_hal.cia402 import DriveState
 from atalante_hal.e2e import COUNTER_BYTE
-from atalante_hal.frame import FRAME_BYTES, Frames, new_frames
+from atalante_hal.frame import FRAME_BYTES, HEADER_BYTES, Frames, new_frames
 from atalante_hal.hal import Hal
 from atalante_hal.image import TransmitImage
 from atalante_hal.robot import JOINTS, Robot, load_robot
@@ -42,7 +42,6 @@ ERROR = 0.01
 ERROR_RATE = 0.05
 PERIOD = 1e-3  # s
 ASSISTANCE = 0.5
-_HEADER = 8  # bytes of a frame record before the payload
 _E2E = Struct("<HB")
 
 
@@ -150,7 +149,7 @@ class Recording:
             self._slow_turn[row] = (turn + 1) % TURN
             at = row * FRAME_BYTES
             place[:] = self._slow.payloads[0][at : at + FRAME_BYTES]
-            _E2E.pack_into(place, _HEADER, self._slow.checksums[turn, row], turn)
+            _E2E.pack_into(place, HEADER_BYTES, self._slow.checksums[turn, row], turn)
         return len(self.cyclic) + len(due)
 
 
@@ -176,7 +175,7 @@ def _e2e_fields(frames: Frames) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.u
         frames.view(np.uint8).reshape(-1, FRAME_BYTES),
         frames.view(np.uint16).reshape(-1, FRAME_BYTES // 2),
     )
-    return octets[:, _HEADER + COUNTER_BYTE], halves[:, _HEADER // 2]
+    return octets[:, HEADER_BYTES + COUNTER_BYTE], halves[:, HEADER_BYTES // 2]
 
 
 def _walking(walk: Walk, image: TransmitImage) -> Vector:

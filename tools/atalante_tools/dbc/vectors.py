@@ -21,7 +21,7 @@ import numpy.typing as npt
 from atalante_dbc import Message, Signal
 from atalante_hal.codec import Vector
 from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
-from atalante_hal.frame import FRAME_BYTES
+from atalante_hal.frame import FRAME_BYTES, HEADER_BYTES
 from atalante_hal.image import TransmitImage
 
 if TYPE_CHECKING:
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 MAGIC: Final = b"ATVEC\x00\x00\x01"
 HEADER: Final = Struct("<8sII")
-#: Where the payload begins in a frame record.
-_PAYLOAD: Final = 8
 
 
 class Vectors:
@@ -45,10 +43,10 @@ class Vectors:
         self._decoded = np.empty(codec.size)
         self._in_range = np.ones(len(build.messages), np.uint8)
         octets = self._received.view(np.uint8).reshape(-1, FRAME_BYTES)
-        self._counters = octets[:, _PAYLOAD + COUNTER_BYTE]
-        self._crcs = octets.view("<u2")[:, _PAYLOAD // 2]
+        self._counters = octets[:, HEADER_BYTES + COUNTER_BYTE]
+        self._crcs = octets.view("<u2")[:, HEADER_BYTES // 2]
         self._protected = [
-            (row.data[_PAYLOAD + CRC_BYTES : _PAYLOAD + m.length], data_id_bytes(m.data_id))
+            (row.data[HEADER_BYTES + CRC_BYTES : HEADER_BYTES + m.length], data_id_bytes(m.data_id))
             for row, m in zip(octets, build.messages, strict=True)
         ]
         self._minimum = np.array([s.minimum for _, s in codec.signals])
@@ -70,7 +68,7 @@ class Vectors:
             return [place + byte for place in places for byte in range(8)]
 
         def payload(start: int, row: int, message: Message) -> range:
-            first = start + FRAME_BYTES * row + _PAYLOAD
+            first = start + FRAME_BYTES * row + HEADER_BYTES
             return range(first, first + message.length)
 
         order: list[int] = []

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from atalante_hal.bulk import crc_differences, crc_of_zeros
 from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES
-from atalante_hal.frame import FRAME_BYTES, Frames, new_frames
+from atalante_hal.frame import FRAME_BYTES, HEADER_BYTES, Frames, new_frames
 from atalante_tools.bench.measure import Block, Effort, Measurement, require
 from atalante_tools.validate.plan import Plan
 from atalante_tools.validate.project import Project
@@ -31,7 +31,6 @@ _QUICK_CYCLES, _QUICK_REPEATED = 300, 2
 _SLICE = 30_000
 _MS = 1_000_000  # ns
 _BEGIN = 1_700_000_000 * 1000 * _MS
-_HEADER_BYTES = 8
 _LENGTHS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64])
 
 
@@ -176,11 +175,11 @@ def _repeat(
         if not len(rows):
             continue
         of = octets[rows]
-        of[:, _HEADER_BYTES + COUNTER_BYTE] = np.arange(len(rows))
-        of[:, _HEADER_BYTES : _HEADER_BYTES + CRC_BYTES] = 0
+        of[:, HEADER_BYTES + COUNTER_BYTE] = np.arange(len(rows))
+        of[:, HEADER_BYTES : HEADER_BYTES + CRC_BYTES] = 0
         right = crc_differences(of.reshape(-1).view(whole.dtype), message.length)
         right ^= np.uint16(crc_of_zeros(message.length, message.data_id))
-        of[:, _HEADER_BYTES : _HEADER_BYTES + CRC_BYTES] = right[:, None].view(np.uint8)
+        of[:, HEADER_BYTES : HEADER_BYTES + CRC_BYTES] = right[:, None].view(np.uint8)
         octets[rows] = of
     offset = np.repeat(np.arange(times) * cycles, len(frames))
     return whole, np.tile(cycle, times) + offset, np.tile(sent, times)

@@ -7,14 +7,13 @@ import numpy.typing as npt
 
 from atalante_hal.bulk import crc_differences
 from atalante_hal.e2e import COUNTER_BYTE
-from atalante_hal.frame import FRAME_BYTES
+from atalante_hal.frame import FRAME_BYTES, HEADER_BYTES
 from atalante_tools.validate.findings import Findings
 from atalante_tools.validate.plan import Plan, Rows
 from atalante_tools.validate.stream import Stream
 
 Steps = npt.NDArray[np.int64]
 
-_HEADER_BYTES = 8
 #: Steps of a message without a counter, or before which nothing was received.
 NO_STEPS = 0
 
@@ -87,7 +86,7 @@ class Counters:
 
     def steps(self, stream: Stream) -> Steps:
         """Counter steps of each frame; `NO_STEPS - 1` where there is nothing to compare with. Shape (n,)."""
-        counters = stream.frames.view(np.uint8).reshape(-1, FRAME_BYTES)[:, _HEADER_BYTES + COUNTER_BYTE].copy()
+        counters = stream.frames.view(np.uint8).reshape(-1, FRAME_BYTES)[:, HEADER_BYTES + COUNTER_BYTE].copy()
         steps = counter_steps(counters, stream.before(counters, self._last))
         steps[stream.starts[~self._seen[stream.present]]] = NO_STEPS - 1
         if not bool(self._protected[stream.present].all()):
