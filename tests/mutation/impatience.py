@@ -11,7 +11,11 @@ from collections import Counter
 from collections.abc import Iterator
 
 import pytest
+from mutmut.mutation.trampoline import get_mutant_under_test
 from mutmut.state import state
+
+#: In the name of every mutant.
+MUTANT = "__mutmut_"
 
 #: CPU time [s] a test may take, and times its usual duration on top.
 AT_LEAST, TIMES = 2.0, 4.0
@@ -33,7 +37,9 @@ def _fail(number: int, frame: object) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
-    if usual := state().duration_by_test.get(item.nodeid):
+    usual = state().duration_by_test.get(item.nodeid)
+    # Not in the run without a mutant: how long a test took is from the last run, and it may have grown since.
+    if usual and MUTANT in get_mutant_under_test():
         signal.signal(signal.SIGPROF, _fail)
         signal.setitimer(signal.ITIMER_PROF, AT_LEAST + TIMES * usual)
     try:
