@@ -104,9 +104,11 @@ def run(
     late_in_row = 0
     active = False
     controller_record, telemetry = hal.controller_record, controller.telemetry
-    # What lives now lives as long as the run: the collector need not look at it again and again.
-    gc.collect()
-    gc.freeze()
+    # What lives now lives as long as the run: the collector need not look at it again and again. Who froze it before keeps it so.
+    frozen = gc.get_freeze_count() > 0
+    if not frozen:
+        gc.collect()
+        gc.freeze()
     start = time.perf_counter()
     try:
         while True:
@@ -136,7 +138,8 @@ def run(
     finally:
         statistics.cycles = len(costs)
         statistics.wall = time.perf_counter() - start
-        gc.unfreeze()
+        if not frozen:
+            gc.unfreeze()
         hal.stop()
     return statistics
 

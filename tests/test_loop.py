@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import numpy as np
 import pytest
 
@@ -109,6 +111,25 @@ def test_the_loop_ends_in_hold_whatever_ends_it(make_rig):
     with pytest.raises(KeyboardInterrupt):
         run(rig.hal, Recorder(), LockStep(), until=interrupt)
     assert rig.hal.state.supervisor is S.HOLD
+
+
+@pytest.mark.parametrize("frozen", [False, True], ids=["nobody froze before", "the caller froze"])
+def test_the_collector_leaves_alone_what_was_there_before_the_run(make_rig, monkeypatch, frozen):
+    collected = []
+    monkeypatch.setattr(gc, "collect", lambda: collected.append("collect"))
+    gc.unfreeze()
+    if frozen:
+        gc.freeze()
+    during = []
+    try:
+        rig = make_rig()
+        run(rig.hal, Recorder(), LockStep(), until=after(2), record=lambda: during.append(gc.get_freeze_count()))
+        after_it = gc.get_freeze_count()
+    finally:
+        gc.freeze()
+    assert min(during) > 0
+    assert (after_it > 0) is frozen
+    assert collected == ([] if frozen else ["collect"])
 
 
 def test_deadlines_are_absolute_and_a_missed_one_is_not_made_up_for():

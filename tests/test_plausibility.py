@@ -920,7 +920,7 @@ NOTHING, EVEN = [0.0] * 4, [100.0] * 4
 class TestPlates:
     def test_at_first_nothing_is_known(self):
         feet = Plates().feet
-        assert (feet.on_ground, feet.swing, feet.cells, feet.findings()) == (False, None, {}, ())
+        assert (feet.swing, feet.cells, feet.findings()) == (None, {}, ())
 
     @pytest.mark.parametrize("foot", [0, 1])
     @pytest.mark.parametrize("cell", range(4))
