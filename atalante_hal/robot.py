@@ -178,7 +178,9 @@ def load_robot(path: Path | None = None) -> Robot:
     try:
         raw = path.read_bytes()
         document = tomllib.loads(raw.decode())
-    except (OSError, ValueError, RecursionError) as error:
+    except OSError as error:
+        raise RobotError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
         raise RobotError(f"{path}: {error}") from error
     if set(document) != {"joints", *_TABLES}:
         raise RobotError(f"{path}: the top-level tables are joints, {', '.join(_TABLES)}, found {sorted(document)}")

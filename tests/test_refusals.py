@@ -24,10 +24,12 @@ import atalante_control.gait
 import atalante_dbc.loader
 import atalante_hal.robot
 from atalante_control.gait import HANG_GAIT, GaitError, check_gait, load_gait
+from atalante_control.generation.library import Library, LibraryError
 from atalante_dbc import DBC_FILE, DbcError
 from atalante_hal.image import ReceiveImage, TransmitImage
 from atalante_hal.robot import JOINTS, LEG_JOINTS, ROBOT_FILE, RobotError, load_robot
 from atalante_tools.cli import cli
+from atalante_tools.validate.project import ProjectError, load_project
 
 ROBOT = tomllib.loads(ROBOT_FILE.read_text())
 KEYS = tuple(ROBOT["joints"]["FH"])
@@ -269,6 +271,27 @@ def test_the_command_line_refuses_to_start_in_one_sentence(
     assert result.stderr.startswith(f"atalante: {said}{path}")
     assert result.stderr.count("\n") == 1
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("load", "error"),
+    [
+        (load_robot, RobotError),
+        (lambda path: load_gait(path, load_robot()), GaitError),
+        (atalante_dbc.load, DbcError),
+        (load_project, ProjectError),
+        (lambda path: Library(path.parent), LibraryError),
+    ],
+    ids=["robot", "gait", "DBC", "rules", "library"],
+)
+def test_a_file_that_cannot_be_read_is_named_with_the_reason(
+    tmp_path: Path, load: Callable[[Path], object], error: type[Exception]
+) -> None:
+    folder = tmp_path / "grid.json"
+    folder.mkdir()
+    with pytest.raises(error) as refused:
+        load(folder)
+    assert str(refused.value) == f"{folder} cannot be read: Is a directory"
 
 
 def test_the_gait_that_is_shipped_is_checked_without_its_file() -> None:

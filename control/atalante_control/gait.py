@@ -151,7 +151,9 @@ def load_gait(path: Path, robot: Robot) -> Gait:
         document = json.loads(
             path.read_text(encoding="utf-8"), parse_constant=_refuse_constant, object_pairs_hook=_without_twins
         )
-    except (OSError, ValueError, RecursionError) as error:
+    except OSError as error:
+        raise GaitError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
         raise GaitError(f"{path}: {error}") from error
     if not isinstance(document, dict):
         raise GaitError(f"{path}: a gait file is a JSON object with the keys {', '.join(_REQUIRED)}")

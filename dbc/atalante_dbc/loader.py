@@ -55,7 +55,9 @@ def load(path: Path | None = None) -> Network:
         database = cantools.database.load_string(text, database_format="dbc", strict=False)
     except DbcError:
         raise
-    except (OSError, ValueError, CantoolsError) as error:
+    except OSError as error:
+        raise DbcError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, CantoolsError) as error:
         raise DbcError(f"{path}: {error}") from error
     assert isinstance(database, Database)
     _refuse(path, missing(text))

@@ -96,7 +96,9 @@ class Library:
         path = folder / "grid.json"
         try:
             found = _read_grid(path) if path.exists() else None
-        except (OSError, TypeError, ValueError) as error:
+        except OSError as error:
+            raise LibraryError(f"{path} cannot be read: {error.strerror}") from error
+        except (TypeError, ValueError) as error:
             raise LibraryError(f"{path}: {error}") from error
         if found is None:
             if grid is None:

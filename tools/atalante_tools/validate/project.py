@@ -94,7 +94,9 @@ def load_project(path: Path) -> Project:
     """
     try:
         document = tomllib.loads(path.read_text())
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except OSError as error:
+        raise ProjectError(f"{path} cannot be read: {error.strerror}") from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ProjectError(f"{path} cannot be read as TOML: {error}") from error
     silences = document.pop("silence", [])
     channels = document.pop("channels", {})
