@@ -91,7 +91,9 @@ _counts_key = pytest.StashKey[list[tuple[int, int]]]()
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[_witness_key] = Witness()
     config.stash[_counts_key] = []
-    hal_witness.start(str(config.stash[_witness_key].folder))
+    # With xdist the tests run in its workers, which load this file, too.
+    if hasattr(config, "workerinput") or not config.getoption("numprocesses", None):
+        hal_witness.start(str(config.stash[_witness_key].folder))
 
 
 def pytest_collection_finish() -> None:
