@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,9 +21,12 @@ from atalante_hal.diagnostics import Dtc
 from atalante_hal.e2e import Check
 from atalante_hal.image import ReceiveImage
 from atalante_hal.plausibility import Finding, Plausibility
+from atalante_hal.plausibility.encoders import Encoders
 from atalante_hal.plausibility.feet import Feet
 from atalante_hal.plausibility.finding import Signals, measured, signals_of
+from atalante_hal.plausibility.imus import Imus
 from atalante_hal.plausibility.legs import Legs, _Contradiction, _forgotten, hip_angles
+from atalante_hal.plausibility.stillness import Stillness
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, load_robot
 
 NETWORK = atalante_dbc.load()
@@ -66,6 +70,7 @@ class Machine:
     cycles: int = 0
     missing: set[int] = field(default_factory=set)  # rows that are not heard
     late: dict[int, int] = field(default_factory=dict)  # rows whose data is so many cycles old
+    gaps: set[int] = field(default_factory=set)  # rows that are heard, and some of whose frames were lost before
     amplitude: float = 0.05  # rad
     standing: bool = False
 
@@ -121,7 +126,8 @@ class Machine:
             image.check[missing] = Check.NO_DATA
         for row, cycles in self.late.items():
             age[row] = cycles
-        image.all_fresh = not (self.missing or self.late)
+        image.check[list(self.gaps)] = Check.SOME_LOST
+        image.all_fresh = not (self.missing or self.late or self.gaps)
         found = self.checks.check()
         assert found is self.checks.findings
         self.cycles += 1
@@ -144,6 +150,15 @@ class Machine:
 def only(found: tuple[Finding, ...]) -> Finding:
     assert len(found) == 1, found
     return found[0]
+
+
+def nobody(*_: object) -> None:
+    """In the place of what is not to be called."""
+    raise AssertionError
+
+
+def signals() -> Signals:
+    return signals_of(CODEC, np.zeros(CODEC.size))
 
 
 def test_measured_signals_come_first_and_views_are_views():
@@ -339,6 +354,74 @@ class TestVelocity:
         assert machine.run(300, turn) == ()
 
 
+class TestEncodersAlone:
+    """Exactly at their thresholds, which no Machine hits: there the joints are somewhere."""
+
+    way = ROBOT.velocity_max * ROBOT.gear * PERIOD
+    noise = 3.0 * ROBOT.encoder_noise * ROBOT.gear
+
+    @staticmethod
+    def encoders() -> tuple[Encoders, Signals]:
+        now = signals()
+        return Encoders(ROBOT, now, signals(), PERIOD, 16), now
+
+    def test_at_first_nothing_is_known(self):
+        encoders, _ = self.encoders()
+        assert encoders.jumps == [0] * 12
+        assert encoders.findings() == ()
+        assert encoders.within_reach()
+
+    @signs
+    @pytest.mark.parametrize("cycles", [1, 3])
+    def test_the_reach_itself_is_within_it(self, sign: float, cycles: int):
+        for joint in range(12):
+            encoders, now = self.encoders()
+            reach = cycles * self.way[joint] + self.noise[joint]
+            for size, good in ((reach, True), (np.nextafter(reach, np.inf), False)):
+                now.position[joint] = sign * size
+                assert encoders.accept(joint, cycles) is good
+                if cycles == 1:
+                    assert encoders.within_reach() is good
+            assert encoders.jumps == [int(j == joint) for j in range(12)]
+
+    def test_who_moves_little_is_looked_at_together(self):
+        encoders, now = self.encoders()
+        encoders._reach = None  # type: ignore[assignment] # nobody is looked at alone
+        reach = self.way + self.noise
+        now.position[:] = 0.28 * reach.min()
+        assert encoders.within_reach()
+        now.position[:] = 0.0
+        now.position[reach.argmin()] = reach.min()
+        assert encoders.within_reach()
+
+    def test_the_velocity_itself_may_err_by_what_is_allowed(self):
+        for joint, found in itertools.product(range(12), (False, True)):
+            allowed = ROBOT.sensors.velocity_error * ROBOT.gear[joint]
+            encoders, now = self.encoders()
+            now.velocity[joint] = -np.nextafter(allowed, np.inf) if found else -allowed
+            # One sample, and three that are compared with the one before.
+            assert [encoders.judge_velocity(True) for _ in range(5)] == [False] * 3 + [found] * 2
+            assert [f.value for f in encoders.findings()] == pytest.approx([-ROBOT.sensors.velocity_error] * found)
+
+    def test_a_sample_that_was_not_whole_is_compared_with_none(self):
+        encoders, now = self.encoders()
+        now.velocity[4] = 100.0
+        assert [encoders.judge_velocity(whole) for whole in (True, False) * 6] == [False] * 12
+        encoders, now = self.encoders()
+        now.velocity[4] = 100.0
+        whole = (True, True, True, False, True, True)
+        assert [encoders.judge_velocity(w) for w in whole] == [False] * 5 + [True]
+        assert encoders.judge_velocity(False)
+
+    def test_each_joint_is_counted_for_itself(self):
+        encoders, now = self.encoders()
+        now.velocity[4] = now.velocity[9] = 100.0
+        assert [encoders.judge_velocity(True) for _ in range(3)] == [False] * 3
+        now.velocity[9] = -100.0  # right on average
+        assert encoders.judge_velocity(True)
+        assert [f.node for f in encoders.findings()] == [JOINTS[4].upper()]
+
+
 class TestImuRange:
     @imus
     @pytest.mark.parametrize("quantity", ["gyro", "accel"])
@@ -424,6 +507,83 @@ class TestQuaternion:
         assert any(machine.cycle(stretch) for _ in range(32))
         assert [f.node for f in machine.checks.findings] == ["IMU_PELVIS", "IMU_RIGHT_TIBIA"]
         assert machine.refused == {row("IMU_pelvis"): 1, row("IMU_right_tibia"): 1}
+
+
+class TestImusAlone:
+    """Exactly at their thresholds, with an error of the norm that is a binary fraction."""
+
+    robot = replace(ROBOT, sensors=replace(ROBOT.sensors, quaternion_error=0.125))
+    ends = tuple(
+        signal.maximum - 0.5 * signal.factor
+        for signal in (CODEC.signals[CODEC.index("IMU_TORSO_STATE", name)][1] for name in ("GyroX", "AccelX"))
+    )
+
+    def make(self) -> tuple[Imus, Signals]:
+        now = signals()
+        now.quaternion[:, 0] = 1.0
+        return Imus(self.robot, CODEC, now), now
+
+    @pytest.mark.parametrize(
+        ("quaternion", "norm"),
+        [
+            ((1.0, 0.25, 0.25, 0.0), None),
+            ((0.75, 0.5, 0.25, 0.0), None),
+            ((1.0, 0.25, 0.25, 0.125), math.sqrt(1.140625)),
+            ((0.75, 0.5, 0.125, 0.125), math.sqrt(0.84375)),
+        ],
+    )
+    def test_what_a_norm_may_err_by_is_allowed_itself(self, quaternion: tuple[float, ...], norm: float | None):
+        wrong = norm is not None
+        for imu, turn in itertools.product(range(4), range(4)):
+            imus, now = self.make()
+            now.quaternion[imu] = np.roll(quaternion, turn)
+            assert not imus.judge_norms(False)
+            assert imus.judge_norms(True) is wrong
+            assert [f.confirmed for f in imus.findings()] == [False] * wrong  # for how long is not counted yet
+            for cycles in (9, 10):
+                assert imus.accept(imu, cycles, frozen=False) is not wrong
+                assert imus.no_attitude == ({imu: norm} if wrong else {})
+                assert [f.confirmed for f in imus.findings()] == [cycles == 10] * wrong
+
+    @pytest.mark.parametrize(
+        ("quaternion", "usable"),
+        [
+            ((1.0, 0.25, 0.0, 0.0), True),
+            ((1.0, 0.25, 0.015625, 0.0), False),
+            ((0.75, 0.5, 0.25, 0.25), True),
+            ((0.75, 0.5, 0.25, 0.234375), False),
+        ],
+    )
+    def test_all_norms_together_may_err_by_half_of_it(self, quaternion: tuple[float, ...], usable: bool):
+        imus, now = self.make()
+        now.quaternion[2] = quaternion
+        assert imus.usable() is usable
+
+    def test_who_measures_little_is_looked_at_together(self):
+        imus, now = self.make()
+        imus.saturation = nobody  # type: ignore[method-assign,assignment]
+        now.gyro[0, 1] = 0.9 * min(self.ends)
+        assert imus.usable()
+
+    @pytest.mark.parametrize("quantity", ["gyro", "accel"])
+    @pytest.mark.parametrize("usable", [False, True])
+    def test_the_end_of_the_range_itself_is_the_end(self, quantity: str, usable: bool):
+        end = self.ends[quantity == "accel"]
+        for imu, axis, sign in itertools.product(range(4), range(3), (1.0, -1.0)):
+            imus, now = self.make()
+            getattr(now, quantity)[imu, axis] = sign * (np.nextafter(end, 0.0) if usable else end)
+            assert imus.usable() is usable
+            assert imus.saturation(imu) == (None if usable else end)
+            for cycles in (9, 10):
+                assert imus.accept(imu, cycles, frozen=False) is usable
+                assert imus.saturated == ({} if usable else {imu: end})
+                assert [f.confirmed for f in imus.findings()] == [cycles == 10] * (not usable)
+
+    def test_one_that_repeats_itself_is_of_no_use(self):
+        imus, _ = self.make()
+        assert not imus.accept(2, 1, frozen=True)
+        assert imus.accept(2, 1, frozen=False)
+        assert imus.findings() == ()
 
 
 angles = st.floats(-1.2, 1.2)
@@ -749,6 +909,39 @@ class TestStandingEncoder:
         errors[axis] += way
         assert now.errors == tuple(errors)
 
+    def test_a_leg_is_looked_at_out_of_turn_while_it_stands_still(self):
+        standing, looked_at = np.zeros(12, np.int64), []
+        legs = Legs(ROBOT, signals(), standing)
+
+        def compare(leg: int) -> _Contradiction:
+            looked_at.append(leg)
+            return _Contradiction((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+        legs._compare = compare  # type: ignore[method-assign]
+
+        def look(judge: Callable[[bool], bool], whole: bool = True) -> list[int]:
+            looked_at.clear()
+            assert not judge(whole)
+            return looked_at.copy()
+
+        left, right = legs.judge_left, legs.judge_right
+        for stands, orders in (
+            ([], ([0], [1])),
+            ([0], ([0], [1, 0])),
+            ([3], ([0], [1, 0])),
+            ([4, 11], ([0], [1])),  # ankles
+            ([6], ([0, 1], [1])),
+            ([9], ([0, 1], [1])),
+        ):
+            standing[:] = np.isin(range(12), stands)
+            assert (look(left), look(right)) == orders
+        standing[:] = 0
+        for leg, judge in enumerate((right, left)):
+            legs._stuck[leg] = (Finding(Dtc.ENC_STUCK, "", 0.0, True, ""),)
+            assert look(judge) == [1 - leg, leg]
+        standing[:] = 1
+        assert look(left, whole=False) == []
+
     def test_one_sample_is_a_stray(self):
         machine, turn = self.standing(JOINTS.index("left_TH"))
         for _ in range(5):
@@ -821,6 +1014,74 @@ class TestFrozenImu:
             machine.cycle(lambda now: now.gyro.__setitem__(0, frozen))
             waited += 1
         assert 150 < waited < 200
+
+
+class TestStillnessAlone:
+    """Sample by sample."""
+
+    rng = np.random.default_rng(4)
+
+    def stillness(self, every: int = 16) -> tuple[Stillness, ReceiveImage, Signals]:
+        image = ReceiveImage(MESSAGES, np.zeros(CODEC.size))
+        now = signals_of(CODEC, image.values)
+        return Stillness(ROBOT, image, now, every), image, now
+
+    def move(self, now: Signals) -> None:
+        now.position[:] = MIDDLE * GEAR + 1e-3 * self.rng.random(12)
+        now.gyro[:] = self.rng.random((4, 3))
+        now.force[:] = self.rng.random((2, 4, 3))
+
+    def test_at_first_nothing_stands_still(self):
+        stillness, _, _ = self.stillness()
+        assert not stillness.standing.any()
+        assert stillness.findings() == ()
+
+    @pytest.mark.parametrize(("every", "to_stuck", "to_freeze"), [(3, 16, 32), (4, 11, 24), (16, 2, 5)])
+    def test_as_many_repetitions_are_needed_as_fit(self, every: int, to_stuck: int, to_freeze: int):
+        def hold_encoder(now: Signals) -> None:
+            now.position[7] = MIDDLE[7] * GEAR[7]
+
+        def hold_gyro(now: Signals) -> None:
+            now.gyro[2] = 1.0, 2.0, 3.0
+
+        def hold_cell(now: Signals) -> None:
+            now.force[1, 3, 0] = 1.0
+
+        for hold, repetitions in ((hold_encoder, to_stuck), (hold_gyro, to_freeze), (hold_cell, to_freeze)):
+            # That every node was heard is not looked up: here the image knows of none.
+            stillness, _, now = self.stillness(every)
+            for sample in range(repetitions + 2):
+                self.move(now)
+                hold(now)
+                now.torque[:] = 100.0 * sample
+                assert stillness.sample(True) is (sample >= repetitions)
+                assert len(stillness.findings()) == (sample >= repetitions)
+            self.move(now)
+            assert not stillness.sample(True)
+            assert stillness.findings() == ()
+
+    @pytest.mark.parametrize("heard", [Check.OK, Check.SOME_LOST])
+    def test_who_is_not_heard_is_neither_sampled_nor_counted(self, heard: Check):
+        stillness, image, now = self.stillness()
+        torso = row("IMU_torso")
+
+        def sample(value: float, check: Check) -> bool:
+            self.move(now)
+            now.gyro[0] = value
+            image.check.fill(heard)
+            image.check[torso] = check
+            return stillness.sample(False)
+
+        assert not sample(1.0, heard)
+        assert not sample(2.0, Check.NO_DATA)
+        assert not sample(2.0, heard)  # other than the one before
+        for _ in range(4):
+            assert not sample(2.0, heard)
+            assert not sample(2.0, Check.REPEATED)
+        assert sample(2.0, heard)
+        assert stillness.imus == [0]
+        assert sample(3.0, Check.NO_DATA)
+        assert not sample(3.0, heard)
 
 
 class TestForceCells:
@@ -918,6 +1179,11 @@ NOTHING, EVEN = [0.0] * 4, [100.0] * 4
 
 
 class TestPlates:
+    def test_who_carries_nothing_is_not_looked_at_cell_by_cell(self):
+        plates = Plates()
+        plates.feet._judge_cells = nobody  # type: ignore[method-assign]
+        assert not plates.judge(NOTHING, [0.0, ROBOT.sensors.cell_free, 0.0, 0.0])
+
     def test_at_first_nothing_is_known(self):
         feet = Plates().feet
         assert (feet.swing, feet.cells, feet.findings()) == (None, {}, ())
@@ -957,7 +1223,6 @@ class TestPlates:
         plates = Plates()
         for cells, stands in (([free + 1.0, free, 0.0, 0.0], False), ([free + 1.0, -free - 1.0, 0.0, 0.0], True)):
             plates.judge(cells, NOTHING)
-            assert plates.feet.on_ground is stands
             assert plates.feet.swing == (1 if stands else None)
         plates.judge(NOTHING, EVEN)
         assert plates.feet.swing == 0
@@ -969,7 +1234,7 @@ class TestPlates:
         for _ in range(2):
             assert not plates.judge(EVEN, NOTHING)
             assert [plates.judge(NOTHING, NOTHING) for _ in range(100)] == [False] * 19 + [True] * 80 + [False]
-            assert not plates.feet.on_ground
+            assert not plates.judge(NOTHING, NOTHING)
         plates.judge(EVEN, NOTHING)
         for _ in range(20):
             plates.judge(NOTHING, NOTHING)
@@ -1046,3 +1311,63 @@ def test_two_machines_alike_find_alike():
         return [machine.cycle(lambda now: now.position.__setitem__(2, 0.0)) for _ in range(40)]
 
     assert run(Machine()) == run(Machine())
+
+
+def test_which_check_is_made_in_which_cycle(monkeypatch: pytest.MonkeyPatch):
+    made: list[str] = []
+    for owner, name in (
+        (Stillness, "sample"),
+        (Encoders, "judge_velocity"),
+        (Imus, "judge_norms"),
+        (Legs, "judge_left"),
+        (Legs, "judge_right"),
+        (Feet, "judge"),
+    ):
+        monkeypatch.setattr(owner, name, lambda *_, name=name: bool(made.append(name)))
+    image = ReceiveImage(MESSAGES, np.zeros(CODEC.size))
+    checks = Plausibility(ROBOT, image, PERIOD)
+    assert checks.findings == ()
+    expected = {0: "sample", 2: "judge_velocity", 16: "sample", 18: "judge_velocity"}
+    expected |= {4: "judge_norms", 8: "judge_left", 24: "judge_right"}
+    expected |= dict.fromkeys(range(1, 32, 4), "judge")
+    for cycle in range(64):
+        assert checks.check() == ()
+        assert made == ([expected[cycle % 32]] if cycle % 32 in expected else [])
+        made.clear()
+
+
+def test_rows_are_judged_one_by_one_only_where_something_is_wrong():
+    machine = Machine()
+    judge_rows, machine.checks._judge_rows = machine.checks._judge_rows, nobody  # type: ignore[method-assign]
+    assert machine.run(64) == ()
+    machine.checks._judge_rows = judge_rows  # type: ignore[method-assign]
+    machine.missing = {row("left_FH"), row("IMU_pelvis")}
+    machine.run(3)
+    machine.missing = set()
+    machine.run(1)
+    machine.checks._judge_rows = nobody  # type: ignore[method-assign]
+    assert machine.run(64) == ()
+
+
+def test_who_is_not_heard_hides_nobody_who_jumps():
+    machine = Machine()
+    machine.missing = {row("left_FH")}
+    assert only(machine.cycle(lambda now: now.position.__setitem__(5, 100.0 * GEAR[5]))).node == "LEFT_HA"
+    assert machine.refused == {row("left_HA"): 1}
+
+
+class TestAfterALoss:
+    """A frame after one that was lost is as good as any."""
+
+    def test_a_joint_that_jumps_is_found(self):
+        machine = Machine()
+        machine.gaps = {row("left_SH")}
+        assert only(machine.cycle(lambda now: now.position.__setitem__(2, 100.0 * GEAR[2]))).node == "LEFT_SH"
+        assert machine.refused == {row("left_SH"): 1}
+
+    @pytest.mark.parametrize(("foot", "cell"), [(0, 3), (1, 0)])
+    def test_a_cell_that_contradicts_the_others_is_found(self, foot: int, cell: int):
+        machine = Machine()
+        machine.gaps = {row(f"FOOT_{FEET[foot]}")}
+        push = TestForceCells().stick_out(foot, cell, 200.0)
+        assert machine.until_found(Dtc.FOOT_CELL, 260, push) >= 250

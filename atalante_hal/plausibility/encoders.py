@@ -11,7 +11,7 @@ import numpy as np
 
 from atalante_hal.diagnostics import Dtc
 from atalante_hal.plausibility.finding import JOINT_NODES, Finding, Signals
-from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.robot import JOINTS, Robot, Vector
 
 #: Jumps on end, without a good value between them, that are no stray any more.
 JUMPS_TO_CONFIRM = 5
@@ -36,17 +36,15 @@ class Encoders:
         self._noise = 3.0 * robot.encoder_noise * robot.gear
         self._reach = self._way + self._noise
         # Twelve squares under the square of the smallest reach leave none beyond its own: one product for most cycles.
-        self._surely = float(self._reach.min()) ** 2
+        self._surely = float((self._reach * self._reach).min())
         self._moved = np.zeros(len(JOINTS))
         self.jumps = [0] * len(JOINTS)
-        self._jump_of = [0.0] * len(JOINTS)
+        self._jump_of: dict[int, float] = {}  # size of the last one
         # Twice the mean velocity of two samples less twice the way between them: the share of the later and of the earlier one.
         time = every * period
         self._of_later, self._of_earlier = np.array([[-2.0 / time, 1.0], [2.0 / time, 1.0]])
-        self._error, self._earlier, self._size = np.zeros((3, len(JOINTS)))
+        self._earlier: Vector | None = None  # share of the last sample, if every joint was heard in it
         self._twice_allowed = 2.0 * robot.sensors.velocity_error * robot.gear
-        self._right = np.empty(len(JOINTS), np.bool_)
-        self._sampled = False
         self._wrong = [0] * len(JOINTS)
         self._wrong_findings: tuple[Finding, ...] = ()
         self._gear = robot.gear.tolist()
@@ -82,22 +80,19 @@ class Encoders:
         Returns:
             Whether a velocity is wrong.
         """
-        error, motion = self._error, self._now.motion
-        self._of_later.dot(motion, error)
-        np.add(error, self._earlier, error)
-        self._of_earlier.dot(motion, self._earlier)
-        comparable, self._sampled = whole and self._sampled, whole
-        if comparable:
-            np.abs(error, self._size)
-            right = np.less_equal(self._size, self._twice_allowed, self._right).tobytes()
-            if right != _ALL or any(self._wrong):
-                self._count_wrong()
+        motion, earlier = self._now.motion, self._earlier
+        self._earlier = self._of_earlier.dot(motion) if whole else None
+        if whole and earlier is not None:
+            error = self._of_later.dot(motion) + earlier
+            right = np.abs(error) <= self._twice_allowed
+            if right.tobytes() != _ALL or any(self._wrong):
+                self._count_wrong(error.tolist(), right.tolist())
         return bool(self._wrong_findings)
 
-    def _count_wrong(self) -> None:
-        self._wrong = [0 if right else self._wrong[joint] + 1 for joint, right in enumerate(self._right.tolist())]
+    def _count_wrong(self, error: list[float], right: list[bool]) -> None:
+        self._wrong = [0 if right[joint] else wrong + 1 for joint, wrong in enumerate(self._wrong)]
         self._wrong_findings = tuple(
-            self._wrong_velocity(joint, 0.5 * float(self._error[joint]))
+            self._wrong_velocity(joint, 0.5 * error[joint])
             for joint, wrong in enumerate(self._wrong)
             if wrong >= VELOCITY_SAMPLES
         )

@@ -33,11 +33,9 @@ class Feet:
         # Less than the square of all that a free cell may say: no cell carries.
         self._surely_free = self._free**2
         self._doubtful = False  # a cell contradicted the others at the last look
-        #: A foot has stood, and since then not both have swung for long.
-        self.on_ground = False
         #: Leg that swings while the other one stands, by its place in FEET; None: none does.
         self.swing: int | None = None
-        self._swinging = 0  # cycles
+        self._swinging = LIFTED_CYCLES  # cycles since a foot stood last
         self._contradicts = [[0] * len(CELLS) for _ in FEET]
         #: Cells that contradict the others: (foot, cell) -> N.
         self.cells: dict[tuple[int, int], float] = {}
@@ -51,7 +49,8 @@ class Feet:
         Returns:
             Whether something is implausible.
         """
-        if not self.on_ground and not self._doubtful and self._forces.dot(self._forces) <= self._surely_free:
+        lifted = self._swinging >= LIFTED_CYCLES
+        if lifted and not self._doubtful and self._forces.dot(self._forces) <= self._surely_free:
             return False
         stands = [False, False]
         for foot, cells in enumerate(self._force[:, :, 2].tolist()):
@@ -61,15 +60,11 @@ class Feet:
                 self._judge_cells(foot, cells, carries)
         self.swing = None if stands[0] == stands[1] else stands.index(False)
         self._doubtful = any(map(any, self._contradicts))
-        if any(stands):
-            self.on_ground, self._swinging = True, 0
-        elif self.on_ground:
-            self._swinging += self._every
-            self.on_ground = self._swinging < LIFTED_CYCLES
+        self._swinging = 0 if any(stands) else self._swinging + self._every
         return bool(self.cells) or self._both_swing()
 
     def _both_swing(self) -> bool:
-        return self.on_ground and self._swinging >= SWING_CYCLES
+        return SWING_CYCLES <= self._swinging < LIFTED_CYCLES
 
     def _judge_cells(self, foot: int, cells: list[float], carries: list[bool]) -> None:
         for cell, force in enumerate(cells):

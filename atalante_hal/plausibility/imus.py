@@ -30,7 +30,7 @@ class Imus:
         #: IMUs whose quaternion is none, and of those at the end of their range; both by number with the value.
         self.no_attitude: dict[int, float] = {}
         self.saturated: dict[int, float] = {}
-        self._useless = [0] * len(IMUS)  # cycles since the last good value
+        self._given_up = [False] * len(IMUS)
 
     def usable(self) -> bool:
         """Whether every quaternion is a unit, unless two err the opposite way, and no axis is at the end of its range.
@@ -62,7 +62,7 @@ class Imus:
             else:
                 standing[imu] = value
         usable = not frozen and saturation is None and norm is None
-        self._useless[imu] = 0 if usable else cycles
+        self._given_up[imu] = not usable and cycles >= IMU_CYCLES
         return usable
 
     def _wrong_norm(self, imu: int) -> float | None:
@@ -85,12 +85,9 @@ class Imus:
     def findings(self) -> tuple[Finding, ...]:
         """What stands."""
         return (
-            *(_no_attitude(imu, norm, self._given_up(imu)) for imu, norm in self.no_attitude.items()),
-            *(_saturated(imu, value, self._given_up(imu)) for imu, value in self.saturated.items()),
+            *(_no_attitude(imu, norm, self._given_up[imu]) for imu, norm in self.no_attitude.items()),
+            *(_saturated(imu, value, self._given_up[imu]) for imu, value in self.saturated.items()),
         )
-
-    def _given_up(self, imu: int) -> bool:
-        return self._useless[imu] >= IMU_CYCLES
 
 
 def _end_of_range(codec: Codec, name: str) -> float:

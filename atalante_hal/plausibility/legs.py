@@ -61,10 +61,10 @@ class Legs:
         self._attitude_change, self._misalignment = robot.sensors.attitude_change, robot.sensors.misalignment
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
         self._standing = [standing[hip : hip + len(_AXIS_OF)] for hip in _HIPS]
-        self._none_stands = bytes(self._standing[0].nbytes)
         #: Of each joint, what was said when it moved last.
         self._moved: list[_Contradiction | None] = [None] * len(JOINTS)
-        self._turned = [0] * len(JOINTS)  # samples on end in which the leg of a joint that stands still has turned
+        #: Samples on end in which the leg of a joint that stands still has turned.
+        self._turned: dict[int, int] = {}
         self._drifts: list[tuple[Finding, ...]] = [() for _ in SIDES]
         self._stuck: list[tuple[Finding, ...]] = [() for _ in SIDES]
 
@@ -89,7 +89,7 @@ class Legs:
             self._judge_drift(leg, said)
             self._judge_standstill(leg, said)
             other = 1 - leg
-            if self._stuck[other] or self._standing[other].tobytes() != self._none_stands:
+            if self._stuck[other] or self._standing[other].any():
                 self._judge_standstill(other, self._compare(other))
         return any(self._drifts) or any(self._stuck)
 

@@ -62,10 +62,12 @@ class Plausibility:
         #: Row -> cycle in which its last good values were measured; up to date while not settled.
         self._measured = dict.fromkeys((*self._joint_rows, *self._imu_rows), -NEVER)
         self._settled = False  # the last values of all rows were good, and of the cycle they came in
-        self._changed = False  # what stands: an IMU may be of no use from now on, or of use again
         self._turns = self._build_turns()
         self._cycle = 0
-        self.findings: tuple[Finding, ...] = ()
+        self.findings: tuple[Finding, ...]
+        #: What stood when the rows were judged last: where that changes, an IMU is of no use from now on, or of use again.
+        self._judged: tuple[Finding, ...]
+        self.findings = self._judged = ()
 
     def _build_turns(self) -> list[Callable[[bool], bool] | None]:
         """Which slow check is made in which cycle: called with `fresh`, returns whether it has something to tell."""
@@ -86,9 +88,9 @@ class Plausibility:
         turn = self._turns[self._cycle % _ROUND]
         if turn is not None and (turn(fresh) or self.findings):
             self._collect()
-        settled = fresh and self._settled and not self._changed
+        settled = fresh and self._settled and self.findings is self._judged
         if not (settled and self._encoders.within_reach() and self._imus.usable()):
-            self._changed = False
+            self._judged = self.findings
             self._judge_rows()
             self._collect()
         if self.findings:
@@ -140,7 +142,6 @@ class Plausibility:
         )
         if findings != self.findings:
             self.findings = findings
-            self._changed = True
 
     def _silence_cells(self) -> None:
         """A cell that is stuck carries nothing: what is left of its foot are the others."""

@@ -44,7 +44,7 @@ class Stillness:
         size = len(self._values)
         self._sampled = np.full(size, np.nan)
         self._same = np.empty(size, np.bool_)
-        self._repeats = np.zeros(size, np.int64)
+        self._repeats = np.full(size, 0)
         # So many repetitions fit behind the first sample of a standstill, which comes up to `every` - 1 cycles late.
         limit = np.full(size, _NEVER)
         limit[codec.slice("Position")] = self._to_stuck = (STUCK_CYCLES - every + 1) // every
