@@ -70,7 +70,7 @@ def test_people_get_torques_residuals_and_pinocchios_judgement() -> None:
 
 
 def test_what_cannot_be_walked_ends_in_one_sentence() -> None:
-    outcome = run(*PATIENT, "--step-length", "0.4", "--step-duration", "0.8", "--json")
+    outcome = run(*PATIENT, "--step-length", "0.4", "--step-duration", "0.4", "--json")
     assert outcome.exit_code == 1
     assert json.loads(outcome.stdout)["status"] != "solved"
     assert outcome.stderr.strip().splitlines()[-1].startswith("atalante: no such gait for 75 kg, 1.75 m")
