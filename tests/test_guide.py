@@ -21,7 +21,7 @@ from atalante_control.certificate import HandOver, certify
 from atalante_control.deadbeat import Deadbeat
 from atalante_control.gait import HANG_GAIT, PERIOD, bezier, derivative, load_gait
 from atalante_control.guide import GuideConfig, GuideFilter
-from atalante_control.guide_kernel import damped_gate, gate
+from atalante_control.guide_kernel import damped_gate, gate, tick
 from atalante_control.guide_shapes import SHAPES, GuideShape
 from atalante_hal.robot import load_robot
 
@@ -245,6 +245,14 @@ def test_the_middle_of_the_guide_is_left_alone():
         u = f.tick(cycle, 0.0, 0.0, 0.0, 0.0)
         assert max(f.gates) < 1e-3
         assert max(map(abs, u)) < 0.1
+
+
+def test_who_ticks_the_tables_themselves_gets_the_filters_own_torque():
+    asked, ticked = guide(), guide()
+    errors = 0.03, 0.4, -0.02, -0.3
+    torque = asked.tick(100, *errors)
+    assert tick(*ticked.tables, 100, *errors) == torque != (0.0, 0.0)
+    assert (ticked.h, ticked.gates, ticked.bounds) == (asked.h, asked.gates, asked.bounds)
 
 
 def test_past_its_end_a_step_stays_at_its_end():
