@@ -32,11 +32,10 @@ class Feet:
         self._every = every
         # Less than the square of all that a free cell may say: no cell carries.
         self._surely_free = self._free**2
-        self._doubtful = False  # a cell contradicted the others at the last look
         #: Leg that swings while the other one stands, by its place in FEET; None: none does.
         self.swing: int | None = None
         self._swinging = LIFTED_CYCLES  # cycles since a foot stood last
-        self._contradicts = [[0] * len(CELLS) for _ in FEET]
+        self._contradicts = [[0] * len(CELLS) for _ in FEET]  # cycles in which a cell has contradicted the others
         #: Cells that contradict the others: (foot, cell) -> N.
         self.cells: dict[tuple[int, int], float] = {}
 
@@ -50,16 +49,15 @@ class Feet:
             Whether something is implausible.
         """
         lifted = self._swinging >= LIFTED_CYCLES
-        if lifted and not self._doubtful and self._forces.dot(self._forces) <= self._surely_free:
+        if lifted and self._forces.dot(self._forces) <= self._surely_free and not any(map(any, self._contradicts)):
             return False
-        stands = [False, False]
+        stands = []
         for foot, cells in enumerate(self._force[:, :, 2].tolist()):
             carries = [abs(force) > self._free for force in cells]
-            stands[foot] = sum(carries) >= 2
+            stands.append(sum(carries) >= 2)
             if heard[foot]:
                 self._judge_cells(foot, cells, carries)
         self.swing = None if stands[0] == stands[1] else stands.index(False)
-        self._doubtful = any(map(any, self._contradicts))
         self._swinging = 0 if any(stands) else self._swinging + self._every
         return bool(self.cells) or self._both_swing()
 

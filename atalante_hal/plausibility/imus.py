@@ -6,7 +6,7 @@ import math
 
 from atalante_hal.codec import Codec
 from atalante_hal.diagnostics import Dtc
-from atalante_hal.plausibility.finding import IMU_MESSAGES, IMU_NODES, Finding, Signals
+from atalante_hal.plausibility.finding import IMU_NODES, Finding, Signals
 from atalante_hal.robot import IMUS, Robot
 
 #: Cycles without a good value after which an IMU is given up.
@@ -91,8 +91,8 @@ class Imus:
 
 
 def _end_of_range(codec: Codec, name: str) -> float:
-    """Readings from here on are the last step of the range."""
-    signal = next(s for m, s in codec.signals if m.name == IMU_MESSAGES[0] and s.name == name)
+    """Readings from here on are the last step of the range, which is the same of all IMUs."""
+    signal = next(signal for _, signal in codec.signals if signal.name == name)
     return signal.maximum - 0.5 * signal.factor
 
 

@@ -51,7 +51,7 @@ class Stillness:
         limit[codec.slice("Gyro")] = limit[codec.slice("Force")] = to_freeze = (FROZEN_CYCLES - every + 1) // every
         self._to_freeze = to_freeze
         self._limit = limit
-        self._over, self._none_over = np.empty(size, np.bool_), bytes(size)
+        self._none_over = bytes(size)
         #: Samples on end in which each encoder stood still, shape (12,).
         self.standing: npt.NDArray[np.int64]
         self.standing, self._gyros, self._cells = (
@@ -91,7 +91,7 @@ class Stillness:
             self._sampled[:] = self._values
         else:
             np.copyto(self._sampled, self._values, where=heard)
-        over: bool = np.greater_equal(repeats, self._limit, self._over).tobytes() != self._none_over
+        over: bool = (repeats >= self._limit).tobytes() != self._none_over
         if over or self.encoders or self.imus or self.cells:
             self._judge()
         return over
