@@ -166,8 +166,6 @@ def test_measured_signals_come_first_and_views_are_views():
     values = np.arange(CODEC.size, dtype=np.float64)
     now = signals_of(CODEC, values)
     assert now.motion.tolist() == [now.position.tolist(), now.velocity.tolist()]
-    assert now.inertial.tolist() == [*now.gyro.ravel(), *now.accel.ravel()]
-    assert now.quaternions.tolist() == now.quaternion.ravel().tolist()
     assert now.forces.tolist() == now.force.ravel().tolist()
     for name, view in now._asdict().items():
         assert np.shares_memory(view, values), name
@@ -384,16 +382,6 @@ class TestEncodersAlone:
                     assert encoders.within_reach() is good
             assert encoders.jumps == [int(j == joint) for j in range(12)]
 
-    def test_who_moves_little_is_looked_at_together(self):
-        encoders, now = self.encoders()
-        encoders._reach = None  # type: ignore[assignment] # nobody is looked at alone
-        reach = self.way + self.noise
-        now.position[:] = 0.28 * reach.min()
-        assert encoders.within_reach()
-        now.position[:] = 0.0
-        now.position[reach.argmin()] = reach.min()
-        assert encoders.within_reach()
-
     def test_the_velocity_itself_may_err_by_what_is_allowed(self):
         for joint, found in itertools.product(range(12), (False, True)):
             allowed = ROBOT.sensors.velocity_error * ROBOT.gear[joint]
@@ -495,8 +483,8 @@ class TestQuaternion:
             image.new_cycle()
             assert checks.check() == ()
 
-    @pytest.mark.parametrize("phase", range(0, 32, 5))
-    def test_two_that_err_the_opposite_way_are_found_within_a_round(self, phase: int):
+    @pytest.mark.parametrize("phase", [0, 5])
+    def test_two_that_err_the_opposite_way_are_found_at_once(self, phase: int):
         machine = Machine()
         machine.run(phase)
 
@@ -504,7 +492,7 @@ class TestQuaternion:
             now.quaternion[1] *= math.sqrt(1.1)
             now.quaternion[3] *= math.sqrt(0.9)
 
-        assert any(machine.cycle(stretch) for _ in range(32))
+        assert machine.cycle(stretch)
         assert [f.node for f in machine.checks.findings] == ["IMU_PELVIS", "IMU_RIGHT_TIBIA"]
         assert machine.refused == {row("IMU_pelvis"): 1, row("IMU_right_tibia"): 1}
 
@@ -537,33 +525,12 @@ class TestImusAlone:
         for imu, turn in itertools.product(range(4), range(4)):
             imus, now = self.make()
             now.quaternion[imu] = np.roll(quaternion, turn)
-            assert not imus.judge_norms(False)
-            assert imus.judge_norms(True) is wrong
-            assert [f.confirmed for f in imus.findings()] == [False] * wrong  # for how long is not counted yet
+            assert imus.usable() is not wrong
+            assert imus.findings() == ()
             for cycles in (9, 10):
                 assert imus.accept(imu, cycles, frozen=False) is not wrong
                 assert imus.no_attitude == ({imu: norm} if wrong else {})
                 assert [f.confirmed for f in imus.findings()] == [cycles == 10] * wrong
-
-    @pytest.mark.parametrize(
-        ("quaternion", "usable"),
-        [
-            ((1.0, 0.25, 0.0, 0.0), True),
-            ((1.0, 0.25, 0.015625, 0.0), False),
-            ((0.75, 0.5, 0.25, 0.25), True),
-            ((0.75, 0.5, 0.25, 0.234375), False),
-        ],
-    )
-    def test_all_norms_together_may_err_by_half_of_it(self, quaternion: tuple[float, ...], usable: bool):
-        imus, now = self.make()
-        now.quaternion[2] = quaternion
-        assert imus.usable() is usable
-
-    def test_who_measures_little_is_looked_at_together(self):
-        imus, now = self.make()
-        imus.saturation = nobody  # type: ignore[method-assign,assignment]
-        now.gyro[0, 1] = 0.9 * min(self.ends)
-        assert imus.usable()
 
     @pytest.mark.parametrize("quantity", ["gyro", "accel"])
     @pytest.mark.parametrize("usable", [False, True])
@@ -573,7 +540,6 @@ class TestImusAlone:
             imus, now = self.make()
             getattr(now, quantity)[imu, axis] = sign * (np.nextafter(end, 0.0) if usable else end)
             assert imus.usable() is usable
-            assert imus.saturation(imu) == (None if usable else end)
             for cycles in (9, 10):
                 assert imus.accept(imu, cycles, frozen=False) is usable
                 assert imus.saturated == ({} if usable else {imu: end})
@@ -1318,7 +1284,6 @@ def test_which_check_is_made_in_which_cycle(monkeypatch: pytest.MonkeyPatch):
     for owner, name in (
         (Stillness, "sample"),
         (Encoders, "judge_velocity"),
-        (Imus, "judge_norms"),
         (Legs, "judge_left"),
         (Legs, "judge_right"),
         (Feet, "judge"),
@@ -1328,7 +1293,7 @@ def test_which_check_is_made_in_which_cycle(monkeypatch: pytest.MonkeyPatch):
     checks = Plausibility(ROBOT, image, PERIOD)
     assert checks.findings == ()
     expected = {0: "sample", 2: "judge_velocity", 16: "sample", 18: "judge_velocity"}
-    expected |= {4: "judge_norms", 8: "judge_left", 24: "judge_right"}
+    expected |= {8: "judge_left", 24: "judge_right"}
     expected |= dict.fromkeys(range(1, 32, 4), "judge")
     for cycle in range(64):
         assert checks.check() == ()

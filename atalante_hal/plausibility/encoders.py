@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from atalante_hal.compiled import compiled
 from atalante_hal.diagnostics import Dtc
 from atalante_hal.plausibility.finding import JOINT_NODES, Finding, Signals
 from atalante_hal.robot import JOINTS, Robot, Vector
@@ -35,9 +36,6 @@ class Encoders:
         self._way = robot.velocity_max * robot.gear * period
         self._noise = 3.0 * robot.encoder_noise * robot.gear
         self._reach = self._way + self._noise
-        # Twelve squares under the square of the smallest reach leave none beyond its own: one product for most cycles.
-        self._surely = float((self._reach * self._reach).min())
-        self._moved = np.zeros(len(JOINTS))
         self.jumps = [0] * len(JOINTS)
         self._jump_of: dict[int, float] = {}  # size of the last one
         # Twice the mean velocity of two samples less twice the way between them: the share of the later and of the earlier one.
@@ -48,14 +46,12 @@ class Encoders:
         self._wrong = [0] * len(JOINTS)
         self._wrong_findings: tuple[Finding, ...] = ()
         self._gear = robot.gear.tolist()
+        self._within_reach = compiled(within_reach)
+        self.within_reach()
 
     def within_reach(self) -> bool:
         """Whether every joint is where it can have moved to in one cycle."""
-        moved = self._moved
-        np.subtract(self._now.position, self._before.position, moved)
-        if moved.dot(moved) <= self._surely:
-            return True
-        return np.less_equal(np.abs(moved), self._reach).tobytes() == _ALL
+        return self._within_reach(self._now.position, self._before.position, self._reach)
 
     def accept(self, joint: int, cycles: int) -> bool:
         """Whether the new value of one joint may be used.
@@ -112,3 +108,12 @@ class Encoders:
         at_joint = error / self._gear[joint]
         text = f"the velocity of {JOINTS[joint]} is {np.degrees(at_joint):+.0f} deg/s off what its encoder does"
         return Finding(Dtc.ENC_VELOCITY, JOINT_NODES[joint], at_joint, True, text)
+
+
+def within_reach(position: Vector, before: Vector, reach: Vector) -> bool:
+    """Whether no joint has moved by more than its reach. Shapes (12,), motor side."""
+    for joint in range(len(reach)):
+        moved = abs(position[joint] - before[joint])
+        if moved > reach[joint]:
+            return False
+    return True

@@ -42,8 +42,6 @@ class Signals(NamedTuple):
     accel: Vector  # (4, 3) m/s2
     force: Vector  # (2, 4, 3) N
     motion: Vector  # (2, 12) position and velocity
-    quaternions: Vector  # (16,) quaternion
-    inertial: Vector  # (24,) gyro and accel
     forces: Vector  # (24,) force
 
 
@@ -66,8 +64,6 @@ def signals_of(codec: Codec, values: Vector) -> Signals:
         values[accel].reshape(len(IMUS), 3),
         values[force].reshape(len(FEET), len(CELLS), 3),
         values[position.start : velocity.stop].reshape(2, len(JOINTS)),
-        values[quaternion],
-        values[gyro.start : accel.stop],
         values[force],
     )
 

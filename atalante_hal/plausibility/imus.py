@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 
 from atalante_hal.codec import Codec
+from atalante_hal.compiled import compiled
 from atalante_hal.diagnostics import Dtc
 from atalante_hal.plausibility.finding import IMU_NODES, Finding, Signals
-from atalante_hal.robot import IMUS, Robot
+from atalante_hal.robot import IMUS, Robot, Vector
 
 #: Cycles without a good value after which an IMU is given up.
 IMU_CYCLES = 10
@@ -23,30 +24,18 @@ class Imus:
     def __init__(self, robot: Robot, codec: Codec, now: Signals) -> None:
         self._now = now
         self._gyro_end, self._accel_end = (_end_of_range(codec, signal) for signal in ("GyroX", "AccelX"))
-        self._surely = min(self._gyro_end, self._accel_end) ** 2
         self._norm_error = robot.sensors.quaternion_error
-        # Half of what one may err: the others do so by the precision of the wire.
-        self._least, self._most = len(IMUS) - 0.5 * self._norm_error, len(IMUS) + 0.5 * self._norm_error
         #: IMUs whose quaternion is none, and of those at the end of their range; both by number with the value.
         self.no_attitude: dict[int, float] = {}
         self.saturated: dict[int, float] = {}
         self._given_up = [False] * len(IMUS)
+        self._usable = compiled(usable)
+        self.usable()
 
     def usable(self) -> bool:
-        """Whether every quaternion is a unit, unless two err the opposite way, and no axis is at the end of its range.
-
-        No axis is if the sum of all squares is under the square of that end: one product for most cycles.
-        """
-        quaternions, inertial = self._now.quaternions, self._now.inertial
-        if not self._least <= quaternions.dot(quaternions) <= self._most:
-            return False
-        return bool(inertial.dot(inertial) < self._surely) or not any(map(self.saturation, range(len(IMUS))))
-
-    def saturation(self, imu: int) -> float | None:
-        """The largest reading of an IMU that is at the end of its range [rad/s or m/s2], None if none is."""
-        gyro = max(map(abs, self._now.gyro[imu].tolist()))
-        accel = max(map(abs, self._now.accel[imu].tolist()))
-        return gyro if gyro >= self._gyro_end else accel if accel >= self._accel_end else None
+        """Whether every quaternion is a unit, and no axis at the end of its range."""
+        now = self._now
+        return self._usable(now.quaternion, now.gyro, now.accel, self._norm_error, self._gyro_end, self._accel_end)
 
     def accept(self, imu: int, cycles: int, *, frozen: bool) -> bool:
         """Whether the new values of one IMU may be used.
@@ -55,7 +44,7 @@ class Imus:
             cycles: from the last good ones to these.
             frozen: it repeats itself.
         """
-        saturation, norm = self.saturation(imu), self._wrong_norm(imu)
+        saturation, norm = self._saturation(imu), self._wrong_norm(imu)
         for value, standing in ((saturation, self.saturated), (norm, self.no_attitude)):
             if value is None:
                 standing.pop(imu, None)
@@ -65,22 +54,17 @@ class Imus:
         self._given_up[imu] = not usable and cycles >= IMU_CYCLES
         return usable
 
+    def _saturation(self, imu: int) -> float | None:
+        """The largest reading of an IMU that is at the end of its range [rad/s or m/s2], None if none is."""
+        for readings, end in ((self._now.gyro, self._gyro_end), (self._now.accel, self._accel_end)):
+            if (most := largest(readings[imu])) >= end:
+                return most
+        return None
+
     def _wrong_norm(self, imu: int) -> float | None:
         """The norm of the quaternion of an IMU, None if it is a unit."""
-        w, x, y, z = self._now.quaternion[imu].tolist()
-        squared = w * w + x * x + y * y + z * z
+        squared = squared_norm(self._now.quaternion[imu])
         return None if abs(squared - 1.0) <= self._norm_error else math.sqrt(squared)
-
-    def judge_norms(self, whole: bool) -> bool:
-        """Look at each quaternion by itself; returns whether one is none.
-
-        Args:
-            whole: every node was heard in this cycle; otherwise `accept` looks at those that were.
-        """
-        if whole:
-            norms = ((imu, self._wrong_norm(imu)) for imu in range(len(IMUS)))
-            self.no_attitude.update((imu, norm) for imu, norm in norms if norm is not None)
-        return bool(self.no_attitude)
 
     def findings(self) -> tuple[Finding, ...]:
         """What stands."""
@@ -88,6 +72,35 @@ class Imus:
             *(_no_attitude(imu, norm, self._given_up[imu]) for imu, norm in self.no_attitude.items()),
             *(_saturated(imu, value, self._given_up[imu]) for imu, value in self.saturated.items()),
         )
+
+
+def usable(
+    quaternion: Vector, gyro: Vector, accel: Vector, norm_error: float, gyro_end: float, accel_end: float
+) -> bool:
+    """Whether every IMU is.
+
+    Args:
+        quaternion, gyro, accel: shapes (4, 4), (4, 3) [rad/s], (4, 3) [m/s2].
+        norm_error: what the square of a quaternion's norm may be off 1.
+        gyro_end, accel_end: readings from here on are the end of the range.
+    """
+    for imu in range(len(quaternion)):
+        if not abs(squared_norm(quaternion[imu]) - 1.0) <= norm_error:
+            return False
+        if largest(gyro[imu]) >= gyro_end or largest(accel[imu]) >= accel_end:
+            return False
+    return True
+
+
+def squared_norm(quaternion: Vector) -> float:
+    """Shape (4,)."""
+    w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    return float(w * w + x * x + y * y + z * z)
+
+
+def largest(readings: Vector) -> float:
+    """The largest magnitude of three axes, shape (3,)."""
+    return float(max(abs(readings[0]), abs(readings[1]), abs(readings[2])))
 
 
 def _end_of_range(codec: Codec, name: str) -> float:

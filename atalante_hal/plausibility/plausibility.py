@@ -29,7 +29,7 @@ from atalante_hal.robot import Robot
 
 #: Cycles between two turns of what looks for standstill and wrong velocities, and of the look at the feet.
 SLOW, FEET = 16, 4
-#: Cycles after which the turns repeat; norms and each leg get one.
+#: Cycles after which the turns repeat; each leg gets one.
 _ROUND = 32
 _FRESH = int(Check.SOME_LOST)
 
@@ -75,7 +75,7 @@ class Plausibility:
         turns[0::SLOW] = [self._stillness.sample] * (_ROUND // SLOW)
         turns[2::SLOW] = [self._encoders.judge_velocity] * (_ROUND // SLOW)
         turns[1::FEET] = [self._judge_feet] * (_ROUND // FEET)
-        turns[4], turns[8], turns[24] = self._imus.judge_norms, self._legs.judge_left, self._legs.judge_right
+        turns[8], turns[24] = self._legs.judge_left, self._legs.judge_right
         return turns
 
     def check(self) -> tuple[Finding, ...]:

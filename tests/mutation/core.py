@@ -33,4 +33,4 @@ CORE = {
     ),
 }
 #: Parts with loops that run as machine code, which has no mutants and no lines: there they run as the source they are.
-LOOPS = ("e2e", "image", "limiter", "guide", "drive")
+LOOPS = ("e2e", "image", "plausibility", "limiter", "guide", "drive")
