@@ -28,7 +28,7 @@ class Imus:
         #: IMUs whose quaternion is none, and of those at the end of their range; both by number with the value.
         self.no_attitude: dict[int, float] = {}
         self.saturated: dict[int, float] = {}
-        self._given_up = [False] * len(IMUS)
+        self._given_up: dict[int, bool] = {}
         self._usable = compiled(usable)
         self.usable()
 
