@@ -23,8 +23,8 @@ RECEIVE_BUDGET = 128
 PERSISTENT = 5
 #: Time to listen for another HAL before the first SYNC [s].
 LISTEN = 0.2
-#: Longest wait [s] for nodes of which none has been heard.
-_FIRST_PATIENCE = 0.1
+#: Longest wait [s] for answers that nobody may give: no node has been heard, or what would ask them was not sent.
+_DOUBTFUL_PATIENCE = 0.1
 #: Class of an error frame that says bus-off, linux/can/error.h.
 ERROR_BUS_OFF = 0x40
 
@@ -79,6 +79,7 @@ class Transceiver:
         self._found: list[tuple[Dtc, bool, float, str]] = []
         self._refused = 0  # batches in a row for which the transmit queue had no room
         self._full_this_cycle = False
+        self._asked = True  # the last batch has left whole
         self._floods = 0  # cycles in a row
         self._bus_off = 0  # error class of the frame that said so, until the operator acknowledges it
         #: Nothing is wrong with the bus.
@@ -103,6 +104,7 @@ class Transceiver:
         """
         if batch.headers.tobytes() != batch.granted:
             raise TransmitDenied(f"a frame of {self._node} has another identifier, length or format than was granted")
+        self._asked = False
         try:
             self.bus.send(batch.frames)
         except BusFull as error:
@@ -111,6 +113,7 @@ class Transceiver:
         except BusError as error:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} refuses frames: {error}")
         else:
+            self._asked = True
             if self.tap is not None:
                 self.tap.sent(batch.frames)
 
@@ -119,7 +122,7 @@ class Transceiver:
 
         Args:
             cycle: wait for its messages; None: what is there at once will do.
-            patience: longest wait for them [s].
+            patience: longest wait for them [s]; shorter when the last batch, their SYNC, did not leave.
 
         Returns:
             Frames in the buffer now.
@@ -199,7 +202,7 @@ class Transceiver:
         """Wait until every expected message has come after the `first` frames, at most `patience` [s]."""
         # Nobody heard yet: take whoever answers until they fall silent, so that no answer is left for the next cycle.
         nobody = not expected
-        deadline = time.monotonic() + (min(patience, _FIRST_PATIENCE) if nobody else patience)
+        deadline = time.monotonic() + (min(patience, _DOUBTFUL_PATIENCE) if nobody or not self._asked else patience)
         while count < RECEIVE_BUDGET:
             expected.difference_update(self.scratch["can_id"][first:count].tolist())
             remaining = deadline - time.monotonic()

@@ -221,14 +221,23 @@ def test_nodes_that_speak_another_dbc_keep_the_robot_out_of_ready(make_rig, netw
 
 
 @pytest.mark.parametrize("error", [BusDown("the interface is down"), BusFull("the queue is full")])
-def test_a_bus_that_refuses_frames_ends_in_hold_and_raises_nothing(rig, error):
+def test_a_bus_that_refuses_frames_ends_in_hold_and_raises_nothing(make_rig, monkeypatch, error):
+    rig = make_rig(patience=60.0)
     rig.until(S.ACTIVE)
+    receive, waits = rig.bus.receive, []
 
     def refuse(frames):
         raise error
 
+    def wait(frames, timeout=0.0):
+        waits.append(timeout)
+        return receive(frames, timeout)
+
     rig.bus.to_nodes = refuse
-    assert rig.run(8).supervisor is S.HOLD
+    with monkeypatch.context() as patch:
+        patch.setattr(rig.bus, "receive", wait)
+        assert rig.run(8).supervisor is S.HOLD
+    assert 0.0 < max(waits) <= 0.1  # for the answers to a SYNC that was not sent
     rig.bus.to_nodes = lambda frames: frames
     assert rig.run(50).supervisor is S.HOLD
 

@@ -240,6 +240,21 @@ def test_while_nobody_is_known_whoever_answers_is_taken_until_nobody_does(desk: 
     assert desk.bus.timeouts == pytest.approx([0.0, 0.1, 0.1, 0.1])
 
 
+@pytest.mark.parametrize("refusal", [BusDown("gone"), BusFull("no room", 0)])
+def test_who_may_not_have_been_asked_is_not_waited_for_long(desk: Desk, refusal: BusError):
+    desk.bus.refuses = refusal
+    desk.transceiver.send(sync(desk))
+    for patience, waited in ((60.0, 0.1), (0.03, 0.03)):
+        desk.bus.timeouts.clear()
+        assert desk.transceiver.receive(0, image(0, 1), patience) == 0
+        assert desk.bus.timeouts == pytest.approx([0.0, waited])
+    desk.bus.refuses = None
+    desk.transceiver.send(sync(desk))
+    desk.bus.timeouts.clear()
+    desk.transceiver.receive(0, image(0, 1), 60.0)
+    assert desk.bus.timeouts == [0.0, 60.0]
+
+
 def test_without_patience_nothing_is_waited_for(desk: Desk):
     desk.bus.arrivals = [ids(1), ids(2)]
     assert desk.transceiver.receive(0, image(0, 1), 0.0) == 1

@@ -1,4 +1,4 @@
-"""Faults of the wire on real SocketCAN: a flood by another process, a second HAL."""
+"""Faults of the wire on real SocketCAN: a flood by another process, a second HAL, an interface that goes down."""
 
 from __future__ import annotations
 
@@ -16,17 +16,40 @@ from atalante_dbc import Network
 from atalante_emulator.body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
+from atalante_hal.bus import BusDown
 from atalante_hal.bus.socketcan import SocketCanBus
+from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.cia402 import DriveState
-from atalante_hal.frame import new_frames
+from atalante_hal.frame import Frames, new_frames
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
 from atalante_hal.transceiver import RECEIVE_BUDGET
 from atalante_hal.types import SupervisorState
-from tests.vcan.conftest import PATIENCE, Loop, repeated
+from tests.vcan.conftest import PATIENCE, Loop, as_root, repeated
 
 S = SupervisorState
 ATALANTE = str(Path(sys.executable).with_name("atalante"))
+
+
+class NodesEnd(WrappedBus):
+    """The nodes' end of the wire: an interface that is down is silence to them, and what they say then reaches nobody."""
+
+    down = False  # and nothing has been heard since
+
+    def send(self, frames: Frames) -> None:
+        try:
+            super().send(frames)
+        except BusDown:
+            self.down = True
+
+    def receive(self, frames: Frames, timeout: float = 0.0) -> int:
+        try:
+            count = super().receive(frames, timeout)
+        except BusDown:
+            self.down = True
+            return 0
+        self.down = self.down and not count
+        return count
 
 
 @dataclass
@@ -71,11 +94,16 @@ def walking(network: Network, robot: Robot, urdf_text: str) -> Iterator[type]:
             body = PyBulletBody(urdf_text)
             stack.callback(body.close)
             operator = Operator(0.5, starts=False)
-            emulator = Emulator(network, robot, body, buses[0], operator=operator)
+            wire = NodesEnd(buses[0])
+            emulator = Emulator(network, robot, body, wire, operator=operator)
+
+            def answer() -> None:
+                if not emulator.poll(0.05) and wire.down:
+                    emulator.idle()  # no SYNC will come: a millisecond goes by without
 
             hal = Hal(network, robot, buses[1], patience=PATIENCE)
             line = Line(hal, Loop(hal), emulator, operator, stack)
-            stack.enter_context(repeated(lambda: emulator.poll(0.05)))
+            stack.enter_context(repeated(answer))
             assert line.loop.cycles(400, S.READY) is S.READY, hal.missing()
             line.start()
             yield line
@@ -134,3 +162,24 @@ def test_f14_a_running_hal_holds_in_the_cycle_in_which_it_hears_another(
         assert line.loop.cycles(100) is S.HOLD
         assert line.drives_hold
         line.start()
+
+
+def test_f16_an_interface_that_goes_down_ends_in_hold_until_the_operator_starts_again(spare_vcan: str, walking) -> None:
+    with walking(spare_vcan) as line:
+        line.loop.cycles(20)
+        before = line.hal.state.cycle
+        as_root("ip", "link", "set", spare_vcan, "down")
+        assert line.loop.cycles(5) is S.HOLD
+        assert "BUS_DOWN" in line.codes()
+        assert f"type `ip link set {spare_vcan} up`" in line.hal.reason
+        line.operator.start()  # which nobody hears
+        assert line.loop.cycles(30) is S.HOLD
+        assert line.hal.state.cycle == before + 35
+        assert line.drives_hold  # by themselves
+
+        as_root("ip", "link", "set", spare_vcan, "up")
+        assert line.loop.cycles(60) is S.HOLD  # what was pressed meanwhile does not count
+        assert line.hal.missing() == []
+        assert line.drives_hold
+        line.start()
+        assert line.loop.cycles(20) is S.ACTIVE, line.hal.reason
