@@ -21,7 +21,7 @@ coverage: .venv/installed-dev ## every line and branch of the safety core is run
 	$(BIN)/python tests/mutation/cover.py
 
 mutation: .venv/installed-dev ## mutants of the safety core: 95 % are killed, the others are argued in tests/mutation/SURVIVORS.md
-	$(BIN)/python tests/mutation/mutate.py
+	$(BIN)/python tests/mutation/mutate.py $(if $(WITHOUT),--without $(WITHOUT))
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .

@@ -1,6 +1,8 @@
 """Mutation testing of the safety core with mutmut: every surviving mutant is argued in SURVIVORS.md, or a test is missing.
 
-    python tests/mutation/mutate.py [PART...]      or `make mutation`; parts such as limiter, default: all of the core
+    python tests/mutation/mutate.py [PART...] [--without PART...]
+
+or `make mutation`; parts such as limiter, default: all of the core.
 
 Each part is judged by its own tests alone, in a copy of the project under .mutation/ that is laid out as mutmut wants it. A
 mutant that was killed stays so until its function changes; one that lived is judged again every time. Take .mutation/ away to
@@ -103,7 +105,11 @@ class Trial:
         (self._work / "pyproject.toml").write_text(text)
 
     def judge(self, children: int) -> None:
-        """Let mutmut judge every mutant that was not killed before; it shows its progress itself."""
+        """Let mutmut judge every mutant that was not killed before; it shows its progress itself, at a terminal.
+
+        Raises:
+            SystemExit: it failed.
+        """
         for file in self._files:
             meta = self._meta(file)
             if meta.exists():
@@ -119,7 +125,12 @@ class Trial:
             "HYPOTHESIS_STORAGE_DIRECTORY": str(self._work / ".hypothesis"),
         }
         command = [sys.executable, "-m", "mutmut", "run", "--max-children", str(children)]
-        subprocess.run(command, cwd=self._work, env=environment, check=True)
+        output = None if sys.stdout.isatty() else subprocess.PIPE
+        done = subprocess.run(
+            command, cwd=self._work, env=environment, stdout=output, stderr=subprocess.STDOUT, text=True, check=False
+        )
+        if done.returncode:
+            sys.exit(f"{done.stdout or ''}\nmutmut failed with the part {self._part} (exit code {done.returncode})")
 
     def verdicts(self) -> Iterator[tuple[str, int, list[Mutant]]]:
         """Each module's name, how many mutants it has, and those that live.
@@ -170,13 +181,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Mutate, judge, compare with the list."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("part", nargs="*", choices=[*CORE, []], metavar="PART", help=", ".join(CORE) + "; default: all")
+    parser.add_argument("--without", nargs="+", choices=CORE, default=[], metavar="PART", help="parts to leave out")
     parser.add_argument("--children", type=int, default=os.cpu_count() or 1, help="mutants at a time")
     wanted = parser.parse_args(arguments)
     known = listed(SURVIVORS.read_text(encoding="utf-8"))
     modules: list[str] = []
     alive: list[Mutant] = []
-    told, total = [], 0
-    for part in wanted.part or CORE:
+    total = 0
+    parts = [part for part in wanted.part or CORE if part not in wanted.without]
+    if not parts:
+        parser.error("no part is left")
+    for part in parts:
         trial, start = Trial(part), time.monotonic()
         trial.lay_out()
         trial.judge(wanted.children)
@@ -184,15 +199,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
             modules.append(module)
             alive += living
             total += count
-            told.append(f"{module}: {count - len(living)} of {count} mutants killed")
-        told[-1] += f" ({part}: {time.monotonic() - start:.0f} s)"
-    print("\n".join(told))
+            print(f"{module}: {count - len(living)} of {count} mutants killed", flush=True)
+        print(f"{part}: {time.monotonic() - start:.0f} s", flush=True)
     unlisted = [m for m in alive if m not in known]
     gone = [m for m in known if m not in alive and any(m.function.startswith(f"{module}.") for module in modules)]
     for survivor in unlisted:
         print(f"\nlives and is not in SURVIVORS.md; kill it with a test, or argue it there:\n\n{survivor}")
     for survivor in gone:
         print(f"\nis in SURVIVORS.md and does not live; take it out:\n\n{survivor}")
+    for part in wanted.without:
+        print(f"\n{part} was left out")
     score = 1.0 - len(alive) / total
     print(f"\n{score:.1%} of {total} mutants killed, {REQUIRED:.0%} are required")
     return int(score < REQUIRED or bool(unlisted) or bool(gone))
