@@ -46,17 +46,11 @@ clean:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed; call make PYTHON=/path/to/python3.11" >&2; exit 1; }
 	$(PYTHON) -m venv .venv
 
-# Byte code is made by all cores at once; pip does it on one, which takes as long as everything else about it.
-define install
-$(BIN)/pip install --quiet --disable-pip-version-check --no-compile --editable '.[$(1)]'
-	$(BIN)/python -m compileall -qq -j 0 .venv/lib || true # a package may bring files that are no Python 3
-endef
-
 # Installed again when the dependencies change; otherwise a second call starts at once.
 .venv/installed-all: pyproject.toml | .venv/bin/python
-	$(call install,all)
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[all]'
 	@touch $@
 
 .venv/installed-dev: pyproject.toml | .venv/bin/python
-	$(call install,dev)
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	@touch $@ .venv/installed-all
