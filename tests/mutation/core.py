@@ -32,5 +32,3 @@ CORE = {
         ("test_drive.py", "test_emergency.py", "test_collision.py"),
     ),
 }
-#: Parts with loops that run as machine code, which has no mutants and no lines: there they run as the source they are.
-LOOPS = ("e2e", "image", "plausibility", "limiter", "guide", "drive")
