@@ -47,7 +47,7 @@ class Encoders:
         self._wrong_findings: tuple[Finding, ...] = ()
         self._gear = robot.gear.tolist()
         self._within_reach = compiled(within_reach)
-        self.within_reach()
+        self.within_reach()  # is compiled now, not in a cycle
 
     def within_reach(self) -> bool:
         """Whether every joint is where it can have moved to in one cycle."""

@@ -30,7 +30,7 @@ class Imus:
         self.saturated: dict[int, float] = {}
         self._given_up: dict[int, bool] = {}
         self._usable = compiled(usable)
-        self.usable()
+        self.usable()  # is compiled now, not in a cycle
 
     def usable(self) -> bool:
         """Whether every quaternion is a unit, and no axis at the end of its range."""
