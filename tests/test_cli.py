@@ -149,6 +149,29 @@ def test_a_sentence_of_several_lines_becomes_one(failing: Any) -> None:
     assert failing(BusError("first\n  second\tthird")).stderr == "atalante: first second third\n"
 
 
+@pytest.mark.parametrize(
+    ("error", "sentence"),
+    [
+        (PermissionError(13, "Permission denied", "/root/run"), "/root/run cannot be used: Permission denied"),
+        (OSError(28, "No space left on device"), "what was to be written cannot be used: No space left on device"),
+    ],
+)
+def test_a_file_that_the_system_refuses_is_one_sentence(failing: Any, error: OSError, sentence: str) -> None:
+    result = failing(error)
+    assert (result.exit_code, result.stderr) == (1, f"atalante: {sentence}\n")
+
+
+def test_a_system_call_that_goes_wrong_without_a_file_is_a_defect(failing: Any) -> None:
+    error = OSError(9, "Bad file descriptor")
+    assert failing(error).exception is error
+
+
+@pytest.mark.parametrize("group", ["pendant", "dbc", "faults", "gait"])
+def test_a_group_alone_says_what_is_in_it(group: str) -> None:
+    alone, asked = CliRunner().invoke(cli, [group]), CliRunner().invoke(cli, [group, "--help"])
+    assert (alone.exit_code, alone.stdout, alone.stderr) == (2, "", asked.stdout)
+
+
 def test_a_defect_keeps_its_traceback(failing: Any) -> None:
     error = ZeroDivisionError("a defect")
     assert failing(error).exception is error

@@ -60,6 +60,8 @@ class Commands(click.Group):
             return super().invoke(ctx)
         except KeyboardInterrupt:
             ctx.exit(INTERRUPTED)
+        except click.exceptions.NoArgsIsHelpError:
+            raise  # a group named alone: its help is the answer
         except click.UsageError as error:
             where = error.ctx.command_path if error.ctx else ctx.command_path
             raise Misused(f"{error.format_message().rstrip('.')}; see `{where} --help`") from error

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 from typing import IO, Any, Final
 
@@ -67,10 +68,14 @@ KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_tools.validate.project", "ProjectError", Misused),
 )
 
+#: What a disk says that takes no more: full, over quota, read-only, broken. Such an error may name no file.
+DISK: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
+
 
 def failure_of(error: BaseException) -> Failed | None:
     """What a library's error means for the command; None: it is a defect and deserves its traceback.
 
+    A file or folder that the system refuses is named with its reason, without the error's number.
     An error with a diagnostic code (FAULTS.md: CONFIG_INVALID, DBC_INVALID, GAIT_INVALID, ...) is told with it.
     """
     for module, name, failure in KNOWN:
@@ -79,4 +84,6 @@ def failure_of(error: BaseException) -> Failed | None:
             sentence = " ".join(str(error).split())
             code = getattr(error, "code", "")
             return failure(f"{code}: {sentence}" if code else sentence)
+    if isinstance(error, OSError) and (error.filename is not None or error.errno in DISK):
+        return Failed(f"{error.filename or 'what was to be written'} cannot be used: {error.strerror}")
     return None
