@@ -65,7 +65,7 @@ def test_show_alone_names_the_picture_itself(tmp_path: Path, monkeypatch: pytest
     [
         (["--mass", "30", "--height", "175"], "a patient's mass is from 45 to 110 kg, not 30 kg"),
         (["--mass", "75", "--height", "1.2"], "a patient's height is from 1.5 to 2 m, not 1.2 m"),
-        (["--mass", "75", "--height", "175", "--thigh", "80"], "a patient's thigh_length is from 0.3 to 0.55 m"),
+        (["--mass", "75", "--height", "175", "--thigh", "80"], "a patient's thigh length is from 0.3 to 0.55 m"),
         (["--mass", "75"], "a patient needs --mass and --height"),
         (["--thigh", "40"], "a patient needs --mass and --height"),
     ],

@@ -139,8 +139,8 @@ def test_a_number_of_numpy_is_written_as_a_number() -> None:
         ((44.9, 1.75), "a patient's mass is from 45 to 110 kg, not 44.9 kg"),
         ((75.0, 2.01), "a patient's height is from 1.5 to 2 m, not 2.01 m"),
         ((75.0, 175.0), "a patient's height is from 1.5 to 2 m, not 175 m"),
-        ((75.0, 1.75, 0.6), "a patient's thigh_length is from 0.3 to 0.55 m, not 0.6 m"),
-        ((75.0, 1.75, None, 0.2), "a patient's shank_length is from 0.3 to 0.55 m, not 0.2 m"),
+        ((75.0, 1.75, 0.6), "a patient's thigh length is from 0.3 to 0.55 m, not 0.6 m"),
+        ((75.0, 1.75, None, 0.2), "a patient's shank length is from 0.3 to 0.55 m, not 0.2 m"),
         ((math.nan, 1.75), "a patient's mass is from 45 to 110 kg, not nan kg"),
     ],
 )

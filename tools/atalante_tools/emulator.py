@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from atalante_tools.options import Target, patient_options, target_options
+from atalante_tools.options import SEED, Between, Target, patient_options, target_options
 from atalante_tools.signals import StopRequest, stop_requested
 from atalante_tools.terminal import Progress, say
 
@@ -25,14 +25,19 @@ LOOK_UP: Final = 0.1
 
 @click.command()
 @target_options(embedded=False)
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the sensors' noise.")
+@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Of the sensors' noise.")
 @click.option(
     "--operator/--no-operator",
     default=True,
     show_default=True,
     help="Hold the pendant too and press START when the HAL is ready; otherwise that is `atalante pendant`.",
 )
-@click.option("--xi", type=click.FloatRange(0.0, 1.0), help="Assistance factor the operator sets, 0 to 1.")
+@click.option(
+    "--xi",
+    type=Between(0.0, 1.0),
+    metavar="X",
+    help="Assistance factor the operator sets.  [default: none, the HAL's own stays]",
+)
 @patient_options(legs=False)
 def command(target: Target, seed: int, operator: bool, xi: float | None, patient: Patient | None) -> None:
     """Be the robot on a bus: drives, IMUs, feet, motors and, unless told otherwise, the operator's pendant.

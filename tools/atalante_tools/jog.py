@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from atalante_tools.names import find
-from atalante_tools.options import Target, json_option, target_options
+from atalante_tools.options import SEED, Target, json_option, target_options
 from atalante_tools.outcome import Failed
 from atalante_tools.signals import stop_requested
 from atalante_tools.terminal import say, show_json
@@ -30,7 +30,7 @@ TOLERANCE: Final = math.radians(1.0)
 @click.option(
     "--speed", type=float, default=20.0, show_default=True, metavar="DEG_S", help="Fastest on the way [deg/s]."
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the embedded robot's noise.")
+@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Of the embedded robot's noise.")
 @target_options(embedded=True)
 @json_option
 def command(joint: str, degrees: float, speed: float, seed: int, target: Target, as_json: bool) -> None:

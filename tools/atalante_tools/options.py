@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
@@ -20,6 +22,35 @@ EMBEDDED: Final = "embedded"
 
 #: --json: one object a line on stdout, everything else on stderr.
 json_option = click.option("--json", "as_json", is_flag=True, help="JSON objects on stdout, one a line.")
+
+#: Of random numbers: an option's type.
+SEED: Final = click.IntRange(min=0)
+
+
+class Between(click.FloatRange):
+    """A number in a range, which nan is not: an option's type."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The number."""
+        number = super().convert(value, param, ctx)
+        if math.isnan(number):
+            self.fail("nan is not a number", param, ctx)
+        return number
+
+
+class Picture(click.Path):
+    """A picture to be drawn, of a kind that its suffix names: an option's type. Wrong ones are told before the work."""
+
+    def __init__(self, *suffixes: str) -> None:
+        super().__init__(dir_okay=False)
+        self._suffixes = suffixes
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path."""
+        path = Path(str(super().convert(value, param, ctx)))
+        if path.suffix.lower() not in self._suffixes:
+            self.fail(f"{path} must end in {' or '.join(self._suffixes)}", param, ctx)
+        return path
 
 
 #: From here on a length means centimetres: nobody is 5 m tall, and no thigh or step is under 5 cm.
@@ -78,9 +109,11 @@ def patient_options(*, legs: bool) -> Callable[[_Command], _Command]:
     ]
     if legs:
         options += [
-            click.option("--thigh", type=length, metavar="M", help="Hip to knee.  [default: Winter's for the height]"),
             click.option(
-                "--shank", type=length, metavar="M", help="Knee to ankle.  [default: Winter's for the height]"
+                "--thigh", type=length, metavar="M", help="Hip to knee, m or cm.  [default: Winter's for the height]"
+            ),
+            click.option(
+                "--shank", type=length, metavar="M", help="Knee to ankle, m or cm.  [default: Winter's for the height]"
             ),
         ]
 
@@ -114,7 +147,11 @@ def _subject(patient: Patient | None, step_length: float | None, step_duration: 
 
     default_length, default_duration = DEFAULT_STEP
     try:
-        return Subject(patient, step_length or default_length, step_duration or default_duration)
+        return Subject(
+            patient,
+            default_length if step_length is None else step_length,
+            default_duration if step_duration is None else step_duration,
+        )
     except ValueError as error:
         raise click.UsageError(str(error)) from error
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from atalante_tools.options import Target, target_options
+from atalante_tools.options import Between, Target, target_options
 from atalante_tools.outcome import Failed
 from atalante_tools.signals import stop_requested
 from atalante_tools.terminal import say
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 for_option = click.option(
     "--for",
     "seconds",
-    type=click.FloatRange(0.01, 86400.0),
+    type=Between(0.01, 86400.0),
     metavar="SECONDS",
     help="End after so long [s], with STOP; otherwise on Ctrl-C.",
 )
@@ -58,7 +58,7 @@ def start(target: Target, seconds: float | None) -> None:
 
 
 @command.command()
-@click.argument("factor", metavar="X", type=click.FloatRange(0.0, 1.0))
+@click.argument("factor", metavar="X", type=Between(0.0, 1.0))
 @target_options(embedded=False, clock=False)
 @for_option
 def xi(factor: float, target: Target, seconds: float | None) -> None:

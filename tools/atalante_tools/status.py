@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from atalante_tools.options import Target, json_option, target_options
+from atalante_tools.options import Between, Target, json_option, target_options
 from atalante_tools.outcome import Failed, FaultLatched
 from atalante_tools.signals import StopRequest, stop_requested
 from atalante_tools.terminal import show_json, table
@@ -26,7 +26,7 @@ _BLANK: Final = "-"
 @click.option(
     "--for",
     "seconds",
-    type=click.FloatRange(0.05, 60.0),
+    type=Between(0.05, 60.0),
     default=1.0,
     show_default=True,
     metavar="SECONDS",

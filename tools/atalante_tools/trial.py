@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from atalante_tools.names import find
-from atalante_tools.options import Target, json_option, options_as, subject_options
+from atalante_tools.options import SEED, Between, Target, json_option, options_as, subject_options
 from atalante_tools.signals import stop_requested
 from atalante_tools.terminal import say, show_json, table
 
@@ -77,9 +77,9 @@ def trial_options(steps: int, out: str) -> Callable[[_Command], _Command]:
     options = [
         click.option("--steps", type=click.IntRange(1), default=steps, show_default=True, metavar="N",
                      help="Right-stance steps with each shape."),
-        click.option("--xi", type=click.FloatRange(0.0, 1.0), default=0.5, show_default=True, metavar="X",
+        click.option("--xi", type=Between(0.0, 1.0), default=0.5, show_default=True, metavar="X",
                      help="Assistance factor: 0 widest guide (7.5 deg), 1 full assistance. The pendant may change it."),
-        click.option("--seed", type=int, default=0, show_default=True, metavar="N", help="Of the emulated sensors' noise."),
+        click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Of the emulated sensors' noise."),
         click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=out, show_default=True,
                      metavar="DIR", help="Run folder: recording.mcap, summary.json, figures."),
         click.option("--record-rate", type=int, default=100, show_default=True, metavar="HZ",

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from atalante_tools.names import find
-from atalante_tools.options import Target, json_option, target_options
+from atalante_tools.options import Between, Target, json_option, target_options
 from atalante_tools.signals import stop_requested
 from atalante_tools.terminal import say, show_json
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("motor")
-@click.argument("level", type=click.FloatRange(0.0, 1.0))
+@click.argument("level", type=Between(0.0, 1.0))
 @click.option(
     "--for",
     "seconds",
-    type=click.FloatRange(0.01, 3600.0),
+    type=Between(0.01, 3600.0),
     default=1.0,
     show_default=True,
     metavar="SECONDS",

@@ -57,8 +57,8 @@ class Patient:
         for name, value, (low, high), unit in (
             ("mass", self.mass, MASS_RANGE, "kg"),
             ("height", self.height, HEIGHT_RANGE, "m"),
-            ("thigh_length", self.length("thigh"), LEG_RANGE, "m"),
-            ("shank_length", self.length("shank"), LEG_RANGE, "m"),
+            ("thigh length", self.length("thigh"), LEG_RANGE, "m"),
+            ("shank length", self.length("shank"), LEG_RANGE, "m"),
         ):
             if not low <= value <= high:
                 raise ValueError(f"a patient's {name} is from {low:g} to {high:g} {unit}, not {value:g} {unit}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from atalante_tools.options import Target, json_option, target_options
+from atalante_tools.options import Between, Target, json_option, target_options
 from atalante_tools.outcome import FAILED
 from atalante_tools.terminal import say, show_json
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @click.option("--without", multiple=True, metavar="ID", help="Leave this requirement out; may be repeated.")
 @click.option(
     "--torque",
-    type=click.FloatRange(0.5, 20.0),
+    type=Between(0.5, 20.0),
     default=3.0,
     show_default=True,
     metavar="NM",
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--patience",
-    type=click.FloatRange(0.5),
+    type=Between(0.5),
     default=30.0,
     show_default=True,
     metavar="S",

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from atalante_tools.options import json_option
+from atalante_tools.options import SEED, Between, json_option
 from atalante_tools.outcome import FAILED, Failed
 from atalante_tools.terminal import say, show_json, table
 
@@ -61,7 +61,7 @@ def print_table(file: Path | None, signals: bool, as_json: bool) -> None:
 @command.command()
 @_file_argument
 @click.option(
-    "--limit", type=click.FloatRange(min=0.0), default=60.0, show_default=True, help="Percent a bus may have."
+    "--limit", type=Between(min=0.0), default=60.0, show_default=True, metavar="PERCENT", help="Percent a bus may have."
 )
 @json_option
 def busload(file: Path | None, limit: float, as_json: bool) -> None:
@@ -122,7 +122,7 @@ def diff(old: Path, new: Path, as_json: bool) -> None:
 @click.option(
     "--images", type=click.IntRange(min=1), default=10_000, show_default=True, help="Random images of --check."
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the random images.")
+@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Of the random images.")
 @json_option
 def c_code(
     file: Path | None, output: Path, node: str | None, check: bool, images: int, seed: int, as_json: bool

@@ -10,7 +10,7 @@ import click
 
 from atalante_tools.gait.extra import extra
 from atalante_tools.gait.solve import solve
-from atalante_tools.options import json_option
+from atalante_tools.options import SEED, json_option
 from atalante_tools.outcome import FAILED, Failed
 from atalante_tools.terminal import Progress, say, show_json, table
 
@@ -154,7 +154,7 @@ def fit(folder: Path, out: Path, as_json: bool) -> None:
 @click.option(
     "--count", type=click.IntRange(min=1), default=50, show_default=True, metavar="N", help="Random subjects."
 )
-@click.option("--seed", type=int, default=0, show_default=True, metavar="N", help="Of the subjects.")
+@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Of the subjects.")
 @json_option
 def check(file: Path | None, count: int, seed: int, as_json: bool) -> None:
     """Compare the network with freshly solved gaits of subjects it never saw; exit code 1 if it is not near enough.

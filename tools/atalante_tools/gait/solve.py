@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from atalante_tools.gait.extra import extra
-from atalante_tools.options import json_option, subject_options
+from atalante_tools.options import Picture, json_option, subject_options
 from atalante_tools.outcome import Failed
 from atalante_tools.terminal import Progress, say, show_json, table
 
@@ -33,9 +33,12 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 )
 @click.option("--out", type=_FILE, metavar="FILE", help="Write the gait, .json.")
 @click.option(
-    "--plot", type=_FILE, metavar="FILE", help="Angles, torques, centre of pressure, clearance: .png, .svg, .pdf."
+    "--plot",
+    type=Picture(".png", ".svg", ".pdf"),
+    metavar="FILE",
+    help="Angles, torques, centre of pressure, clearance: .png, .svg, .pdf.",
 )
-@click.option("--animate", type=_FILE, metavar="FILE", help="The step as a stick figure, .gif.")
+@click.option("--animate", type=Picture(".gif"), metavar="FILE", help="The step as a stick figure, .gif.")
 @json_option
 def solve(
     subject: Subject | None, kind: Kind, out: Path | None, plot: Path | None, animate: Path | None, as_json: bool

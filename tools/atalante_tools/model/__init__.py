@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from atalante_tools.options import json_option, patient_options
+from atalante_tools.options import Picture, json_option, patient_options
 from atalante_tools.outcome import Failed
 from atalante_tools.terminal import say, show_json, table
 
@@ -25,7 +25,7 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option(
     "--show",
     "picture",
-    type=_FILE,
+    type=Picture(".png", ".svg", ".pdf"),
     is_flag=False,
     flag_value=Path("model.png"),
     metavar="[FILE]",

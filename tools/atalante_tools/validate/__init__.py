@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from atalante_tools.options import json_option
+from atalante_tools.options import Between, json_option
 from atalante_tools.outcome import FAILED, Failed
 from atalante_tools.signals import SIGNALLED, stop_requested
 from atalante_tools.terminal import Progress, say, show_json
@@ -33,7 +33,7 @@ _OUT = click.Path(dir_okay=False, path_type=Path)
 @click.option(
     "--for",
     "seconds",
-    type=click.FloatRange(0.1),
+    type=Between(0.1),
     default=None,
     metavar="SECONDS",
     help="Listen so long [s], otherwise until Ctrl-C.",
