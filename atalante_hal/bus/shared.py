@@ -1,9 +1,9 @@
 """The embedded bus between two processes: what `pair` is in one, in shared memory, so that both ends work at once.
 
 Each end has a queue that it alone writes and the other alone reads; a count that is stored after the frames says that they are
-there. This relies on stores being seen in program order, as on x86-64. An end that waits looks again and again for a while,
-letting other processes run in between, and then sleeps until the other end rings: a byte through a socket pair. The socket is
-also how each end notices that the other has died, whatever of.
+there. This relies on stores being seen in program order, as on x86-64. An end that waits looks again and again for a while and
+then sleeps until the other end rings: a byte through a socket pair. The socket is also how each end notices that the other has
+died, whatever of. Looking is of use only where the other end has a core of its own: let the two have different ones.
 
 In lock-step one end asks and the other serves: `receive()` of the asker hands over everything it sent, lets the other end make
 one step, and returns with what that sends, or with nothing when the step is over. So the two run the same sequence of calls as
@@ -34,11 +34,10 @@ _SENT, _TAKEN, _ASKED, _MADE, _SERVES, _ASLEEP, _CLOSED = range(7)
 _LINE = 8
 _HEADER_BYTES = mmap.PAGESIZE
 #: How long an end looks again and again before it sleeps [s]: longer than either end of the stack works on a cycle.
-_LOOK = 300e-6
-#: Looking again that took this long [s] let somebody else run: on a busy machine a sleeper is woken sooner than one who made way.
-_CROWDED = 100e-6
-#: Waits that sleep at once after that.
-_STEP_ASIDE = 100
+_LOOK = 500e-6
+#: Waits that sleep at once after one that looked in vain: on a busy machine, or when the other end keeps real time, looking
+#: only takes time away from others.
+_STEP_ASIDE = 32
 #: Longest sleep [ms] before looking again by itself: the bell is rung a moment too early when a store is seen late.
 _SLEEP = 20
 _BELL = b"\0"
@@ -195,24 +194,24 @@ class SharedBus:
         """Wait until `ready()`, at most `limit` [s]; whether it is. Raises `BusDown` when the other end is gone."""
         now = begun = time.monotonic()
         look = 0.0 if self._aside else _LOOK
-        self._aside -= self._aside > 0
+        slept = False
         while not ready():
             waited = now - begun
             if waited >= limit:
                 return False
             if self._peers[_CLOSED]:
                 self._hear()
-            if waited < look:
-                os.sched_yield()
-                before, now = now, time.monotonic()
-                if now - before > _CROWDED:
-                    look, self._aside = 0.0, _STEP_ASIDE
-            else:
+            if waited >= look:
+                slept = True
                 self._mine[_ASLEEP] = 1
                 if not ready():
                     self._sleep(min(_SLEEP, 1e3 * (limit - waited)))
                 self._mine[_ASLEEP] = 0
-                now = time.monotonic()
+            now = time.monotonic()
+        if self._aside:
+            self._aside -= 1
+        elif slept:
+            self._aside = _STEP_ASIDE
         return True
 
     def _sleep(self, longest: float) -> None:

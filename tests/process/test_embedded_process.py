@@ -16,7 +16,7 @@ from atalante_emulator.faults import Fault
 from atalante_emulator.pendant import Operator
 from atalante_hal.robot import Robot
 from atalante_hal.types import SupervisorState
-from atalante_tools.embedded import EmbeddedRobot
+from atalante_tools.embedded import EmbeddedRobot, halves
 from atalante_tools.options import Target
 from atalante_tools.outcome import Failed
 from atalante_tools.pose_hold import PoseHold
@@ -55,6 +55,29 @@ def test_a_robot_apart_becomes_active_and_is_gone_afterwards(network: Network, r
         watch.conclude()
         assert rig.hal.state.supervisor is SupervisorState.HOLD
     assert gone_now(apart.pid)
+
+
+def test_robot_and_hal_share_no_core_while_it_is_there() -> None:
+    before = os.sched_getaffinity(0)
+    with EmbeddedRobot() as apart:
+        ours, childs = os.sched_getaffinity(0), os.sched_getaffinity(apart.pid)
+        assert ours | childs == before
+        assert ours.isdisjoint(childs) or len(before) == 1
+    assert os.sched_getaffinity(0) == before
+    os.sched_setaffinity(0, ours)
+    apart.close()  # a second time, and changes nothing
+    try:
+        assert os.sched_getaffinity(0) == ours
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+@pytest.mark.parametrize(
+    ("cores", "kept", "given"),
+    [({3}, {3}, {3}), ({0, 1}, {0}, {1}), ({5, 1, 2}, {1, 2}, {5}), ({0, 1, 2, 3}, {0, 1}, {2, 3})],
+)
+def test_the_cores_are_halved(cores: set[int], kept: set[int], given: set[int]) -> None:
+    assert halves(cores) == (kept, given)
 
 
 def test_a_killed_robot_ends_the_run_in_one_sentence(network: Network, robot: Robot) -> None:

@@ -4,6 +4,9 @@
 
 The child is a fresh interpreter, in a process group of its own: the terminal's Ctrl-C goes to the loop, which ends in HOLD and
 then closes the bus. Whichever side dies, the other notices by the bus, and nothing is left behind.
+
+The two never share a core: each waits for the other in turn, and a system that thinks they belong together puts them on one,
+where they go several times slower and stay.
 """
 
 from __future__ import annotations
@@ -65,6 +68,10 @@ class EmbeddedRobot(Closing):
             pass_fds=(memory, theirs),
             process_group=0,
         )
+        self._cores = os.sched_getaffinity(0)  # given back by `close`
+        kept, given = halves(self._cores)
+        os.sched_setaffinity(self._child.pid, given)
+        os.sched_setaffinity(0, kept)
         self._begun = False
         os.close(theirs)  # or its end would stay open when it dies
         self.bus = SharedBus("embedded", memory, ours, 0)
@@ -93,8 +100,11 @@ class EmbeddedRobot(Closing):
             raise Failed(str(error)) from error
 
     def close(self) -> None:
-        """Close the bus and see the child off; a second call does nothing."""
+        """Close the bus and see the child off; a second call does nothing. By the thread that made it."""
         self.bus.close()
+        if self._cores:
+            os.sched_setaffinity(0, self._cores)
+            self._cores = set()
         if not self._begun:
             self._child.kill()  # it is of no use, and nobody waits until it has loaded everything
         try:
@@ -104,3 +114,10 @@ class EmbeddedRobot(Closing):
             self._child.wait()
         if self._child.stdin is not None:
             self._child.stdin.close()
+
+
+def halves(cores: set[int]) -> tuple[set[int], set[int]]:
+    """The cores of this thread and of the child, both all of them where there is but one; the odd one is this thread's."""
+    place = (len(cores) + 1) // 2
+    first, others = set(sorted(cores)[:place]), set(sorted(cores)[place:])
+    return first, others or first
