@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from mcap.reader import make_reader
 
 from atalante_control.controller import HangConfig, HangController
@@ -24,10 +25,12 @@ from atalante_hal.frame import Frames
 from atalante_hal.hal import Hal
 from atalante_hal.loop import LockStep, run
 from atalante_hal.robot import JOINTS
+from atalante_hal.telemetry.process import TelemetrySummary
 from atalante_hal.telemetry.schema import message_class
 from atalante_hal.types import State
 from atalante_tools import trial
-from atalante_tools.trial import Result
+from atalante_tools.cli import cli
+from atalante_tools.run_folder import Result, results_table
 
 ATALANTE = str(Path(sys.executable).with_name("atalante"))
 KEYS = [
@@ -41,7 +44,7 @@ def atalante(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 def test_the_table_judges_no_guide_by_a_single_step() -> None:
     walked = Result("pinched", True, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0)
-    head, two, one = trial._table([walked, replace(walked, steps=1)]).splitlines()
+    head, two, one = results_table([walked, replace(walked, steps=1)]).splitlines()
     assert head.split("  ")[0].strip() == "shape"
     assert two.split() == ["pinched", "yes", "2", "0.93", "99.9", "50.0", "4697", "6.2", "90000", "0"]
     assert one.split() == ["pinched", "yes", "1", "-", "-", "-", "4697", "6.2", "90000", "0"]
@@ -174,15 +177,48 @@ def test_at_full_assistance_the_command_frames_are_the_baselines_to_the_last_bit
         (["--shape", "round"], 2, "constant"),
         (["--steps", "0"], 2, "steps"),
         (["--xi", "1.5"], 2, "xi"),
-        (["--record-rate", "333"], 1, "1000"),
-        (["--can-log", "frames.xyz"], 1, ".log"),
+        (["--record-rate", "333"], 2, "'333' does not divide 1000"),
+        (["--record-rate", "0"], 2, "'0' does not divide 1000"),
+        (["--can-log", "frames.xyz"], 2, "end its name in one of .log"),
+        (["-i", "pigeon", "-c", "x"], 3, "there is no CAN interface 'pigeon'"),
+        (["--telemetry", "nofile.toml"], 1, "nofile.toml cannot be read"),
     ],
 )
 def test_bad_input_gets_one_sentence_that_says_what_is_valid(arguments, code, says, tmp_path: Path):
-    done = atalante("hang", "--out", str(tmp_path), *arguments)
-    assert done.returncode == code, done.stderr
+    out = tmp_path / "run"
+    done = CliRunner().invoke(cli, ["hang", "--out", str(out), *arguments])
+    assert done.exit_code == code, done.stderr
+    # Not a word about the guide before: nothing can be promised where nothing runs.
+    assert done.stderr.startswith("atalante: ")
+    assert done.stderr.count("\n") == 1
     assert says in done.stderr
-    assert "Traceback" not in done.stderr
+    assert not out.exists()
+
+
+class Child:
+    """A telemetry process at its end."""
+
+    notices = ("nothing is published: no port",)
+
+    def __init__(self, *summary: str, complete: bool) -> None:
+        self._summary = TelemetrySummary(complete=complete, notices=summary)
+
+    def close(self) -> TelemetrySummary:
+        return self._summary
+
+
+@pytest.mark.parametrize(
+    ("notices", "complete", "said"),
+    [
+        ((*Child.notices, "the recording stopped: disk full"), True, "the recording stopped: disk full\n"),
+        (("telemetry hangs; it is started again",), False, "telemetry hangs; it is started again\n"),
+        ((), False, "the telemetry process has died: the recording may end early\n"),
+        ((), True, ""),
+    ],
+)
+def test_what_was_not_recorded_is_told_once(notices, complete, said, capsys):
+    trial._tell_losses(Child(*notices, complete=complete))
+    assert capsys.readouterr().err == said
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -229,7 +265,7 @@ def test_a_patient_s_gait_of_the_network_is_walked_inside_a_certified_guide(tmp_
     ],
 )
 def test_a_subject_out_of_range_gets_the_range(arguments, code, says, tmp_path: Path):
-    done = atalante("hang", "--out", str(tmp_path), *arguments)
-    assert done.returncode == code, done.stderr
+    done = CliRunner().invoke(cli, ["hang", "--out", str(tmp_path), *arguments])
+    assert done.exit_code == code, done.stderr
     assert says in done.stderr
-    assert "Traceback" not in done.stderr
+    assert done.stderr.count("\n") == 1

@@ -6,7 +6,6 @@ guide shape -> certificate (announced) -> steps -> recording, summary.json, figu
 from __future__ import annotations
 
 import functools
-import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -19,8 +18,9 @@ import click
 
 from atalante_tools.names import find
 from atalante_tools.options import SEED, Between, Target, json_option, options_as, subject_options
+from atalante_tools.run_folder import Result, leave, results_table, run_folder
 from atalante_tools.signals import stop_requested
-from atalante_tools.terminal import say, show_json, table
+from atalante_tools.terminal import say, show_json
 
 if TYPE_CHECKING:
     from atalante_control.controller import HangController
@@ -56,20 +56,11 @@ class Options:
     subject: Subject | None = None  # whose gait of the network; None: the gait drawn for the air
 
 
-@dataclass(frozen=True)
-class Result:
-    """One shape; the keys of `--json` and of summary.json."""
-
-    shape: str
-    certified: bool
-    steps: int  # completed right-stance steps
-    max_ratio: float  # largest |e| / q_bound from the first completed step on
-    inside: float  # share of that time both assisted joints were in the guide
-    filter_active: float  # share of that time the filter acted
-    cycles: int
-    real_time_factor: float
-    frames: int
-    crc_errors: int
+def _record_rate(text: str) -> int:
+    """A rate [Hz] that takes every n-th cycle: an option's type."""
+    if text.isdecimal() and int(text) and not 1000 % int(text):
+        return int(text)
+    raise click.BadParameter(f"{text!r} does not divide 1000 as 1, 10, 50, 100, 200, 250, 500 and 1000 do")
 
 
 def trial_options(steps: int, out: str) -> Callable[[_Command], _Command]:
@@ -81,11 +72,11 @@ def trial_options(steps: int, out: str) -> Callable[[_Command], _Command]:
                      help="Assistance factor: 0 widest guide (7.5 deg), 1 full assistance. The pendant may change it."),
         click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Of the emulated sensors' noise."),
         click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=out, show_default=True,
-                     metavar="DIR", help="Run folder: recording.mcap, summary.json, figures."),
-        click.option("--record-rate", type=int, default=100, show_default=True, metavar="HZ",
-                     help="Recorded cycles a second; 1000 is every cycle."),
+                     metavar="DIR", help="Run folder: recording.mcap, summary.json, figure; an earlier run's are replaced."),
+        click.option("--record-rate", type=_record_rate, default="100", show_default=True, metavar="HZ",
+                     help="Recorded cycles a second, a divisor of 1000, which is every cycle."),
         click.option("--can-log", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
-                     help="Log every frame; format by suffix (.log, .asc, .blf)."),
+                     help="Log every frame; format by suffix: .log, .asc, .blf, .log.gz, .asc.gz."),
         click.option("--telemetry", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
                      help="Telemetry file (TOML): Zenoh endpoint, TLS certificate, users."),
     ]  # fmt: skip
@@ -100,43 +91,74 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
         Failed, FaultLatched: the robot left ACTIVE before the steps were done; what was walked until then is kept.
         SystemExit: a signal ended it.
     """
-    import atalante_dbc
     from atalante_control.guide_shapes import SHAPES
-    from atalante_hal.robot import load_robot
     from atalante_hal.telemetry.access import load_telemetry_file
 
-    shapes = [tuple(SHAPES)[find(name, tuple(SHAPES), "guide shape")] for name in shapes]
+    names = tuple(SHAPES)
+    wanted = {name: SHAPES[name] for name in (names[find(shape, names, "guide shape")] for shape in shapes)}
+    if options.can_log is not None:
+        _require_format(options.can_log)
     outlet = load_telemetry_file(options.telemetry) if options.telemetry else {}
     results: list[Result] = []
+    with run_folder(options.out):
+        try:
+            _walk_all(target, wanted, options, outlet, results, as_json=as_json)
+        finally:
+            if results:
+                if not as_json:
+                    click.echo(results_table(results))
+                asked = {key: value for key, value in asdict(options).items() if key not in ("out", "can_log")}
+                leave(options.out, asked | {"version": version("atalante-hal")}, results)
+
+
+def _require_format(can_log: Path) -> None:
+    from atalante_hal.telemetry.can_log import check_format
+    from atalante_hal.telemetry.sink import SinkError
+
     try:
-        with ExitStack() as stack:
-            apart = _start_robot(target, stack)  # it loads what it needs while the controllers are made
-            network, robot = atalante_dbc.load(), load_robot()
-            exoskeleton, gait, controllers = _controllers(
-                options.subject, robot, {name: SHAPES[name] for name in shapes}
-            )
-            certified = {name: _announce(controller, options.xi) for name, controller in controllers.items()}
-            options.out.mkdir(parents=True, exist_ok=True)
-            stop = stack.enter_context(stop_requested())
-            telemetry: TelemetryProcess | None = None
-            last = [*controllers][-1]
-            for name, controller in controllers.items():
-                with _open(target, options, network, robot, controller, gait.hash32, apart, exoskeleton) as rig:
-                    apart = _start_robot(target, stack) if name != last else None
-                    if telemetry is None:
-                        telemetry = _telemetry(target, options, outlet, rig.hal, network, gait.hash32)
-                        stack.enter_context(telemetry)
-                        _tell_where(telemetry)
-                    telemetry.begin_run(name, {"shape": name, "xi": options.xi, "certified": certified[name]})
-                    walk = _Walk(rig, controller, telemetry, name, options.steps)
-                    statistics = walk.run(stop)
-                    results.append(_result(name, certified[name], controller, rig.hal, statistics))
-                    if as_json:
-                        show_json(asdict(results[-1]))
-                    walk.conclude()
-    finally:
-        if results:
-            _conclude(options, results, as_json=as_json)
+        check_format(can_log)
+    except SinkError as error:
+        raise click.UsageError(str(error)) from error
+
+
+def _walk_all(
+    target: Target,
+    shapes: Mapping[str, GuideShape],
+    options: Options,
+    outlet: Mapping[str, Any],
+    results: list[Result],
+    *,
+    as_json: bool,
+) -> None:
+    """Walk behind each shape in turn and append what became of it to `results`; raises as `run_trial`."""
+    import atalante_dbc
+    from atalante_hal.robot import load_robot
+
+    with ExitStack() as stack:
+        apart = _start_robot(target, stack)  # it loads what it needs while the controllers are made
+        network, robot = atalante_dbc.load(), load_robot()
+        exoskeleton, gait, controllers = _controllers(options.subject, robot, shapes)
+        stop = stack.enter_context(stop_requested())
+        certified: dict[str, bool] = {}
+        telemetry: TelemetryProcess | None = None
+        last = [*controllers][-1]
+        for name, controller in controllers.items():
+            with _open(target, options, network, robot, controller, gait.hash32, apart, exoskeleton) as rig:
+                apart = _start_robot(target, stack) if name != last else None
+                if telemetry is None:
+                    # Promises come when the bus is there to keep them on.
+                    certified = {shape: _announce(guarded, options.xi) for shape, guarded in controllers.items()}
+                    telemetry = _telemetry(target, options, outlet, rig.hal, network, gait.hash32)
+                    stack.enter_context(telemetry)
+                    stack.callback(_tell_losses, telemetry)
+                    _tell_where(telemetry)
+                telemetry.begin_run(name, {"shape": name, "xi": options.xi, "certified": certified[name]})
+                walk = _Walk(rig, controller, telemetry, name, options.steps)
+                statistics = walk.run(stop)
+                results.append(_result(name, certified[name], controller, rig.hal, statistics))
+                if as_json:
+                    show_json(asdict(results[-1]))
+                walk.conclude()
 
 
 class _Walk:
@@ -305,6 +327,16 @@ def _tell_where(telemetry: TelemetryProcess) -> None:
         say(f"telemetry on Zenoh at {telemetry.endpoint}, keys atalante/{telemetry.config.robot}/**")
 
 
+def _tell_losses(telemetry: TelemetryProcess) -> None:
+    """Close it, and say what it could not record or publish."""
+    summary = telemetry.close()
+    for notice in summary.notices:
+        if notice not in telemetry.notices:  # those were told at the start
+            say(notice)
+    if not summary.complete and not summary.notices:
+        say("the telemetry process has died: the recording may end early")
+
+
 def _result(name: str, certified: bool, controller: HangController, hal: Hal, statistics: Statistics) -> Result:
     walked = controller.statistics
     return Result(
@@ -319,54 +351,3 @@ def _result(name: str, certified: bool, controller: HangController, hal: Hal, st
         frames=int(hal.record[hal.layout["frames"]][0]),
         crc_errors=hal.crc_errors,
     )
-
-
-def _conclude(options: Options, results: Sequence[Result], *, as_json: bool) -> None:
-    """Summary, figure, table."""
-    summary = {
-        **{key: value for key, value in asdict(options).items() if key not in ("out", "can_log")},
-        "version": version("atalante-hal"),
-        "shapes": [asdict(result) for result in results],
-    }
-    (options.out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-    figure = _figure(options.out)
-    if not as_json:
-        click.echo(_table(results))
-    say(f"in {options.out}: recording.mcap, summary.json{f', {figure}' if figure else ''}")
-
-
-def _figure(out: Path) -> str:
-    try:
-        from atalante_tools.figures import guide_shapes
-    except ModuleNotFoundError as error:
-        say(f"no figure: {error.name} is not installed; type `pip install 'atalante-hal[plot]'`")
-        return ""
-    name = "guide_shapes.png"
-    guide_shapes(out / "recording.mcap", out / name)
-    return name
-
-
-def _table(results: Sequence[Result]) -> str:
-    head = ["shape", "certified", "steps", "max |e|/q_bound", "inside %", "filter active %", "cycles", "x real time",
-            "frames", "CRC errors"]  # fmt: skip
-    rows = [
-        [
-            r.shape,
-            "yes" if r.certified else "NO",
-            str(r.steps),
-            *_judged(r),
-            str(r.cycles),
-            f"{r.real_time_factor:.1f}",
-            str(r.frames),
-            str(r.crc_errors),
-        ]
-        for r in results
-    ]
-    return table([head, *rows])
-
-
-def _judged(result: Result) -> tuple[str, str, str]:
-    """What became of the guide, from the first completed step on: of a single step there is nothing to say."""
-    if result.steps < 2:
-        return "-", "-", "-"
-    return f"{result.max_ratio:.2f}", f"{100 * result.inside:.1f}", f"{100 * result.filter_active:.1f}"

@@ -1,0 +1,56 @@
+"""The folder of a run: one run at a time, nothing left of a run that did not begin, no figure of half a recording."""
+
+from __future__ import annotations
+
+import errno
+import json
+from pathlib import Path
+
+import pytest
+
+from atalante_tools.outcome import Failed
+from atalante_tools.run_folder import Result, leave, run_folder
+
+WALKED = Result("pinched", True, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0)
+
+
+def test_two_runs_do_not_write_into_one_folder(tmp_path: Path) -> None:
+    out = tmp_path / "runs" / "demo"
+    with run_folder(out):
+        (out / "recording.mcap").touch()
+        with pytest.raises(Failed, match="another run is writing into .*/demo: .* --out"), run_folder(out):
+            raise AssertionError("two runs are in one folder")
+        assert (out / "recording.mcap").exists()
+    with run_folder(out):
+        pass
+    assert [file.name for file in out.iterdir()] == ["recording.mcap"]
+
+
+def test_a_folder_made_for_a_run_that_did_not_begin_goes_again_and_one_that_was_there_stays(tmp_path: Path) -> None:
+    for out in (tmp_path / "new", tmp_path / "old"):
+        if out.name == "old":
+            out.mkdir()
+        with pytest.raises(ZeroDivisionError), run_folder(out):
+            raise ZeroDivisionError
+    assert [folder.name for folder in tmp_path.iterdir()] == ["old"]
+
+
+def test_a_folder_that_cannot_be_made_names_itself(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="file") as refused, run_folder(tmp_path / "file" / "run"):
+        raise AssertionError("there is no such folder")
+    assert (refused.value.errno, refused.value.filename) == (errno.ENOTDIR, str(tmp_path / "file" / "run"))
+
+
+@pytest.mark.parametrize("recording", [b"", b"\x89MCAP0\r\n" + b"\x07" * 100])
+def test_of_half_a_recording_there_is_a_summary_and_no_figure(
+    recording: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "recording.mcap").write_bytes(recording)
+    leave(tmp_path, {"steps": 2}, [WALKED])
+    said = capsys.readouterr().err.splitlines()
+    assert said[0].startswith("no figure: recording.mcap is not whole")
+    assert said[1] == f"in {tmp_path}: recording.mcap, summary.json"
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (summary["steps"], summary["shapes"][0]["shape"]) == (2, "pinched")
+    assert not (tmp_path / "guide_shapes.png").exists()
