@@ -18,7 +18,7 @@ def test_two_runs_do_not_write_into_one_folder(tmp_path: Path) -> None:
     out = tmp_path / "runs" / "demo"
     with run_folder(out):
         (out / "recording.mcap").touch()
-        with pytest.raises(Failed, match="another run is writing into .*/demo: .* --out"), run_folder(out):
+        with pytest.raises(Failed, match=r"another run is writing into .*/demo: .* --out"), run_folder(out):
             raise AssertionError("two runs are in one folder")
         assert (out / "recording.mcap").exists()
     with run_folder(out):
