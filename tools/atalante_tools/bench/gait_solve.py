@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
+from functools import cache
 from itertools import cycle, islice
 from typing import Final
 
@@ -32,17 +33,26 @@ def gait_solve_cold(effort: Effort) -> Measurement:
 
 def gait_solve_warm(effort: Effort) -> Measurement:
     """A gait from that of a neighbour."""
+    return Measurement(_solved(effort, _centre()), _TARGET)
+
+
+@cache
+def _centre() -> Gait:
+    """The neighbour of all subjects; once it is solved, the programme is built."""
     from atalante_control.generation.solve import solve
 
-    return Measurement(_solved(effort, solve(_CENTRE).gait), _TARGET)
+    return solve(_CENTRE).gait
 
 
 def _solved(effort: Effort, neighbour: Gait | None) -> float:
     """Median processor time of a solve [s], the programme being built; compiled, unless it has to be quick."""
     from atalante_control.generation.solve import solve
 
-    solve(_CENTRE, neighbour, machine_code=not effort.quick)
-    rounds, seconds = 2 if effort.quick else _ROUNDS, []
+    if effort.quick:
+        _centre()
+    else:
+        solve(_CENTRE, neighbour, machine_code=True)
+    rounds, seconds = 1 if effort.quick else _ROUNDS, []
     for done, subject in enumerate(islice(cycle(_SUBJECTS), rounds), 1):
         began = time.thread_time()
         solved = solve(subject, neighbour, machine_code=not effort.quick)

@@ -82,7 +82,7 @@ def _library(effort: Effort, jobs: int) -> Measurement:
     from atalante_control.generation.deviation import random_subjects
     from atalante_control.generation.library import solve_subject
 
-    count = (2 if effort.quick else 12) * jobs
+    count = (1 if effort.quick else 12) * jobs
     network = load_network()
     subjects = random_subjects(network.low, network.high, count + jobs, seed=0)
     began = 0.0

@@ -2,7 +2,8 @@
 
 `network -> cantools generate_c_source -> driver -> gcc -> ctypes`. The driver goes through all messages of a cycle,
 unpacks each, asks of every signal whether it is in its range and turns it into a double (or the way back): what our codec
-does. It times itself inside C; nothing of Python is in the figure.
+does. It times itself inside C; nothing of Python is in the figure. Generated is what the HAL needs: decode of what it receives,
+encode of what it sends.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from atalante_hal.frame import FRAME_BYTES, HEADER_BYTES, Frames
 Vector = npt.NDArray[np.float64]
 
 COMPILER = "gcc"
+_NODE = "HAL"
 #: -Bsymbolic: calls inside the library are direct, as in a program of its own.
 OPTIONS = ("-O2", "-fPIC")
 LINK_OPTIONS = ("-shared", "-Wl,-Bsymbolic")
@@ -52,7 +54,7 @@ def available() -> bool:
 
 
 class GeneratedC:
-    """Decode and encode of a fixed list of messages in generated C; row i of the frames is messages[i].
+    """Decode or encode of a fixed list of the HAL's messages in generated C; row i of the frames is messages[i].
 
     Values are in the order of the codec's.
 
@@ -91,9 +93,9 @@ class GeneratedC:
 
 @cache
 def _network() -> tuple[bytes, bytes]:
-    """The generated header, and the generated functions compiled: some seconds, so once."""
+    """The generated header, and the HAL's share of the generated functions compiled: some seconds, so once."""
     with tempfile.TemporaryDirectory(prefix="atalante-bench-") as folder:
-        generate = [sys.executable, "-m", "cantools", "generate_c_source", "--database-name", "net"]
+        generate = [sys.executable, "-m", "cantools", "generate_c_source", "--database-name", "net", "--node", _NODE]
         _run([*generate, "-o", folder, str(DBC_FILE)])
         source, objects = Path(folder, "net.c"), Path(folder, "net.o")
         _run([COMPILER, *OPTIONS, "-c", "-o", str(objects), str(source)])
@@ -112,12 +114,12 @@ def _run(command: Sequence[str]) -> None:
 def _driver(codec: Codec) -> str:
     lines = ["#define _POSIX_C_SOURCE 199309L", "#include <stdint.h>", "#include <time.h>", '#include "net.h"']
     lines.append("volatile bool all_inside;")
-    for direction, parameters, one in (
-        ("decode", "const uint8_t *frames, double *values", _decode_one),
-        ("encode", "uint8_t *frames, const double *values", _encode_one),
+    for direction, parameters, one, sent in (
+        ("decode", "const uint8_t *frames, double *values", _decode_one, False),
+        ("encode", "uint8_t *frames, const double *values", _encode_one, True),
     ):
         lines += [f"static void {direction}_cycle({parameters})", "{", "bool inside = true;"]
-        lines += [one(codec, row, message) for row, message in enumerate(codec.messages)]
+        lines += [one(codec, row, m) for row, m in enumerate(codec.messages) if (m.sender == _NODE) is sent]
         lines += ["all_inside = inside;", "}"]
         body = f"{direction}_cycle(frames, values);"
         lines.append(_TIMED.format(name=direction, parameters=parameters, body=body))

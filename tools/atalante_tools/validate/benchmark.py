@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -129,6 +130,7 @@ class _Tap:
         self.taken.append((frames[:count].copy(), self.cycle, False))
 
 
+@cache
 def _record(cycles: int) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
     """The robot holding its pose in ACTIVE: frames, their cycle from 0, and which ones the HAL sent.
 
