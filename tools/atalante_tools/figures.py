@@ -19,12 +19,21 @@ from matplotlib import pyplot as plt
 
 _LEFT_HIP = "left_SH"
 _RIGHT_STANCE = 1
+#: A step recorded up to this phase was walked to its end.
+_WHOLE = 0.9
+#: (phase, measured, desired, upper edge, lower edge [deg]) of the cycles of a step.
+_Step = list[tuple[float, ...]]
 
 
 def guide_shapes(recording: Path, picture: Path) -> None:
-    """The paper's figure of guide shapes: left hip over the phase, every right-stance step overlaid, one panel a shape."""
-    steps: dict[str, dict[int, list[tuple[float, ...]]]] = defaultdict(lambda: defaultdict(list))
+    """The paper's figure of guide shapes: left hip over the phase, every right-stance step overlaid, one panel a shape.
+
+    A run that was stopped ends in the middle of a step, which is left out unless it is the only one.
+    """
+    steps: dict[str, dict[int, _Step]] = defaultdict(lambda: defaultdict(list))
+    last: dict[str, tuple[int, int]] = {}  # step and stance that a run ends in
     for run, guide, upper, lower in _guide_samples(recording):
+        last[run] = guide.step, guide.stance
         if guide.stance == _RIGHT_STANCE and guide.name and guide.name[0] == _LEFT_HIP:
             desired = guide.desired_position[2]
             degrees = np.degrees([desired + guide.error[0], desired, desired + upper, desired - lower])
@@ -35,7 +44,7 @@ def guide_shapes(recording: Path, picture: Path) -> None:
         rows, columns, figsize=(4.4 * columns, 3.2 * rows), sharex=True, sharey=True, squeeze=False
     )
     for axis, (run, walked) in zip(axes.flat, steps.items(), strict=False):
-        _panel(axis, run, walked)
+        _panel(axis, run, _whole(walked, last[run]))
     for axis in axes.flat[len(steps) :]:
         axis.set_visible(False)
     for axis in axes[-1]:
@@ -47,7 +56,18 @@ def guide_shapes(recording: Path, picture: Path) -> None:
     plt.close(figure)
 
 
-def _panel(axis: Any, run: str, walked: dict[int, list[tuple[float, ...]]]) -> None:
+def _whole(walked: dict[int, _Step], last: tuple[int, int]) -> dict[int, _Step]:
+    """The steps that were walked to their end, or all when none was."""
+    number, stance = last
+    whole = {
+        step: samples
+        for step, samples in walked.items()
+        if (step, _RIGHT_STANCE) != (number, stance) or max(samples)[0] >= _WHOLE
+    }
+    return whole or walked
+
+
+def _panel(axis: Any, run: str, walked: dict[int, _Step]) -> None:
     for number, samples in sorted(walked.items()):
         phase, actual, desired, upper, lower = np.array(sorted(samples)).T
         last = number == max(walked)
@@ -56,7 +76,7 @@ def _panel(axis: Any, run: str, walked: dict[int, list[tuple[float, ...]]]) -> N
             axis.plot(phase, desired, color="black", linewidth=1.0, linestyle="--", label="desired")
             axis.plot(phase, upper, color="tab:red", linewidth=1.2, label="guide")
             axis.plot(phase, lower, color="tab:red", linewidth=1.2)
-    axis.set_title(f"{run}: {len(walked)} right-stance steps", fontsize=9)
+    axis.set_title(f"{run}: {len(walked)} right-stance step{'s'[: len(walked) != 1]}", fontsize=9)
     axis.legend(fontsize=7, loc="best")
     axis.grid(alpha=0.3)
 
