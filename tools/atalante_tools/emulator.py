@@ -42,7 +42,8 @@ LOOK_UP: Final = 0.1
 def command(target: Target, seed: int, operator: bool, xi: float | None, patient: Patient | None) -> None:
     """Be the robot on a bus: drives, IMUs, feet, motors and, unless told otherwise, the operator's pendant.
 
-    With --wall a millisecond is a millisecond, HAL or not; with --lockstep time goes on with each SYNC alone.
+    With --wall a millisecond is a millisecond, HAL or not; with --lockstep time goes on with each SYNC alone. An interface that
+    goes down is waited for.
 
     With --mass and --height its legs are as long as that patient needs them, as `atalante hang` with the same two expects.
     Nobody is in it: it hangs in the air and weighs what it weighs empty.
@@ -112,8 +113,9 @@ def over(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[[], bool]
 
 
 def status_line(emulator: Emulator, bus: Line) -> str:
-    """Cycles, frames and drive states."""
+    """Cycles, frames, drive states, and what is wrong with the interface."""
     states = Counter(state.name for state in emulator.drives.state)
     drives = ", ".join(f"{count} {name}" for name, count in states.items())
     lost = f", {emulator.frames_lost} lost" if emulator.frames_lost else ""
-    return f"{emulator.cycle} cycles, {bus.received} frames in, {bus.sent} out{lost}; drives: {drives}"
+    down = f"; {bus.down}" if bus.down else ""
+    return f"{emulator.cycle} cycles, {bus.received} frames in, {bus.sent} out{lost}; drives: {drives}{down}"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from atalante_hal.bus import Bus
+import time
+
+from atalante_hal.bus import Bus, BusDown
 from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.frame import Frames
 
@@ -12,6 +14,13 @@ class Line(WrappedBus):
 
     When somebody else speaks as the pendant, the emulated operator's own frames are kept back from then on, as a pendant
     process falls silent for a newer one.
+
+    An interface that goes down is silence, as a pulled plug is to a robot: what the nodes say reaches nobody until it is up.
+
+    Attributes:
+        sent, received: frames so far.
+        down: what the interface says while it is down; empty: nothing is wrong.
+        pendant_given_away: somebody else speaks as the pendant.
     """
 
     def __init__(self, bus: Bus, pendant_id: int) -> None:
@@ -19,18 +28,29 @@ class Line(WrappedBus):
         self._pendant_id = pendant_id
         self.sent = 0
         self.received = 0
+        self.down = ""
         self.pendant_given_away = False
 
     def send(self, frames: Frames) -> None:
-        """As `Bus.send`."""
+        """As `Bus.send`, without `BusDown`."""
         if self.pendant_given_away:
             frames = self._without_pendant(frames)
-        super().send(frames)
-        self.sent += len(frames)
+        try:
+            super().send(frames)
+        except BusDown as error:
+            self.down = str(error)
+        else:
+            self.down = ""
+            self.sent += len(frames)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """As `Bus.receive`."""
-        count = super().receive(frames, timeout)
+        """As `Bus.receive`, without `BusDown`: after `timeout` [s] nothing has come."""
+        try:
+            count = super().receive(frames, timeout)
+        except BusDown as error:
+            self.down = str(error)
+            time.sleep(timeout)
+            return 0
         self.received += count
         if not self.pendant_given_away and (frames["can_id"][:count] == self._pendant_id).any():
             self.pendant_given_away = True
