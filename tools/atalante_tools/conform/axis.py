@@ -44,6 +44,12 @@ ROUTES: Final[dict[DriveState, tuple[Controlword, ...]]] = {
 
 #: Cycles a drive may take for a transition.
 FOLLOW: Final = 50
+#: Cycles for which a command that must not move is repeated.
+STAY: Final = 8
+#: Cycles from a command to the state frame that shows it, at the most, when nothing has to switch.
+SHOWN: Final = 3
+#: Difference of measured and wanted torque that is noise [Nm].
+NOISE: Final = 0.3
 
 
 class Axis:
@@ -163,3 +169,17 @@ def names_of(heard: list[Heard]) -> str:
 def always(heard: list[Heard], state: DriveState) -> bool:
     """Every frame says that state, and there is one."""
     return bool(heard) and all(state_of(h) == state for h in heard)
+
+
+def emergencies_of(bench: Bench, first: int) -> list[int]:
+    """Error codes of the emergencies of the node since the frame of that number."""
+    return [
+        int(h.values["ErrorCode"])
+        for h in bench.heard[first:]
+        if h.message is bench.emergency_message and h.values and h.values["ErrorCode"]
+    ]
+
+
+def codes_of(codes: list[int]) -> str:
+    """Error codes as CiA 301 writes them."""
+    return ", ".join(f"{code:#06x}" for code in codes) or "none"

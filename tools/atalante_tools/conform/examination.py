@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from atalante_hal.cia402 import Controlword
-from atalante_tools.conform import any_node, drive, haptics, pendant, sensor
+from atalante_tools.conform import any_node, drive, drive_states, haptics, pendant, sensor
 from atalante_tools.conform.axis import Axis
 from atalante_tools.conform.bench import Bench
 from atalante_tools.conform.requirement import Requirement
@@ -29,4 +29,4 @@ def requirements_of(bench: Bench) -> list[Requirement]:
 def make_safe(bench: Bench) -> None:
     """Leave a drive in its hold, however the examination ended; other nodes need nothing."""
     if bench.node.kind == "drive":
-        Axis(bench).run(drive.STOP, Controlword.QUICK_STOP)
+        Axis(bench).run(drive_states.STOP, Controlword.QUICK_STOP)
