@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import click
@@ -15,11 +16,12 @@ import pytest
 from click.testing import CliRunner
 
 from atalante_control.gait import GaitError
+from atalante_control.guide_shapes import SHAPES
 from atalante_dbc import DbcError
 from atalante_hal.bus import BusAbsent, BusDown, BusError, BusFull
 from atalante_hal.bus.channel_map import ChannelMapError
 from atalante_hal.bus.replay import LogUnreadable
-from atalante_hal.robot import RobotError
+from atalante_hal.robot import JOINTS, MOTORS, RobotError
 from atalante_hal.telemetry.access import AccessError
 from atalante_hal.telemetry.process import TelemetryError
 from atalante_hal.telemetry.ring import RingError
@@ -91,6 +93,26 @@ def test_angles_say_their_unit() -> None:
     text = CliRunner().invoke(cli, ["jog", "--help"]).stdout
     assert "degrees" in text
     assert "deg/s" in text
+
+
+@pytest.mark.parametrize("group", ["pendant", "dbc", "faults", "gait"])
+def test_the_list_of_a_group_is_whole_sentences(group: str) -> None:
+    text = CliRunner().invoke(cli, [group, "--help"], terminal_width=80).stdout
+    lines = text.split("Commands:\n")[1].splitlines()
+    assert len(lines) >= 3
+    assert all(line.startswith("  ") and line[2] != " " and line.endswith(".") for line in lines)
+    assert "..." not in "".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("command", "names"), [("jog", JOINTS), ("vibrate", MOTORS), ("demo", SHAPES), ("hang", SHAPES)]
+)
+def test_help_says_what_there_is_to_name(command: str, names: Sequence[str]) -> None:
+    words = set(re.findall(r"\w+", CliRunner().invoke(cli, [command, "--help"]).stdout))
+    for name in names:
+        side, *rest = name.split("_")
+        parts = [f"{side}_", *(f"{part}_" for part in rest[:-1]), rest[-1]] if rest else [name]
+        assert words.issuperset(parts), (command, name)
 
 
 # -- errors ----------------------------------------------------------------------------------------------------------

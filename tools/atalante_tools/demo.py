@@ -9,7 +9,12 @@ from atalante_tools.trial import Options, run_trial, trial_options
 
 
 @click.command()
-@click.option("--shape", metavar="NAME", multiple=True, help="A guide shape; may be repeated.  [default: all]")
+@click.option(
+    "--shape",
+    metavar="NAME",
+    multiple=True,
+    help="constant, widening, narrowing, pinched, asymmetric, snap; may be repeated.  [default: all]",
+)
 @trial_options(steps=30, out="runs/demo")
 def command(shape: tuple[str, ...], options: Options, as_json: bool) -> None:
     """Walk in the air with every guide shape, on an emulated robot, faster than real time.

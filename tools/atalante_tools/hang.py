@@ -9,7 +9,13 @@ from atalante_tools.trial import Options, run_trial, trial_options
 
 
 @click.command()
-@click.option("--shape", default="constant", show_default=True, metavar="NAME", help="The guide shape.")
+@click.option(
+    "--shape",
+    default="constant",
+    show_default=True,
+    metavar="NAME",
+    help="The guide's: constant, widening, narrowing, pinched, asymmetric, snap.",
+)
 @target_options(embedded=True)
 @trial_options(steps=30, out="runs/hang")
 def command(shape: str, target: Target, options: Options, as_json: bool) -> None:
@@ -19,7 +25,7 @@ def command(shape: str, target: Target, options: Options, as_json: bool) -> None
     after the steps, on Ctrl-C, and when anything goes wrong.
 
     \b
-    Example: atalante emulator -i socketcan -c vcan0 --operator     (in another terminal)
+    Example: atalante emulator -i socketcan -c vcan0     (in another terminal)
              atalante hang -i socketcan -c vcan0 --steps 5 --shape pinched
     """
     run_trial(target, (shape,), options, as_json=as_json)

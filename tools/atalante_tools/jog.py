@@ -36,6 +36,9 @@ TOLERANCE: Final = math.radians(1.0)
 def command(joint: str, degrees: float, speed: float, seed: int, target: Target, as_json: bool) -> None:
     """Move one joint to an angle in degrees; the others hold the pose they are in.
 
+    JOINT is left_ or right_ and FH, TH, SH (hip: frontal, transverse, sagittal), SK (knee), SA or HA (ankle: sagittal, henke).
+    An angle the joint does not reach is answered with its range.
+
     The operator has to press START (`atalante pendant start`); the embedded robot has one who does. Ends in HOLD.
 
     \b

@@ -41,7 +41,7 @@ def command() -> None:
     """
 
 
-@command.command()
+@command.command(short_help="Hold the dead-man, press START, and stay.")
 @target_options(embedded=False, clock=False)
 @for_option
 def start(target: Target, seconds: float | None) -> None:
@@ -57,7 +57,7 @@ def start(target: Target, seconds: float | None) -> None:
     raise SystemExit(operator.stop.exit_code)
 
 
-@command.command()
+@command.command(short_help="Set the assistance factor, and stay.")
 @click.argument("factor", metavar="X", type=Between(0.0, 1.0))
 @target_options(embedded=False, clock=False)
 @for_option
@@ -75,7 +75,7 @@ def xi(factor: float, target: Target, seconds: float | None) -> None:
     raise SystemExit(operator.stop.exit_code)
 
 
-@command.command()
+@command.command(short_help="Press STOP.")
 @target_options(embedded=False, clock=False)
 def stop(target: Target) -> None:
     """Press STOP for half a second and say what the HAL made of it.
@@ -86,7 +86,7 @@ def stop(target: Target) -> None:
     press_once(target, "STOP")
 
 
-@command.command()
+@command.command(short_help="Press HOLD.")
 @target_options(embedded=False, clock=False)
 def hold(target: Target) -> None:
     """Press HOLD for half a second and say what the HAL made of it.

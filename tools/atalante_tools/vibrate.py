@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 def command(motor: str, level: float, seconds: float, target: Target, as_json: bool) -> None:
     """Run one vibration motor at a level from 0 (still) to 1 (strongest); all joints hold the pose they are in.
 
+    MOTOR is left_ or right_, thigh_ or shank_, and front or back: left_thigh_front.
+
     The operator has to press START (`atalante pendant start`); the embedded robot has one who does. Ends in HOLD.
 
     \b

@@ -25,7 +25,7 @@ def command() -> None:
     """
 
 
-@command.command()
+@command.command(short_help="What keeps the strict loader from trusting FILE.")
 @_file_argument
 @json_option
 def lint(file: Path | None, as_json: bool) -> None:
@@ -58,7 +58,7 @@ def print_table(file: Path | None, signals: bool, as_json: bool) -> None:
     _show(signal_rows(network) if signals else message_rows(network), as_json)
 
 
-@command.command()
+@command.command(short_help="Worst-case load of each bus, message by message.")
 @_file_argument
 @click.option(
     "--limit", type=Between(min=0.0), default=60.0, show_default=True, metavar="PERCENT", help="Percent a bus may have."
@@ -83,7 +83,7 @@ def busload(file: Path | None, limit: float, as_json: bool) -> None:
         raise Failed(f"more than {limit:g} % of the time in the worst case: {', '.join(over)}")
 
 
-@command.command()
+@command.command(short_help="What changes on the wire from OLD to NEW.")
 @click.argument("old", type=_FILE)
 @click.argument("new", type=_FILE)
 @json_option
@@ -105,7 +105,7 @@ def diff(old: Path, new: Path, as_json: bool) -> None:
         raise SystemExit(FAILED)
 
 
-@command.command("c-code")
+@command.command("c-code", short_help="C code for FILE, compared with Python.")
 @_file_argument
 @click.option(
     "-o",

@@ -42,7 +42,7 @@ def command() -> None:
     """
 
 
-@command.command("list")
+@command.command("list", short_help="The matrix: each fault, its bound, code and proof.")
 @json_option
 def list_(as_json: bool) -> None:
     """The matrix: what each fault is, its bound and its code, and what proves it."""
@@ -59,7 +59,7 @@ def list_(as_json: bool) -> None:
     )
 
 
-@command.command("run")
+@command.command("run", short_help="Run the cases of one fault and judge them.")
 @click.argument("id_", metavar="ID")
 @click.option("--case", "name", metavar="TEXT", default="", help="Only the cases with this in their name.")
 @json_option
@@ -87,7 +87,7 @@ def run(id_: str, name: str, as_json: bool) -> None:
     _conclude(summary)
 
 
-@command.command("campaign")
+@command.command("campaign", short_help="Run every fault, alone and in pairs; write a report.")
 @click.argument("ids", metavar="[ID]...", nargs=-1)
 @click.option(
     "--jobs",

@@ -41,7 +41,7 @@ def command() -> None:
 command.add_command(solve)
 
 
-@command.command()
+@command.command(short_help="Solve the gaits of a grid of patients and steps.")
 @click.option(
     "--out", type=_FOLDER, required=True, metavar="DIR", help="Folder of the library; made if it is not there."
 )
@@ -149,7 +149,7 @@ def fit(folder: Path, out: Path, as_json: bool) -> None:
     )
 
 
-@command.command()
+@command.command(short_help="Compare the network with freshly solved gaits.")
 @click.option("--network", "file", type=_FILE, metavar="FILE", help="The network.  [default: the one that ships]")
 @click.option(
     "--count", type=click.IntRange(min=1), default=50, show_default=True, metavar="N", help="Random subjects."

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
 
-@click.command()
+@click.command(short_help="Optimise the gait of a patient.")
 @subject_options
 @click.option(
     "--kind",
