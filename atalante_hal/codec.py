@@ -24,6 +24,8 @@ WORD, PLACE, MASK, LARGEST, LOW, HIGH, INVALID = range(7)
 BASE, FACTOR, OFFSET = range(3)
 #: In the place of an invalid code, or of a signal: there is none.
 NO_CODE = -1
+#: What `read_row` found.
+INSIDE, OUTSIDE, SAYS_INVALID = range(3)
 #: Adding this to a float and taking it away again rounds it to an integer.
 _ROUND = 1.5 * 2.0**52
 _LONGEST = 51  # bits such an integer can have
@@ -81,15 +83,9 @@ class Codec:
         #: Raw code of every signal, of the last `decode` or `encode`.
         self.codes = np.zeros(self.size, np.int64)
         self._decode, self._encode = compiled(decode), compiled(encode)
-        # Decoding one row alone: place of the value, bits, largest code, range, scale.
-        self._one_by_one: list[list[tuple[int, int, int, int, int, int, float, float]]] = [[] for _ in self.messages]
-        for i, (row, s, codes) in enumerate(zip(self.row_of.tolist(), signals, plan, strict=True)):
-            mask, largest, low, high = codes[MASK : HIGH + 1]
-            self._one_by_one[row].append((i, s.start, mask, largest, low, high, s.factor, s.offset))
-        self._invalid_codes = [
-            [(s.start, (1 << s.length) - 1, s.invalid_raw) for s in m.signals if s.invalid_raw is not None]
-            for m in self.messages
-        ]
+        #: Signals of row r: signals_by_row[row_begins[r] : row_begins[r + 1]], by their place in the decoded values.
+        self.signals_by_row: Words = np.argsort(self.row_of, kind="stable").astype(np.int64)
+        self.row_begins: Words = np.searchsorted(self.row_of[self.signals_by_row], np.arange(len(self.messages) + 1))
 
     def index(self, message: str, signal: str) -> int:
         """Place of one signal in the decoded values.
@@ -133,34 +129,6 @@ class Codec:
         """Rows with a signal outside its range, of the last `decode`."""
         outside = (self.codes < self.plan[LOW]) | (self.codes > self.plan[HIGH])
         return sorted(set(self.row_of[outside].tolist()))
-
-    def decode_row(self, row: int, payload: bytes, out: Vector) -> bool:
-        """The values of one message alone, signal by signal: for a handful of signals cheaper than array operations.
-
-        Args:
-            payload: of the message's length.
-            out: shape (size,), DBC units; other messages' values and those of a message outside its range stay.
-
-        Returns:
-            Whether every signal is inside its DBC range.
-        """
-        bits = int.from_bytes(payload, "little")
-        values = []
-        for place, start, mask, largest, low, high, factor, offset in self._one_by_one[row]:
-            code = bits >> start & mask
-            if code > largest:  # of a signed signal: negative
-                code -= mask + 1
-            if not low <= code <= high:
-                return False
-            values.append((place, code * factor + offset))
-        for place, value in values:
-            out[place] = value
-        return True
-
-    def says_invalid(self, row: int, payload: bytes) -> bool:
-        """Whether a signal of one message carries its invalid code. `payload`: of the message's length."""
-        bits = int.from_bytes(payload, "little")
-        return any(bits >> start & mask == code for start, mask, code in self._invalid_codes[row])
 
     def encode(self, values: Vector, frames: Frames) -> None:
         """Write physical values into the payloads; reserved bits become 0. Shape (size,), DBC units.
@@ -212,6 +180,32 @@ def scale(codes: Words, scales: Vector, values: Vector) -> None:
     base, factor, offset = scales[BASE], scales[FACTOR], scales[OFFSET]
     for i in range(len(codes)):
         values[i] = (codes[i] + base[i]) * factor[i] + offset[i]
+
+
+def read_row(words: Words, behind: int, signals: Words, plan: Words, codes: Words) -> int:
+    """`read_codes` of one row alone: `INSIDE`, `OUTSIDE`, or `SAYS_INVALID`: outside, and a signal carries its invalid code.
+
+    Args:
+        behind: how many words behind its place in the plan the row stands.
+        signals: those of the row, places in the decoded values.
+    """
+    inside, invalid = True, False
+    for i in signals:
+        code = words[plan[WORD, i] + behind] >> plan[PLACE, i] & plan[MASK, i]
+        invalid |= code == plan[INVALID, i]
+        if code > plan[LARGEST, i]:  # of a signed signal: negative
+            code -= plan[MASK, i] + 1
+        codes[i] = code
+        inside &= plan[LOW, i] <= code <= plan[HIGH, i]
+    if inside:
+        return INSIDE
+    return SAYS_INVALID if invalid else OUTSIDE
+
+
+def scale_row(codes: Words, signals: Words, scales: Vector, values: Vector) -> None:
+    """`scale` of some signals alone."""
+    for i in signals:
+        values[i] = (codes[i] + scales[BASE, i]) * scales[FACTOR, i] + scales[OFFSET, i]
 
 
 def encode(values: Vector, plan: Words, scales: Vector, targets: Words, codes: Words, words: Words) -> int:

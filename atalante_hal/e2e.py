@@ -115,16 +115,30 @@ def protect(octets: Octets, spans: Words, counters: Words) -> None:
         octets[begin], octets[begin + 1] = crc & 0xFF, crc >> 8
 
 
+#: In the place of the counter that is expected: nothing was ever received.
+NOTHING = -1
+_OK, _SOME_LOST, _REPEATED, _WRONG_SEQUENCE = map(
+    int, (Check.OK, Check.SOME_LOST, Check.REPEATED, Check.WRONG_SEQUENCE)
+)
+
+
+def judge_counter(expected: int, received: int) -> int:
+    """As `check_counter`, the result as a plain integer: for loops that are compiled.
+
+    Args:
+        expected: one more than the last counter accepted, or `NOTHING`.
+    """
+    skipped = received - expected & 0xFF
+    if expected == NOTHING or skipped == 0:
+        return _OK
+    if skipped == 0xFF:
+        return _REPEATED
+    return _SOME_LOST if skipped < MAX_DELTA else _WRONG_SEQUENCE
+
+
 def check_counter(last: int | None, received: int) -> Check:
     """Judge an alive counter against the last one accepted; None: nothing was received before."""
-    if last is None:
-        return Check.OK
-    delta = (received - last) & 0xFF
-    if delta == 1:
-        return Check.OK
-    if delta == 0:
-        return Check.REPEATED
-    return Check.SOME_LOST if delta <= MAX_DELTA else Check.WRONG_SEQUENCE
+    return Check(judge_counter(NOTHING if last is None else last + 1 & 0xFF, received))
 
 
 #: The leaky bucket of a message: a bad cycle fills it, a good one empties it, and full it trips. Steady loss above a fifth trips.

@@ -13,28 +13,41 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc import Message
-from atalante_hal.codec import NO_CODE, Codec, Vector, Words, encode, read_codes, scale
+from atalante_hal.codec import (
+    INSIDE,
+    NO_CODE,
+    SAYS_INVALID,
+    Codec,
+    Vector,
+    Words,
+    encode,
+    read_codes,
+    read_row,
+    scale,
+    scale_row,
+)
 from atalante_hal.compiled import compiled
 from atalante_hal.e2e import (
     COUNTER_BYTE,
-    CRC_BYTES,
+    NOTHING,
     Check,
     Octets,
-    check_counter,
-    crc,
-    data_id_bytes,
+    checksum,
     intact,
+    judge_counter,
     protect,
     protected_spans,
 )
-from atalante_hal.frame import HEADER_BYTES, WORDS, Frames, as_words, new_frames
+from atalante_hal.frame import FRAME_BYTES, HEADER_BYTES, WORDS, Frames, as_words, new_frames
 
-#: In the place of a counter: nothing was ever received.
-_NOTHING = -1
 #: In the place of a cycle tag: the senders count for themselves.
 _NO_TAG = -1
-#: Largest `Check` whose data is new, as a plain integer.
-_FRESH = int(Check.SOME_LOST)
+#: `Check`s as plain integers; up to the first, data is new.
+_FRESH = _SOME_LOST = int(Check.SOME_LOST)
+_REPEATED, _WRONG_SEQUENCE = int(Check.REPEATED), int(Check.WRONG_SEQUENCE)
+_CRC, _LENGTH, _RANGE, _INVALID = int(Check.CRC), int(Check.LENGTH), int(Check.RANGE), int(Check.INVALID)
+#: In the place of a row: the frame is no message of the image.
+_FOREIGN = -1
 #: Age of a message that never came.
 NEVER = 1 << 30
 #: Oldest answer [cycles] that is taken for a late one; what is older was replayed.
@@ -69,14 +82,11 @@ class ReceiveImage:
         self.frames = self.codec.template()
         self._words = self.frames.view(np.int64)
         self._headers: Words = as_words(self.frames)[:, 0].astype(np.int64)
-        self._row_of_header = {header: row for row, header in enumerate(self._headers.tolist())}
         self._expected_headers = self._headers.tobytes()
         self.frame_ids = {message.frame_id: row for row, message in enumerate(self.codec.messages)}
-        self._data_ids = [data_id_bytes(m.data_id) for m in self.codec.messages]
-        self._lengths = [m.length for m in self.codec.messages]
         self._spans = protected_spans(self.codec.messages)
         #: Counter the next frame of each row should carry.
-        self._expected: Words = np.full(count, _NOTHING)
+        self._expected: Words = np.full(count, NOTHING)
         #: The values before the last `accept`.
         self.values_before = self.values.copy()
         self._age_before: npt.NDArray[np.int64] = self.age.copy()
@@ -84,8 +94,10 @@ class ReceiveImage:
         self.all_fresh = self._was_fresh = False
         self._ordered = _Received(new_frames(count), count)
         self._received = self._ordered
-        self._accept_exact = compiled(accept_exact)
-        self._accept(self._ordered, None)  # nothing; from now on it is machine code
+        self._accept_exact, self._accept_frames = compiled(accept_exact), compiled(accept_frames)
+        # Nothing; from now on it is machine code.
+        self._accept(self._ordered, None)
+        self.accept_each(new_frames(0), 0)
 
     def new_cycle(self, elapsed: int = 1) -> None:
         """`elapsed` cycles have begun: until something arrives, every row is that much older and has no data."""
@@ -177,48 +189,35 @@ class ReceiveImage:
             Places in `frames[:count]` of the frames that are no message of this image.
         """
         self.values_before[:] = self.values
-        foreign: list[int] = []
-        checks, words = self.check, as_words(frames)
-        for place, header in enumerate(words[:count, 0].tolist()):
-            row = self._row_of_header.get(header)
-            if row is None:
-                row = self.frame_ids.get(header & 0xFFFFFFFF)
-                if row is None:
-                    foreign.append(place)
-                else:
-                    self._refuse_frame(row, Check.LENGTH)
-                continue
-            payload = words[place].tobytes()[HEADER_BYTES : HEADER_BYTES + self._lengths[row]]
-            result = self._judge(row, payload, tag)
-            if result <= _FRESH and not self.codec.decode_row(row, payload, self.values):
-                result = Check.INVALID if self.codec.says_invalid(row, payload) else Check.RANGE
-            if result > _FRESH:
-                self._refuse_frame(row, result)
-                continue
-            self._words[row * WORDS : (row + 1) * WORDS] = words[place]
-            self.age[row] = 0 if tag is None else tag - payload[COUNTER_BYTE] & 0xFF
-            checks[row] = result
+        found: Words = np.empty((count, 2), np.int64)
+        codec = self.codec
+        self._accept_frames(
+            frames.view(np.int64),
+            frames.view(np.uint8),
+            found,
+            self._headers,
+            self._spans,
+            self._expected,
+            _NO_TAG if tag is None else tag,
+            self._restarts,
+            codec.plan,
+            codec.scales,
+            codec.signals_by_row,
+            codec.row_begins,
+            codec.codes,
+            self.values,
+            self.age,
+            self.check,
+            self._words,
+        )
+        foreign = []
+        for place, (row, check) in enumerate(found.tolist()):
+            if row == _FOREIGN:
+                foreign.append(place)
+            elif check > _FRESH:
+                self.refused.append((row, Check(check)))
+                self.crc_errors += check == _CRC
         return foreign
-
-    def _refuse_frame(self, row: int, why: Check) -> None:
-        self.refused.append((row, why))
-        if self.check[row] > _FRESH:
-            self.check[row] = why
-
-    def _judge(self, row: int, payload: bytes, tag: int | None) -> Check:
-        if crc(payload[CRC_BYTES:], self._data_ids[row]) != int.from_bytes(payload[:CRC_BYTES], "little"):
-            self.crc_errors += 1
-            return Check.CRC
-        counter, expected = payload[COUNTER_BYTE], int(self._expected[row])
-        last = None if expected == _NOTHING else expected - 1 & 0xFF
-        result = check_counter(last, counter)
-        if tag is not None and result is not Check.REPEATED:
-            # An answer to no SYNC of the last cycles, or older than what is known already, says nothing about what comes next.
-            behind = last is not None and counter - last & 0xFF >= _HALF_TURN
-            if tag - counter & 0xFF >= LATEST or behind:
-                return Check.WRONG_SEQUENCE
-        self._expected[row] = counter + 1 & 0xFF
-        return Check.SOME_LOST if result is Check.WRONG_SEQUENCE and self._restarts else result
 
 
 class _Received:
@@ -272,6 +271,93 @@ def accept_exact(
     for row in range(len(headers)):
         expected[row] = expected[row] + 1 & 0xFF
     return True
+
+
+def accept_frames(
+    words: Words,
+    octets: Octets,
+    found: Words,
+    headers: Words,
+    spans: Words,
+    expected: Words,
+    tag: int,
+    restarts: bool,
+    plan: Words,
+    scales: Vector,
+    signals_by_row: Words,
+    row_begins: Words,
+    codes: Words,
+    values: Vector,
+    age: Words,
+    check: Octets,
+    kept: Words,
+) -> None:
+    """Judge frames one by one in order of arrival and commit the good ones.
+
+    Args:
+        words, octets: flat views of the frames received.
+        found: row of each frame, or `_FOREIGN`, and its `Check`; rewritten, shape (count, 2).
+        tag: counter all should carry, or `_NO_TAG`; the other arguments as for `accept_exact`, and of `ReceiveImage`.
+    """
+    for place in range(len(found)):
+        first = place * WORDS
+        row = row_of(words[first], headers)
+        found[place, 0] = row
+        if row == _FOREIGN:
+            continue
+        behind = (place - row) * FRAME_BYTES
+        result = judge_frame(words, octets, row, behind, headers, spans, expected, tag, restarts)
+        signals = signals_by_row[row_begins[row] : row_begins[row + 1]]
+        if result <= _FRESH:
+            said = read_row(words, first - row * WORDS, signals, plan, codes)
+            if said != INSIDE:
+                result = _INVALID if said == SAYS_INVALID else _RANGE
+        found[place, 1] = result
+        if result <= _FRESH:
+            scale_row(codes, signals, scales, values)
+            counter = int(octets[spans[row, 0] + behind + COUNTER_BYTE])
+            age[row] = 0 if tag == _NO_TAG else tag - counter & 0xFF
+            kept[row * WORDS : (row + 1) * WORDS] = words[first : first + WORDS]
+            check[row] = result
+        elif check[row] > _FRESH:
+            check[row] = result
+
+
+def row_of(header: int, headers: Words) -> int:
+    """Row of the message with the identifier of a frame, or `_FOREIGN`."""
+    for row in range(len(headers)):
+        if headers[row] & 0xFFFFFFFF == header & 0xFFFFFFFF:
+            return row
+    return _FOREIGN
+
+
+def judge_frame(
+    words: Words,
+    octets: Octets,
+    row: int,
+    behind: int,
+    headers: Words,
+    spans: Words,
+    expected: Words,
+    tag: int,
+    restarts: bool,
+) -> int:
+    """`Check` of a frame's format, CRC and counter; moves `expected` on. `behind`: bytes it stands behind its row's place."""
+    begin, end, data_id = spans[row, 0] + behind, spans[row, 1] + behind, spans[row, 2]
+    if words[(begin - HEADER_BYTES) // 8] != headers[row]:
+        return _LENGTH
+    crc = checksum(octets, begin, end, data_id)
+    if octets[begin] != crc & 0xFF or octets[begin + 1] != crc >> 8:
+        return _CRC
+    counter = int(octets[begin + COUNTER_BYTE])
+    result = judge_counter(expected[row], counter)
+    if tag != _NO_TAG and result != _REPEATED:
+        # An answer to no SYNC of the last cycles, or older than what is known already, says nothing about what comes next.
+        backwards = expected[row] != NOTHING and counter - expected[row] + 1 & 0xFF >= _HALF_TURN
+        if tag - counter & 0xFF >= LATEST or backwards:
+            return _WRONG_SEQUENCE
+    expected[row] = counter + 1 & 0xFF
+    return _SOME_LOST if result == _WRONG_SEQUENCE and restarts else result
 
 
 class TransmitImage:

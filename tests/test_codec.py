@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from atalante_dbc import DBC_FILE, load
-from atalante_hal.codec import Codec, group_of
+from atalante_hal.codec import INSIDE, OUTSIDE, SAYS_INVALID, Codec, group_of, read_row, scale_row
+from atalante_hal.frame import WORDS
 from atalante_hal.robot import JOINTS
 
 NETWORK = load()
@@ -172,12 +173,43 @@ def test_unknown_names_are_answered_with_the_valid_ones():
         codec.slice("Angle")
 
 
+def read_one(codec: Codec, row: int, frames, behind: int = 0) -> int:
+    signals = codec.signals_by_row[codec.row_begins[row] : codec.row_begins[row + 1]]
+    return read_row(frames.view(np.int64), behind, signals, codec.plan, codec.codes)
+
+
 def test_an_invalid_code_is_told_from_a_value_outside_its_range():
-    network = load()
-    message = network.message("IMU_PELVIS_STATE")
+    message = load().message("LEFT_FH_STATE")
     codec = Codec([message])
+    drive_state = next(s for s in message.signals if s.name == "DriveState")
+    outside = 65 << drive_state.start  # neither in range nor its invalid code
+    frames = codec.template()
     for signal in message.signals:
-        for code in (0, signal.invalid_raw):
-            payload = 0 if code is None else code << signal.start
-            expected = code is not None and code == signal.invalid_raw
-            assert codec.says_invalid(0, payload.to_bytes(message.length, "little")) is expected, signal.name
+        invalid = 0 if signal.invalid_raw is None else signal.invalid_raw << signal.start
+        for payload in (invalid, invalid if signal is drive_state else invalid | outside):
+            frames["data"][0] = np.frombuffer(payload.to_bytes(64, "little"), np.uint8)
+            expected = SAYS_INVALID if invalid else OUTSIDE if payload else INSIDE
+            assert read_one(codec, 0, frames) == expected, signal.name
+
+
+def test_a_row_alone_is_decoded_like_all_of_them_and_nothing_else_is_touched():
+    codec = Codec(MESSAGES)
+    rng = np.random.default_rng(5)
+    low, high = limits(codec)
+    frames, whole = codec.template(), np.zeros(codec.size)
+    codec.encode(rng.uniform(low, high), frames)
+    assert codec.decode(frames, whole)
+    codes = codec.codes.copy()
+    shuffled = rng.permutation(len(MESSAGES))
+    alone = frames[shuffled].copy()
+    for place, row in enumerate(shuffled.tolist()):
+        codec.codes.fill(-7)
+        values = np.full(codec.size, np.nan)
+        signals = codec.signals_by_row[codec.row_begins[row] : codec.row_begins[row + 1]]
+        assert read_one(codec, row, alone, (place - row) * WORDS) == INSIDE
+        scale_row(codec.codes, signals, codec.scales, values)
+        mine = codec.row_of == row
+        assert np.array_equal(values[mine], whole[mine])
+        assert np.array_equal(codec.codes[mine], codes[mine])
+        assert np.isnan(values[~mine]).all()
+        assert (codec.codes[~mine] == -7).all()

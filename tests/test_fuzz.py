@@ -11,9 +11,8 @@ from frame_fuzzer import RECEIVE_BUDGET, SWEEP, Finding, Fuzzer, Oracle, fuzz_im
 
 import atalante_dbc
 from atalante_emulator.drive import Drives
-from atalante_hal.codec import Codec
-from atalante_hal.e2e import Check
-from atalante_hal.frame import as_words, new_frames
+from atalante_hal.e2e import CRC_BYTES, Check, crc, data_id_bytes
+from atalante_hal.frame import Frames, as_words, new_frames
 from atalante_hal.image import ReceiveImage, TransmitImage
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import SupervisorState
@@ -69,20 +68,36 @@ def run_image(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["HAL, every cycle", "nodes"])
 def test_an_image_without_its_crc_check_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ReceiveImage, "_judge", lambda *_: Check.OK)
+    accept_each = ReceiveImage.accept_each
+
+    def accept_damaged(image: ReceiveImage, frames: Frames, count: int, tag: int | None = None) -> list[int]:
+        frames = frames.copy()
+        for frame in frames[:count]:
+            row = image.frame_ids.get(int(frame["can_id"]))
+            if row is not None:
+                message = image.codec.messages[row]
+                data = frame["data"][: message.length]
+                data[:CRC_BYTES] = list(
+                    crc(data[CRC_BYTES:].tobytes(), data_id_bytes(message.data_id)).to_bytes(CRC_BYTES, "little")
+                )
+        return accept_each(image, frames, count, tag)
+
+    monkeypatch.setattr(ReceiveImage, "accept_each", accept_damaged)
     with pytest.raises(Finding, match="took a frame that is not intact"):
         run_image(name)
 
 
 def test_an_image_without_its_range_check_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    decode = Codec.decode_row
+    accept_each = ReceiveImage.accept_each
 
-    def decode_anything(codec: Codec, row: int, payload: bytes, values: Any) -> bool:
-        if not decode(codec, row, payload, values):
-            values[np.flatnonzero(codec.row_of == row)] = 1e9
-        return True
+    def accept_anything(image: ReceiveImage, frames: Frames, count: int, tag: int | None = None) -> list[int]:
+        foreign = accept_each(image, frames, count, tag)
+        for row, why in image.refused:
+            if why is Check.RANGE:
+                image.values[image.codec.row_of == row] = 1e9
+        return foreign
 
-    monkeypatch.setattr(Codec, "decode_row", decode_anything)
+    monkeypatch.setattr(ReceiveImage, "accept_each", accept_anything)
     with pytest.raises(Finding, match="left its range"):
         run_image("HAL, every cycle")
 
