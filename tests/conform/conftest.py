@@ -15,7 +15,7 @@ from atalante_emulator.body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus.pair import PairBus, lockstep_pair
-from atalante_hal.frame import FLAG_BRS, FLAG_FDF, Frames, new_frames
+from atalante_hal.frame import FLAG_BRS, FLAG_FDF, FRAME, Frames, new_frames
 from atalante_hal.robot import Robot
 from atalante_tools.conform.bench import Bench, Limits, LockStep
 from atalante_tools.conform.examination import requirements_of
@@ -30,7 +30,7 @@ class Wire:
 
     def __init__(self, bus: PairBus) -> None:
         self._bus = bus
-        self.to_node: Callable[[Frames], Frames] = lambda frame: frame
+        self.to_node: Callable[[Frames], Frames] | None = None
         self.from_node: Callable[[Frames], Frames] | None = None
         #: Frames the node says besides, asked at every receive.
         self.out_of_the_blue: Callable[[], Frames] = lambda: NO_FRAME
@@ -42,6 +42,9 @@ class Wire:
 
     def send(self, frames: Frames) -> None:
         self.sync_sent |= int(frames["can_id"][-1]) in self._syncs
+        if self.to_node is None:
+            self._bus.send(frames)
+            return
         for place in range(len(frames)):
             kept = self.to_node(frames[place : place + 1].copy())
             if len(kept):
@@ -51,7 +54,8 @@ class Wire:
         count = self._bus.receive(frames, timeout)
         if self.from_node is not None:
             kept = [self.from_node(frames[place : place + 1].copy()) for place in range(count)]
-            together = np.concatenate([*kept, self.out_of_the_blue()])
+            # Through their bytes: numpy takes forty times as long to join records.
+            together = np.frombuffer(b"".join(part.tobytes() for part in [*kept, self.out_of_the_blue()]), FRAME)
             count = len(together)
             frames[:count] = together
         self.sync_sent = False
