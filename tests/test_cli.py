@@ -171,6 +171,11 @@ def test_a_sentence_of_several_lines_becomes_one(failing: Any) -> None:
     assert failing(BusError("first\n  second\tthird")).stderr == "atalante: first second third\n"
 
 
+def test_of_a_list_of_problems_the_first_is_told(failing: Any) -> None:
+    problems = "\n".join(f"a.dbc:{line}: no unit" for line in range(1, 25))
+    assert failing(DbcError(problems)).stderr == "atalante: DBC_INVALID: a.dbc:1: no unit, and 23 more\n"
+
+
 @pytest.mark.parametrize(
     ("error", "sentence"),
     [

@@ -246,3 +246,23 @@ def test_encoding_of_many_fields() -> None:
     for row, payload in enumerate(encode([(n, values * n) for n in numbers], 3)):
         decoded = kind.FromString(payload)
         assert [getattr(decoded, f"f{n}") for n in numbers] == [(row - 1) * n for n in numbers]
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "parquet"])
+@pytest.mark.parametrize(("error", "code"), [(OSError(28, "No space left on device"), 1), (KeyboardInterrupt(), 130)])
+def test_what_does_not_become_whole_leaves_the_file_of_before(
+    suffix: str, error: BaseException, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log, _ = random_log(COLLECTION[0], tmp_path / "random.log", 20)
+    out = tmp_path / f"out.{suffix}"
+    out.write_text("of yesterday")
+
+    def fail(_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(f"atalante_tools.decode.{suffix}.{suffix.capitalize()}Sink.flush", fail)
+    result = run("decode", log, "--dbc", COLLECTION[0], "-o", out)
+    assert result.exit_code == code
+    assert result.stderr == (f"atalante: {out} cannot be written: No space left on device\n" if code == 1 else "")
+    assert out.read_text() == "of yesterday"
+    assert sorted(path.name for path in tmp_path.iterdir()) == [out.name, log.name]

@@ -161,11 +161,11 @@ def test_a_file_that_is_no_network_is_refused(
         load_network(path)
 
 
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 nothing", b"not a network"])
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 nothing", b"not a network", b"(1700000000.0) can0 123#00"])
 def test_a_broken_file_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "network.npz"
     path.write_bytes(content)
-    with pytest.raises(NetworkError, match=re.escape(str(path))):
+    with pytest.raises(NetworkError, match=re.escape(f"{path} is no gait network; `atalante gait fit` makes one")):
         load_network(path)
     with pytest.raises(NetworkError, match="nowhere"):
         load_network(tmp_path / "nowhere.npz")

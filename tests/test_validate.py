@@ -346,6 +346,13 @@ def test_list_rules() -> None:
         assert rule.id in result.stdout
 
 
+def test_list_rules_for_scripts() -> None:
+    listed = [json.loads(line) for line in run("validate", "--list-rules", "--json").stdout.splitlines()]
+    assert [rule["rule"] for rule in listed] == [rule.id for rule in RULES]
+    assert all(rule["meaning"] and rule["source"] for rule in listed)
+    assert sum(len(rule["thresholds"]) for rule in listed) == sum(len(rule.thresholds) for rule in RULES)
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [

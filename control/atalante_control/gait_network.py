@@ -130,7 +130,7 @@ def load_network(path: Path | None = None) -> GaitNetwork:
     except OSError as error:
         raise NetworkError(f"{path} cannot be read: {error.strerror or error}") from error
     except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise NetworkError(f"{path}: {error}") from error
+        raise NetworkError(f"{path} is no gait network; `atalante gait fit` makes one") from error
     if str(arrays.pop("format", "")) != FORMAT or arrays.pop("inputs", np.array([])).tolist() != list(INPUTS):
         raise NetworkError(f"{path}: format is {FORMAT!r} with the inputs {', '.join(INPUTS)}")
     version = str(arrays.pop("version", ""))

@@ -68,6 +68,8 @@ KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_tools.validate.project", "ProjectError", Misused),
 )
 
+#: Lines of a message, one a problem, that still make a sentence with the first.
+MOST: Final = 2
 #: What a disk says that takes no more: full, over quota, read-only, broken. Such an error may name no file.
 DISK: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
 
@@ -81,7 +83,9 @@ def failure_of(error: BaseException) -> Failed | None:
     for module, name, failure in KNOWN:
         kind = getattr(sys.modules.get(module), name, None)
         if kind is not None and isinstance(error, kind):
-            sentence = " ".join(str(error).split())
+            first, *others = str(error).splitlines() or [""]
+            said = f"{first}, and {len(others)} more" if len(others) > MOST else str(error)
+            sentence = " ".join(said.split())
             code = getattr(error, "code", "")
             return failure(f"{code}: {sentence}" if code else sentence)
     if isinstance(error, OSError) and (error.filename is not None or error.errno in DISK):

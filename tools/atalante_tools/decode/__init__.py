@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,6 +35,8 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
     Example: atalante decode night.log -o night.parquet
              atalante decode drive.blf --dbc vehicle.dbc -o drive.mcap
     """
+    if out.suffix.lower() not in (".parquet", ".mcap"):
+        raise click.UsageError(f"{out} must end in .parquet or .mcap")
     from atalante_dbc import DBC_FILE
     from atalante_dbc.foreign import catalogue
     from atalante_tools.decode.signals import Decoder
@@ -46,7 +49,7 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
     sources = [open_log(path) for path in logs]
     decoder = Decoder(plan)
     progress = Progress()
-    with closing(_sink(out, plan)) as sink:
+    with _whole(out) as part, closing(_sink(part, out.suffix.lower(), plan)) as sink:
         for source in sources:
             for chunk in source.chunks():
                 for piece in decoder.decode(chunk):
@@ -65,8 +68,25 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
         raise SystemExit(FAILED)
 
 
-def _sink(out: Path, plan: Plan) -> Sink:
-    suffix = out.suffix.lower()
+@contextmanager
+def _whole(out: Path) -> Iterator[Path]:
+    """Where to write what becomes `out` once it is whole; what does not become whole goes again.
+
+    Raises:
+        Failed: the file cannot be written.
+    """
+    part = out.with_name(f"{out.name}.part")
+    try:
+        yield part
+        part.replace(out)
+    except OSError as error:
+        raise Failed(f"{out} cannot be written: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _sink(out: Path, suffix: str, plan: Plan) -> Sink:
+    """A file of the kind the suffix names."""
     try:
         if suffix == ".parquet":
             from atalante_tools.decode.parquet import ParquetSink
@@ -78,6 +98,4 @@ def _sink(out: Path, plan: Plan) -> Sink:
             return McapSink(out, plan)
     except ModuleNotFoundError as error:
         raise Failed(f"a {suffix} file needs {error.name}: type `pip install 'atalante-hal[decode]'`") from error
-    except OSError as error:
-        raise Failed(f"{out} cannot be written: {error.strerror}") from error
-    raise click.UsageError(f"{out} must end in .parquet or .mcap")
+    raise AssertionError(f"{suffix} was let through")

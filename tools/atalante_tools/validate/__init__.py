@@ -77,10 +77,14 @@ def command(
              atalante validate -i socketcan -c can0 --node LEFT_FH --for 10
              atalante validate drive.blf --dbc vehicle.dbc --rules vehicle.toml --junit result.xml
     """
-    from atalante_tools.validate.report import rules_text
+    from atalante_tools.validate.report import rules_json, rules_text
 
     if list_rules:
-        click.echo(rules_text())
+        if as_json:
+            for rule in rules_json():
+                show_json(rule)
+        else:
+            click.echo(rules_text())
         return
     if bool(logs) == bool(interface):
         raise click.UsageError("name one or more logs, or a bus to listen to: -i socketcan -c can0")

@@ -149,6 +149,14 @@ def rules_text() -> str:
     return table(rows)
 
 
+def rules_json() -> list[dict[str, object]]:
+    """The same for scripts."""
+    return [
+        {"rule": rule.id, "meaning": rule.meaning, "source": rule.source, "thresholds": dict(rule.thresholds)}
+        for rule in RULE_OF.values()
+    ]
+
+
 def _toml(value: object) -> str:
     if isinstance(value, tuple):
         return "[" + ", ".join(f'"{item}"' for item in value) + "]"
