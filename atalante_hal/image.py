@@ -97,7 +97,7 @@ class ReceiveImage:
         self._accept_exact, self._accept_frames = compiled(accept_exact), compiled(accept_frames)
         # Nothing; from now on it is machine code.
         self._accept(self._ordered, None)
-        self.accept_each(new_frames(0), 0)
+        self.accept_each(self._ordered.frames, 0)
 
     def new_cycle(self, elapsed: int = 1) -> None:
         """`elapsed` cycles have begun: until something arrives, every row is that much older and has no data."""
@@ -189,7 +189,7 @@ class ReceiveImage:
             Places in `frames[:count]` of the frames that are no message of this image.
         """
         self.values_before[:] = self.values
-        found: Words = np.empty((count, 2), np.int64)
+        found: Words = np.full((count, 2), _FOREIGN)
         codec = self.codec
         self._accept_frames(
             frames.view(np.int64),

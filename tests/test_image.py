@@ -180,6 +180,18 @@ def test_fast_and_slow_path_give_equal_results_for_any_history(history, shuffler
         assert fast.crc_errors == slow.crc_errors
 
 
+@pytest.mark.parametrize("byte", [0, 1, 2, 11])
+def test_a_flipped_bit_anywhere_is_found_in_a_frame_alone(byte: int):
+    tx, rx, _ = pair()
+    frame = tx.seal_row(0).copy()
+    frame["data"][0, byte] ^= 0x40
+    rx.new_cycle()
+    rx.accept_each(frame, 1)
+    assert rx.refused == [(0, Check.CRC)]
+    assert rx.check[0] == Check.CRC
+    assert rx.crc_errors == 1
+
+
 def test_a_single_row_can_be_sealed_alone():
     tx = TransmitImage(CYCLIC)
     rx = ReceiveImage(CYCLIC)

@@ -84,6 +84,7 @@ class Trial:
     def lay_out(self) -> None:
         """Copy the project; files that are as they were keep their time, and the mutants in them their verdicts."""
         self._work.mkdir(parents=True, exist_ok=True)
+        before = self._sources()
         # mutmut does not copy data again that it has copied once.
         mutants = self._work / "mutants"
         ours = (*self._files, "mutmut-stats.json")
@@ -96,6 +97,9 @@ class Trial:
             if target.exists():
                 shutil.rmtree(target)
             shutil.copytree(ROOT / package, target, ignore=shutil.ignore_patterns("__pycache__", ".*", "mutation"))
+        if self._sources() != before:
+            # Which tests reach a function was asked before it was there.
+            (mutants / "mutmut-stats.json").unlink(missing_ok=True)
         text = PYPROJECT.format(
             packages=json.dumps([Path(package).name for package in PACKAGES]),
             files=json.dumps(self._files),
@@ -103,6 +107,11 @@ class Trial:
             tests=json.dumps([f"tests/{name}" for name in self._tests]),
         )
         (self._work / "pyproject.toml").write_text(text)
+
+    def _sources(self) -> dict[str, bytes]:
+        """The files of the part and their tests, as they are laid out."""
+        paths = [self._work / name for name in (*self._files, *(f"tests/{test}" for test in self._tests))]
+        return {path.name: path.read_bytes() for path in paths if path.exists()}
 
     def judge(self, children: int) -> None:
         """Let mutmut judge every mutant that was not killed before; it shows its progress itself, at a terminal.
