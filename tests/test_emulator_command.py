@@ -54,7 +54,7 @@ class OtherProcess:
             self.stop.ask(2)
 
     def run(self, *arguments: str) -> Result:
-        return CliRunner().invoke(cli, ["emulator", "-i", "virtual", "-c", "test", "--lockstep", *arguments])
+        return CliRunner().invoke(cli, ["emulator", "-i", "pcan", "-c", "test", "--lockstep", *arguments])
 
 
 def test_a_hal_at_the_other_end_finds_every_node_and_an_operator(
@@ -65,7 +65,7 @@ def test_a_hal_at_the_other_end_finds_every_node_and_an_operator(
     assert result.exit_code == 130, result.stderr
     assert result.stdout == ""
     assert result.stderr.startswith(
-        "the robot is on virtual test; now, in another terminal: atalante hang -i virtual -c test\n"
+        "the robot is on pcan test; now, in another terminal: atalante hang -i pcan -c test\n"
     )
     assert other.active_at is not None
     assert other.hal.missing() == []
@@ -79,7 +79,7 @@ def test_without_an_operator_the_pendant_is_somebody_elses(
 ) -> None:
     other = OtherProcess(network, robot, 500, monkeypatch)
     result = other.run("--no-operator")
-    assert "its operator is you: atalante pendant start -i virtual -c test" in result.stderr
+    assert "its operator is you: atalante pendant start -i pcan -c test" in result.stderr
     assert other.active_at is None
     assert other.hal.state.supervisor is SupervisorState.READY
 
@@ -97,7 +97,7 @@ def test_its_legs_are_those_of_the_patient_the_other_side_walks_for(
         assert result.exit_code == 130, result.stderr
     exoskeleton = ExoskeletonParameters()
     assert bodies == [urdf(exoskeleton, robot), urdf(exoskeleton.fitted(Patient(75.0, 1.75)), robot)]
-    assert "atalante hang -i virtual -c test --mass 75 --height 1.75\n" in result.stderr
+    assert "atalante hang -i pcan -c test --mass 75 --height 1.75\n" in result.stderr
 
 
 def test_one_seed_is_one_robot(network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,9 +126,9 @@ def test_the_status_line_counts_cycles_frames_and_drives(
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["-i", "virtual", "-c", "x", "--no-operator", "--xi", "0.5"], "--xi is what the operator sets"),
-        (["-i", "virtual", "-c", "x", "--xi", "2"], "2.0 is not in the range"),
-        (["-i", "virtual", "-c", "x", "--mass", "75"], "a patient needs --mass and --height"),
+        (["-i", "pcan", "-c", "x", "--no-operator", "--xi", "0.5"], "--xi is what the operator sets"),
+        (["-i", "pcan", "-c", "x", "--xi", "2"], "2.0 is not in the range"),
+        (["-i", "pcan", "-c", "x", "--mass", "75"], "a patient needs --mass and --height"),
         (["-i", "embedded"], "this needs a bus that other processes are on"),
         ([], "socketcan needs a channel: -c vcan0"),
     ],

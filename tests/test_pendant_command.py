@@ -28,7 +28,7 @@ from atalante_tools.pendant_session import Keyboard, Session
 from atalante_tools.signals import StopRequest
 
 OFF, READY, ACTIVE, HOLD = (SupervisorState[name] for name in ("OFF", "READY", "ACTIVE", "HOLD"))
-TARGET = Target("virtual", "test", lockstep=False)
+TARGET = Target("pcan", "test", lockstep=False)
 
 
 class Wire:
@@ -365,7 +365,7 @@ def test_no_hal_is_said_once_and_waited_for(world: World, capsys: pytest.Capture
     operator.stay(3.0)
     assert capsys.readouterr().err.splitlines() == [
         "pendant in hand",
-        "no SYNC on virtual test: no HAL is running there; waiting for one",
+        "no SYNC on pcan test: no HAL is running there; waiting for one",
     ]
 
 
@@ -401,7 +401,7 @@ def test_the_keyboard_gives_whole_lines_and_ends_with_the_file() -> None:
 def invoke(world: World, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> Result:
     monkeypatch.setattr(pendant, "open_pendant_bus", lambda target: (world.network, world.wire.end(world.cycle)))
     monkeypatch.setattr(pendant_session, "Session", partial(Session, now=lambda: world.now))
-    return CliRunner().invoke(cli, ["pendant", *arguments, "-i", "virtual", "-c", "test"])
+    return CliRunner().invoke(cli, ["pendant", *arguments, "-i", "pcan", "-c", "test"])
 
 
 @pytest.mark.parametrize("button", ["stop", "hold"])
@@ -415,7 +415,7 @@ def test_stop_without_a_hal_fails_with_a_sentence(world: World, monkeypatch: pyt
     world.running = False
     result = invoke(world, monkeypatch, "stop")
     assert result.exit_code == 1
-    assert "no SYNC on virtual test: no HAL is running there, so there is nothing to stop" in result.stderr
+    assert "no SYNC on pcan test: no HAL is running there, so there is nothing to stop" in result.stderr
 
 
 def test_start_runs_for_a_time_and_ends_in_hold(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -429,14 +429,14 @@ def test_xi_takes_over_and_sets_the_factor(world: World, monkeypatch: pytest.Mon
     world.active()
     result = invoke(world, monkeypatch, "xi", "0.7", "--for", "0.1")
     assert result.exit_code == 0
-    assert result.stderr.startswith("taking over from another pendant on virtual test\nassistance factor 0.7\n")
+    assert result.stderr.startswith("taking over from another pendant on pcan test\nassistance factor 0.7\n")
     assert world.hal.state.assistance_factor == pytest.approx(0.7, abs=1e-4)
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["xi", "1.2", "-i", "virtual", "-c", "x"], "1.2 is not in the range 0.0<=x<=1.0"),
+        (["xi", "1.2", "-i", "pcan", "-c", "x"], "1.2 is not in the range 0.0<=x<=1.0"),
         (["start"], "socketcan needs a channel: -c vcan0"),
         (["stop", "-i", "embedded"], "this needs a bus that other processes are on: -i socketcan -c vcan0"),
         (["stop", "-c", "left_leg=a,b"], "'b' in the channel map is not BUS=CHANNEL"),

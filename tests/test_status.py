@@ -21,7 +21,7 @@ from atalante_tools.observer import NodeReport, Observer, Report, as_json
 from atalante_tools.options import Target
 from atalante_tools.status import render
 
-TARGET = Target("virtual", "test", lockstep=False)
+TARGET = Target("pcan", "test", lockstep=False)
 
 
 class Tap:
@@ -147,7 +147,7 @@ def test_a_node_that_falls_silent_grows_old(network: Network, robot: Robot, traf
 def test_a_hal_that_is_gone_is_said_to_be(network: Network, robot: Robot, traffic: list[Frames]) -> None:
     observer, now = observe(network, robot, [*traffic, *[new_frames(0)] * 600])
     assert render(observer.report(now), TARGET).startswith(
-        "virtual test: the HAL has been silent for 600 ms; it was ACTIVE in cycle 5"
+        "pcan test: the HAL has been silent for 600 ms; it was ACTIVE in cycle 5"
     )
 
 
@@ -258,7 +258,7 @@ def invoke(monkeypatch: pytest.MonkeyPatch, cycles: list[Frames], *arguments: st
     bus = Recorded(cycles, tick)
     monkeypatch.setattr(status, "time", Clock)
     monkeypatch.setattr(rig_module, "open_buses", lambda network, target: dict.fromkeys(network.buses, bus))
-    result = CliRunner().invoke(cli, ["status", "-i", "virtual", "-c", "test", *arguments])
+    result = CliRunner().invoke(cli, ["status", "-i", "pcan", "-c", "test", *arguments])
     assert bus.closed
     return result
 
@@ -266,7 +266,7 @@ def invoke(monkeypatch: pytest.MonkeyPatch, cycles: list[Frames], *arguments: st
 def test_the_table_is_printed(monkeypatch: pytest.MonkeyPatch, traffic: list[Frames]) -> None:
     result = invoke(monkeypatch, traffic, "--for", "0.5")
     assert result.exit_code == 0, result.stderr
-    assert result.stdout.startswith("virtual test: HAL ACTIVE, cycle ")
+    assert result.stdout.startswith("pcan test: HAL ACTIVE, cycle ")
     assert "assistance factor 0.25" in result.stdout
     assert "dead-man pressed" in result.stdout
     assert "2 lost" in result.stdout
@@ -285,8 +285,7 @@ def test_silence_fails_with_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     result = invoke(monkeypatch, [], "--for", "0.1", "--json")
     assert result.exit_code == 1
     assert (
-        "nothing was heard on virtual test for 0.1 s: start a robot (atalante emulator -i virtual -c test)"
-        in result.stderr
+        "nothing was heard on pcan test for 0.1 s: start a robot (atalante emulator -i pcan -c test)" in result.stderr
     )
     assert json.loads(result.stdout)["frames"] == 0
 

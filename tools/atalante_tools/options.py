@@ -19,6 +19,11 @@ if TYPE_CHECKING:
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 EMBEDDED: Final = "embedded"
+#: Interfaces of python-can that do not join processes as a wire does, and why.
+NO_WIRE: Final = {
+    "virtual": "stays inside one process",
+    "udp_multicast": "hands every sender its own frames, which a HAL takes for another HAL's",
+}
 
 #: --json: one object a line on stdout, everything else on stderr.
 json_option = click.option("--json", "as_json", is_flag=True, help="JSON objects on stdout, one a line.")
@@ -201,7 +206,7 @@ def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command]
         embedded: whether an embedded robot is a choice, and then the default.
         clock: whether the command has one.
     """
-    interfaces = "socketcan, virtual, pcan, ..."
+    interfaces = "socketcan, pcan, kvaser, ..."
     options = [
         click.option(
             "-i",
@@ -238,6 +243,10 @@ def _target(interface: str, channel: str, lockstep: bool | None = None, *, embed
             raise click.UsageError("this needs a bus that other processes are on: -i socketcan -c vcan0")
         if channel:
             raise click.UsageError(f"the embedded robot has no channel; to use {channel} say -i socketcan -c {channel}")
+    elif interface in NO_WIRE:
+        raise click.UsageError(
+            f"{interface} {NO_WIRE[interface]}: use an adapter, or a vcan of Linux (`atalante doctor -i socketcan -c vcan0`)"
+        )
     elif not channel:
         raise click.UsageError(f"{interface} needs a channel: -c vcan0, or a channel map of the four buses")
     return Target(interface, channel, interface == EMBEDDED if lockstep is None else lockstep)

@@ -27,7 +27,7 @@ _OUT = click.Path(dir_okay=False, path_type=Path)
 @click.command()
 @click.argument("logs", nargs=-1, metavar="LOG...", type=click.Path(path_type=Path))
 @click.option(
-    "-i", "--interface", default="", metavar="NAME", help="Listen to a bus instead: socketcan, virtual, pcan, ..."
+    "-i", "--interface", default="", metavar="NAME", help="Listen to a bus instead: socketcan, pcan, kvaser, ..."
 )
 @click.option("-c", "--channel", default="", metavar="CHANNEL", help="can0, or several: left_leg=can0,right_leg=can1.")
 @click.option(
