@@ -98,12 +98,20 @@ def run(
     Args:
         until: asked once a cycle, after the command was sent.
         record: called once a cycle with `hal.record` complete, e.g. a ring's `write`.
+
+    Raises:
+        ValueError: the HAL was made for other `controller_fields` than the controller's.
     """
     statistics = Statistics()
     costs, header = statistics.costs, hal.record
     late_in_row = 0
     active = False
     controller_record, telemetry = hal.controller_record, controller.telemetry
+    if len(telemetry) != len(controller_record):
+        raise ValueError(
+            f"the controller's telemetry is {len(telemetry)} numbers and the HAL was made to record {len(controller_record)}: "
+            "give it `controller_fields=controller.telemetry_fields`"
+        )
     # What lives now lives as long as the run: the collector need not look at it again and again. Who froze it before keeps it so.
     frozen = gc.get_freeze_count() > 0
     if not frozen:

@@ -173,3 +173,12 @@ def test_who_oversleeps_makes_no_cycle_up_either():
     oversleeps[0] = 0.0
     assert clock.wait() == pytest.approx(0.0, abs=1e-12)
     assert now[0] == pytest.approx(26e-3)
+
+
+def test_a_controller_the_hal_cannot_record_is_refused_before_anything_moves(make_rig):
+    rig = make_rig()
+    with pytest.raises(
+        ValueError, match="telemetry is 1 numbers and the HAL was made to record 0: give it `controller_fields="
+    ):
+        run(rig.hal, Recorder(), LockStep(), until=after(1))
+    assert rig.hal.state.cycle == 0
