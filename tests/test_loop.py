@@ -122,7 +122,7 @@ def test_the_collector_leaves_alone_what_was_there_before_the_run(make_rig, monk
         gc.freeze()
     during = []
     try:
-        rig = make_rig()
+        rig = make_rig(controller_fields=Recorder.telemetry_fields)
         run(rig.hal, Recorder(), LockStep(), until=after(2), record=lambda: during.append(gc.get_freeze_count()))
         after_it = gc.get_freeze_count()
     finally:
