@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from itertools import starmap
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +61,8 @@ class Recording:
     lines: list[Line]
 
     def copy(self) -> Recording:
-        return Recording([dataclasses.replace(line) for line in self.lines])
+        lines = ((e.stamp, e.channel, e.identifier, e.data, e.sent, e.flags, e.text) for e in self.lines)
+        return Recording(list(starmap(Line, lines)))  # `replace` takes three times as long, and a log has 30,000
 
     def of(self, message: str) -> list[Line]:
         identifier = f"{NETWORK.message(message).frame_id:03X}"
