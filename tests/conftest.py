@@ -15,7 +15,7 @@ from typing import Any
 import hal_witness
 import numpy as np
 import pytest
-from command_limits import RECORD, CommandLimits
+from command_limits import RECORD, CommandLimits, database
 from hypothesis import HealthCheck, Phase, settings
 
 import atalante_dbc
@@ -184,11 +184,7 @@ class Rig:
     def cycle(self, torque: np.ndarray | None = None) -> State:
         state = self.hal.read()
         if state.supervisor is SupervisorState.ACTIVE:
-            if torque is None:
-                torque = (
-                    self.hal.robot.hold_kp * (self._anchor - state.position) - self.hal.robot.hold_kd * state.velocity
-                )
-            self.hal.write(Command(torque, np.zeros(8)))
+            self.hal.write(self.hold_torque() if torque is None else Command(torque, np.zeros(8)))
         else:
             self._anchor = state.position.copy()
             self.hal.hold()
@@ -208,8 +204,38 @@ class Rig:
             f"not {wanted.name} after {cycles} cycles: {self.hal.reason}, missing {self.hal.missing()}"
         )
 
+    def walk(self, cycles: int, *, outside: bool = False, step: int | None = None) -> State:
+        """A controller that holds its pose, for a while, whatever the supervisor says."""
+        for _ in range(cycles):
+            self.hal.read()
+            self.hal.write(self.hold_torque(outside=outside, step=step))
+        return self.hal.state
+
+    def hold_torque(self, *, outside: bool = False, step: int | None = None) -> Command:
+        robot, state = self.hal.robot, self.hal.state
+        torque = robot.hold_kp * (self._anchor - state.position) - robot.hold_kd * state.velocity
+        return Command(torque, np.zeros(8), step=step, outside=outside)
+
     def codes(self) -> list[str]:
         return [event.code for event in self.hal.events]
+
+    def seen(self, *codes: str) -> list[tuple[str, str]]:
+        return [(event.code, event.severity) for event in self.hal.events if event.code in codes]
+
+    def last_commands(self) -> dict[str, dict[str, float]]:
+        """What cantools reads in the newest command frames, by side."""
+        frames = next(f for f in reversed(self.sent) if f["can_id"][0] == 0x100)
+        return {
+            side: database().decode_message(int(f["can_id"]), f["data"][: f["len"]].tobytes(), decode_choices=False)
+            for side, f in zip(("left", "right"), frames[:2], strict=True)
+        }
+
+    def controlwords(self) -> set[int]:
+        return {int(v) for c in self.last_commands().values() for k, v in c.items() if k.endswith("Controlword")}
+
+    @staticmethod
+    def drop(*ids: int) -> Callable[[Frames], Frames]:
+        return lambda frames: frames[~np.isin(frames["can_id"], ids)]
 
 
 class _Tap:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import cantools
 import numpy as np
@@ -13,8 +12,7 @@ from atalante_dbc import DBC_FILE
 from atalante_hal.bus import BusDown, BusFull
 from atalante_hal.cia402 import Controlword, DriveState
 from atalante_hal.diagnostics import Dtc, dtcs_of, number_of
-from atalante_hal.hal import ENABLE_CYCLES, FINISH_STEP_CYCLES, PERIOD, SATURATED_CYCLES, Hal
-from atalante_hal.limiter import Limited
+from atalante_hal.hal import Hal
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Command, SupervisorState
 
@@ -22,53 +20,20 @@ S = SupervisorState
 ORACLE = cantools.database.load_file(str(DBC_FILE))
 
 
-def last_commands(rig) -> dict[str, dict[str, float]]:
-    """What cantools reads in the newest command frames."""
-    frames = next(f for f in reversed(rig.sent) if f["can_id"][0] == 0x100)
-    return {
-        side: ORACLE.decode_message(int(f["can_id"]), f["data"][: f["len"]].tobytes(), decode_choices=False)
-        for side, f in zip(("left", "right"), frames[:2], strict=True)
-    }
-
-
-def controlwords(rig) -> set[int]:
-    return {int(v) for c in last_commands(rig).values() for k, v in c.items() if k.endswith("Controlword")}
-
-
 def torques(rig) -> np.ndarray:
-    commands = last_commands(rig)
+    commands = rig.last_commands()
     return np.array([commands[j.split("_")[0]][f"{j.split('_')[1]}_TargetTorque"] for j in JOINTS])
-
-
-def drop(*ids: int):
-    return lambda frames: frames[~np.isin(frames["can_id"], ids)]
 
 
 def test_start_up_walks_off_ready_active(rig):
     assert rig.cycle().supervisor is S.OFF
     rig.until(S.READY)
-    assert controlwords(rig) == {Controlword.QUICK_STOP}
+    assert rig.controlwords() == {Controlword.QUICK_STOP}
     state = rig.until(S.ACTIVE)
     assert (state.drive_state == DriveState.OPERATION_ENABLED).all()
     rig.cycle()
-    assert controlwords(rig) == {Controlword.ENABLE_OPERATION}
+    assert rig.controlwords() == {Controlword.ENABLE_OPERATION}
     assert [c for c in rig.codes() if c in S.__members__] == ["READY", "ACTIVE"]
-
-
-def test_nothing_starts_without_the_operator(make_rig):
-    rig = make_rig(starts=False)
-    state = rig.run(500)
-    assert state.supervisor is S.READY
-    assert (state.drive_state == DriveState.SWITCH_ON_DISABLED).all()
-
-
-def test_a_start_without_dead_man_is_ignored(make_rig):
-    rig = make_rig(starts=False)
-    rig.until(S.READY)
-    rig.operator.release()
-    rig.run(20)
-    rig.operator.start()
-    assert rig.run(300).supervisor is S.READY
 
 
 def test_what_write_returns_is_what_is_on_the_wire(rig):
@@ -85,7 +50,7 @@ def test_torques_are_not_used_outside_active(rig):
     rig.until(S.READY)
     sent = rig.hal.write(Command(np.full(12, 50.0), np.ones(8)))
     assert not sent.any()
-    assert controlwords(rig) == {Controlword.QUICK_STOP}
+    assert rig.controlwords() == {Controlword.QUICK_STOP}
 
 
 def test_the_record_says_what_the_state_says(rig):
@@ -118,52 +83,17 @@ def test_joint_side_is_motor_side_over_gear(rig):
     assert state.imu_accel[1] == pytest.approx([0, 0, 9.81], abs=0.5)
 
 
-def test_the_pendant_sets_the_assistance_factor(make_rig):
-    rig = make_rig(assistance_factor=0.25)
-    assert rig.until(S.ACTIVE).assistance_factor == 0.25
-    rig.operator.assist(0.75)
-    assert rig.run(2).assistance_factor == 0.75
-    rig.operator.assist(None)
-    assert rig.run(2).assistance_factor == 0.75
-
-
 @pytest.mark.parametrize("factor", [-0.1, 1.1, float("nan")])
 def test_an_assistance_factor_outside_its_range_is_refused(factor, network, robot, rig):
     with pytest.raises(ValueError, match="between 0 and 1"):
         Hal(network, robot, rig.bus, assistance_factor=factor)
 
 
-@pytest.mark.parametrize("word", ["stop", "hold", "release"])
-def test_the_operators_word_ends_in_hold_within_five_cycles(rig, word):
-    rig.until(S.ACTIVE)
-    getattr(rig.operator, word)()
-    assert rig.run(5).supervisor is S.HOLD
-    state = rig.run(5)
-    assert (state.drive_state == DriveState.QUICK_STOP_ACTIVE).all()
-    assert controlwords(rig) == {Controlword.QUICK_STOP}
-
-
-def test_recovery_from_hold_takes_the_operator(rig):
-    rig.until(S.ACTIVE)
-    rig.operator.hold()
-    rig.until(S.HOLD)
-    assert rig.run(500).supervisor is S.HOLD
-    rig.operator.start()
-    assert rig.until(S.ACTIVE, 20).supervisor is S.ACTIVE
-
-
-def test_losing_the_pendant_is_a_stop_after_exactly_its_timeout(rig):
-    rig.until(S.ACTIVE)
-    rig.bus.to_hal = drop(0x194)
-    assert rig.run(4).supervisor is S.ACTIVE
-    assert rig.cycle().supervisor is S.HOLD
-
-
 @pytest.mark.parametrize("joint", JOINTS)
 def test_a_silent_drive_is_noticed_after_exactly_five_lost_frames(rig, joint, network):
     message = network.message(f"{joint.upper()}_STATE")
     rig.until(S.ACTIVE)
-    rig.bus.to_hal = drop(message.frame_id)
+    rig.bus.to_hal = rig.drop(message.frame_id)
     assert rig.run(message.timeout_ms - 1).supervisor is S.ACTIVE
     assert rig.cycle().supervisor is S.HOLD
     assert message.sender in rig.hal.reason
@@ -172,7 +102,7 @@ def test_a_silent_drive_is_noticed_after_exactly_five_lost_frames(rig, joint, ne
 
 def test_four_lost_frames_are_ridden_through(rig):
     rig.until(S.ACTIVE)
-    rig.bus.to_hal = drop(0x183)
+    rig.bus.to_hal = rig.drop(0x183)
     state = rig.run(4)
     assert not state.joints_valid
     rig.bus.to_hal = lambda frames: frames
@@ -186,38 +116,10 @@ def test_a_torque_that_is_not_finite_sends_the_hold_frame_in_the_same_cycle(rig,
     torque = np.zeros(12)
     torque[4] = bad
     rig.cycle(torque)
-    assert controlwords(rig) == {Controlword.QUICK_STOP}
+    assert rig.controlwords() == {Controlword.QUICK_STOP}
     assert not torques(rig).any()
     assert rig.cycle().supervisor is S.HOLD
     assert "finite" in rig.hal.reason
-
-
-def test_a_drive_that_leaves_operation_is_noticed_at_once(rig):
-    rig.until(S.ACTIVE)
-    at = rig.emulator.signals.index("RIGHT_TH_STATE", "DriveState")
-    rig.emulator.before_send.append(lambda _, values: values.__setitem__(at, DriveState.SWITCHED_ON))
-    assert rig.cycle().supervisor is S.HOLD
-    assert "RIGHT_TH" in rig.hal.reason
-
-
-def test_a_drive_fault_is_latched_until_the_operator_starts_again(rig):
-    rig.until(S.ACTIVE)
-    drives = rig.emulator.drives
-    drives.state[7] = DriveState.FAULT
-    drives._states_changed()
-    assert rig.run(2).supervisor is S.FAULT
-    assert rig.run(100).supervisor is S.FAULT
-    assert drives.state[7] is DriveState.FAULT
-    assert set(drives.state) == {DriveState.FAULT, DriveState.QUICK_STOP_ACTIVE}
-    rig.operator.start()
-    assert rig.until(S.ACTIVE, 30).supervisor is S.ACTIVE
-    assert [c for c in rig.codes() if c in S.__members__] == ["READY", "ACTIVE", "FAULT", "HOLD", "ACTIVE"]
-
-
-def test_nodes_that_speak_another_dbc_keep_the_robot_out_of_ready(make_rig, network):
-    rig = make_rig(hal_network=replace(network, hash32=network.hash32 ^ 1))
-    assert rig.run(400).supervisor is S.OFF
-    assert set(rig.hal.missing()) == {n.name for n in network.nodes if n.kind != "master"}
 
 
 @pytest.mark.parametrize("error", [BusDown("the interface is down"), BusFull("the queue is full")])
@@ -277,53 +179,6 @@ def test_every_frame_sent_decodes_with_cantools(rig):
     assert {"SYNC_LEFT_LEG", "SYNC_RIGHT_SENSE", "COMMAND_LEFT_LEG", "HAPTICS_COMMAND", "HAL_STATUS"} <= seen
 
 
-# -- reactions ---------------------------------------------------------------------------------------------------------
-
-
-def seen(rig, *codes: str) -> list[tuple[str, str]]:
-    return [(e.code, e.severity) for e in rig.hal.events if e.code in codes]
-
-
-def set_signal(rig, message: str, signal: str, value: float):
-    """Let a node say something else from now on."""
-    at = rig.emulator.signals.index(message, signal)
-    rig.emulator.before_send.append(lambda _, values: values.__setitem__(at, value))
-
-
-def hold_torque(rig, outside: bool = False, step: int | None = None) -> Command:
-    robot, state = rig.hal.robot, rig.hal.state
-    torque = robot.hold_kp * (rig._anchor - state.position) - robot.hold_kd * state.velocity
-    return Command(torque, np.zeros(8), step=step, outside=outside)
-
-
-def walk(rig, cycles: int, **command):
-    """A controller that holds its pose, for a while."""
-    for _ in range(cycles):
-        rig.hal.read()
-        rig.hal.write(hold_torque(rig, **command))
-    return rig.hal.state
-
-
-def test_a_torque_that_is_cut_for_long_leads_the_assistance_factor_to_one(make_rig):
-    rig = make_rig(assistance_factor=0.5)
-    rig.until(S.ACTIVE)
-    limiter, hal = rig.hal._limiter, rig.hal
-    limiter.saturated = 0
-    apply, cut = limiter.apply, Limited(finite=True, clamped=True)
-
-    def cut_a_little(torque, motion):
-        before = limiter.saturated
-        apply(torque, motion)
-        limiter.saturated = before + 1
-        return cut
-
-    limiter.apply = cut_a_little
-    assert walk(rig, SATURATED_CYCLES + 1).supervisor is S.ACTIVE
-    assert seen(rig, "TORQUE_SATURATED") == [("TORQUE_SATURATED", "warning")] * 2  # pending, then confirmed
-    assert rig.cycle().supervisor is S.FULL_ASSIST
-    assert hal.reason == "the limiter cuts the torque"
-
-
 def test_a_controller_is_told_what_the_limits_left_of_its_last_command(rig):
     rig.until(S.ACTIVE)
     state = rig.hal.read()
@@ -336,132 +191,17 @@ def test_a_controller_is_told_what_the_limits_left_of_its_last_command(rig):
     assert rig.hal.read().torque_sent.tobytes() == little.tobytes()
 
 
-def into_full_assist(rig):
-    rig.until(S.ACTIVE)
-    rig.hal._report(Dtc.FOOT_CELL, "a cell is stuck")
-    state = walk(rig, 1)
-    assert state.supervisor is S.FULL_ASSIST
-    return state
-
-
-def test_full_assist_ramps_in_its_time_and_the_operator_ramps_back(make_rig):
-    rig = make_rig(assistance_factor=0.5)
-    state = into_full_assist(rig)
-    ramp = rig.hal.robot.thresholds.full_assist_ramp
-    cycles = round(ramp / PERIOD / 2)
-    assert state.assistance_factor == pytest.approx(0.501)
-    before = state.assistance_factor
-    for _ in range(cycles - 1):
-        state = walk(rig, 1)
-        assert 0.0 < state.assistance_factor - before <= PERIOD / ramp + 1e-12
-        before = state.assistance_factor
-    assert state.assistance_factor == 1.0
-    assert rig.hal.record[rig.hal.layout["assistance_factor"]] == 1.0
-    assert walk(rig, 10).assistance_factor == 1.0
-    rig.operator.start()
-    assert walk(rig, 2).supervisor is S.ACTIVE
-    assert 0.99 < rig.hal.state.assistance_factor < 1.0
-    assert walk(rig, cycles).assistance_factor == 0.5
-    rig.operator.assist(0.2)
-    assert walk(rig, 2).assistance_factor == 0.2  # the dial acts at once
-
-
-def test_the_dial_does_not_widen_the_guide_in_full_assist(make_rig):
-    rig = make_rig(assistance_factor=0.9)
-    into_full_assist(rig)
-    walk(rig, 150)
-    rig.operator.assist(0.1)
-    assert walk(rig, 5).assistance_factor == 1.0
-
-
-def finishing(rig, step: int | None):
-    rig.until(S.ACTIVE)
-    walk(rig, 5, step=step)
-    rig.hal._report(Dtc.SUPPLY_LOW, "the battery is nearly empty")
-    return walk(rig, 1, step=step)
-
-
-def test_finish_step_ends_in_hold_when_the_feet_change(rig):
-    assert finishing(rig, 7).supervisor is S.FINISH_STEP
-    assert walk(rig, 100, step=7).supervisor is S.FINISH_STEP
-    rig.hal.read()
-    rig.hal.write(hold_torque(rig, step=8))
-    assert rig.cycle().supervisor is S.HOLD
-
-
-def test_finish_step_of_a_controller_that_does_not_walk_is_hold(rig):
-    assert finishing(rig, None).supervisor is S.FINISH_STEP
-    assert rig.cycle().supervisor is S.HOLD
-
-
-def test_finish_step_does_not_go_on_for_ever(rig):
-    finishing(rig, 7)
-    assert walk(rig, FINISH_STEP_CYCLES - 1, step=7).supervisor is S.FINISH_STEP
-    assert walk(rig, 1, step=7).supervisor is S.HOLD
-
-
-def test_a_joint_that_cannot_hold_is_let_down_and_the_others_hold(rig):
-    rig.until(S.ACTIVE)
-    rig.hal._heartbeats.emergencies["LEFT_SK"] = Dtc.EMCY_ENCODER, 0x7305
-    rig.hal._heartbeats.quiet = False
-    rig.hal._steady = False
-    assert rig.cycle().supervisor is S.LOWER
-    commands = last_commands(rig)
-    words = {f"{side}_{k}": v for side, c in commands.items() for k, v in c.items() if k.endswith("Controlword")}
-    assert words.pop("left_SK_Controlword") == Controlword.DISABLE_VOLTAGE
-    assert set(words.values()) == {Controlword.QUICK_STOP}
-    state = rig.run(50)
-    assert state.supervisor is S.LOWER
-    assert state.drive_state[3] == DriveState.SWITCH_ON_DISABLED
-    assert (np.delete(state.drive_state, 3) == DriveState.QUICK_STOP_ACTIVE).all()
-    rig.operator.start()
-    assert rig.until(S.ACTIVE, 50).supervisor is S.ACTIVE
-    assert [c for c in rig.codes() if c in S.__members__][-3:] == ["LOWER", "HOLD", "ACTIVE"]
-
-
-def test_a_start_the_drives_do_not_follow_is_given_up_and_said(rig):
-    rig.operator._starts = False
-    rig.until(S.READY)
-    set_signal(rig, "LEFT_SK_STATE", "DriveState", DriveState.SWITCH_ON_DISABLED)
-    rig.operator.start()
-    rig.run(ENABLE_CYCLES)
-    assert "START_FAILED" not in rig.codes()
-    rig.run(3)
-    assert "START_FAILED" in rig.codes()
-    assert rig.hal.reason == "the drives were not enabled within 200 cycles"
-    assert controlwords(rig) == {Controlword.QUICK_STOP}
-
-
-def test_a_start_ends_when_the_dead_man_is_released(rig):
-    rig.operator._starts = False
-    rig.until(S.READY)
-    set_signal(rig, "LEFT_SK_STATE", "DriveState", DriveState.SWITCH_ON_DISABLED)
-    rig.operator.start()
-    rig.run(10)
-    assert Controlword.SHUTDOWN in controlwords(rig)
-    rig.operator.release()
-    rig.run(3)
-    assert controlwords(rig) == {Controlword.QUICK_STOP}
-    rig.operator.squeeze()
-    rig.run(ENABLE_CYCLES)
-    assert controlwords(rig) == {Controlword.QUICK_STOP}
-    assert "START_FAILED" not in rig.codes()
-
-
 def test_a_joint_outside_the_guide_is_told_and_nothing_else(rig):
     rig.until(S.ACTIVE)
-    assert walk(rig, 5, outside=True).supervisor is S.ACTIVE
-    assert seen(rig, "GUIDE_OUTSIDE") == [("GUIDE_OUTSIDE", "info")]
-
-
-# -- what the world is told --------------------------------------------------------------------------------------------
+    assert rig.walk(5, outside=True).supervisor is S.ACTIVE
+    assert rig.seen("GUIDE_OUTSIDE") == [("GUIDE_OUTSIDE", "info")]
 
 
 def test_active_diagnostics_are_in_the_record_and_the_worst_in_the_status(rig):
     rig.until(S.ACTIVE)
     diagnostics = rig.hal.layout["diagnostics"]
     assert rig.hal.record[diagnostics] == 0
-    rig.bus.to_hal = drop(0x183)
+    rig.bus.to_hal = rig.drop(0x183)
     rig.run(5)
     assert dtcs_of(int(rig.hal.record[diagnostics][0])) == (Dtc.NODE_TIMEOUT,) or Dtc.NODE_TIMEOUT in dtcs_of(
         int(rig.hal.record[diagnostics][0])
@@ -477,21 +217,10 @@ def test_active_diagnostics_are_in_the_record_and_the_worst_in_the_status(rig):
 def test_the_status_carries_the_hash_of_the_gait_and_the_step(make_rig):
     rig = make_rig(gait_hash=0xCAFE)
     rig.until(S.ACTIVE)
-    walk(rig, 120, step=70000)
+    rig.walk(120, step=70000)
     status = next(f for f in reversed(rig.sent) if f["can_id"][0] == 0x700)
     said = ORACLE.decode_message(0x700, status["data"][0, :24].tobytes(), decode_choices=False)
     assert (said["GaitHash"], said["Step"]) == (0xCAFE, 70000 & 0xFFFF)
-
-
-def test_a_change_of_state_says_why(rig):
-    rig.until(S.ACTIVE)
-    rig.operator.hold()
-    rig.until(S.HOLD, 5)
-    assert rig.hal.events[-1].text == "ACTIVE -> HOLD: the operator asked to stop"
-    assert rig.hal.reason == "the operator asked to stop"
-
-
-# -- when things go wrong ----------------------------------------------------------------------------------------------
 
 
 def test_an_exception_sends_the_prepared_hold_frame_under_the_next_counter(rig):
@@ -506,7 +235,7 @@ def test_an_exception_sends_the_prepared_hold_frame_under_the_next_counter(rig):
     assert not sent.any()
     frames = next(f for f in reversed(rig.sent) if f["can_id"][0] == 0x100)
     assert (frames["data"][:, 2] == (int(before) + 1) & 0xFF).all()
-    assert controlwords(rig) == {Controlword.QUICK_STOP}
+    assert rig.controlwords() == {Controlword.QUICK_STOP}
     assert not torques(rig).any()
 
 
@@ -533,29 +262,7 @@ def test_a_short_gap_is_noted(rig):
     rig.until(S.ACTIVE)
     rig.hal.report(Dtc.CYCLE_GAP, "4 ms went by without a cycle", confirmed=False, value=0.004)
     assert rig.cycle().supervisor is S.ACTIVE
-    assert seen(rig, "CYCLE_GAP") == [("CYCLE_GAP", "warning")]
-
-
-def own_frame(frames):
-    alien = frames[:1].copy()
-    alien["can_id"] = 0x100
-    return np.concatenate([frames, alien])
-
-
-def test_another_hal_ends_a_running_one_in_hold_and_keeps_a_new_one_off(make_rig):
-    rig = make_rig()
-    rig.until(S.ACTIVE)
-    rig.bus.to_hal = own_frame
-    assert rig.cycle().supervisor is S.HOLD
-    assert seen(rig, "HAL_DUPLICATE") == [("HAL_DUPLICATE", "error")]
-    new = make_rig()
-    new.bus.to_hal = own_frame
-    new.cycle()
-    new.bus.to_hal = lambda frames: frames
-    assert new.run(500).supervisor is S.OFF
-    assert "another HAL was there first" in new.hal._memory.text_of(frozenset({Dtc.HAL_DUPLICATE})) or (
-        "HAL_DUPLICATE" in new.codes()
-    )
+    assert rig.seen("CYCLE_GAP") == [("CYCLE_GAP", "warning")]
 
 
 def test_stopping_on_a_dead_bus_takes_a_bounded_time(network, robot, monkeypatch):
@@ -606,45 +313,9 @@ def test_the_bus_and_the_tap_can_be_changed(rig):
     assert not rig.hal.silent
 
 
-def hot(rig, **degrees: float):
-    for node, value in degrees.items():
-        set_signal(rig, f"{node}_STATE", "Temperature", value)
-
-
-def test_the_torque_limit_of_a_hot_drive_follows_within_a_cycle_and_is_told(rig):
-    rig.until(S.ACTIVE)
-    hot(rig, LEFT_SK=100.0, RIGHT_SK=100.0)
-    assert rig.cycle().supervisor is S.ACTIVE
-    limit = rig.hal.robot.torque_limit(rig.hal.state.temperature)
-    assert limit[3] < rig.hal.robot.torque_max[3]
-    commands = last_commands(rig)
-    assert commands["left"]["SK_MaxTorque"] == pytest.approx(limit[3], abs=0.0125)
-    assert commands["right"]["SH_MaxTorque"] == pytest.approx(rig.hal.robot.torque_max[8], abs=0.0125)
-    told = {e.node: e for e in rig.hal.events if e.code == "DERATED"}
-    assert set(told) == {"LEFT_SK", "RIGHT_SK"}
-    assert told["LEFT_SK"].value == pytest.approx(limit[3])
-    assert told["LEFT_SK"].severity == "warning"
-    assert rig.run(20).supervisor is S.ACTIVE
-
-
-@pytest.mark.parametrize("node", ["LEFT_SK", "RIGHT_SK"])
-def test_a_drive_far_hotter_than_its_twin_holds_the_robot(rig, node):
-    rig.until(S.ACTIVE)
-    hot(rig, **{node: 115.0})
-    assert rig.cycle().supervisor is S.HOLD
-    assert node in rig.hal.reason
-
-
 def test_reading_without_writing_goes_on_with_the_next_sync(rig):
     for _ in range(3):
         rig.hal.read()
     syncs = [int(f["data"][0, 2]) for f in rig.sent if f["can_id"][0] == 0x10]
     assert [b - a & 0xFF for a, b in itertools.pairwise(syncs)] == [1, 1]
     assert rig.hal.state.valid.shape == (19,)
-
-
-def test_a_heartbeat_that_fails_to_come_is_noticed_while_all_else_is_well(rig):
-    rig.until(S.ACTIVE)
-    rig.bus.to_hal = drop(0x704)
-    assert rig.run(360).supervisor is S.ACTIVE
-    assert seen(rig, "HEARTBEAT_LOST") == [("HEARTBEAT_LOST", "warning")]
