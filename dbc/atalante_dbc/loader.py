@@ -9,6 +9,7 @@ import math
 import re
 import zlib
 from collections.abc import Iterator
+from functools import cache
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -40,12 +41,20 @@ class DbcError(ValueError):
 
 
 def load(path: Path | None = None) -> Network:
-    """The network of a DBC file, checked.
+    """The network of a DBC file, checked; without a path the project's own, which is read once a process.
 
     Raises:
         DbcError: the file cannot be parsed, or breaks a rule (see `_problems`); names each line.
     """
-    path = path or DBC_FILE
+    return _read_once(DBC_FILE) if path is None else _read(path)
+
+
+@cache
+def _read_once(path: Path) -> Network:
+    return _read(path)
+
+
+def _read(path: Path) -> Network:
     try:
         raw = path.read_bytes()
         text = raw.decode("cp1252")
