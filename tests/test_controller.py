@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pinocchio
@@ -281,13 +282,15 @@ def recorded(cycles: int) -> list[State]:
     return states
 
 
-STATES = recorded(STARTUP + STEP + 200)
+@cache
+def walked() -> list[State]:
+    return recorded(STARTUP + STEP + 200)
 
 
 def replayed(xi: float, shape: str = "constant", config: HangConfig = CONFIG, gait: Gait = GAIT) -> np.ndarray:
-    controller = hang(shape, config, gait)
-    controller.reset(STATES[0])
-    return np.array([controller.update(replace(state, assistance_factor=xi)).torque.copy() for state in STATES])
+    controller, states = hang(shape, config, gait), walked()
+    controller.reset(states[0])
+    return np.array([controller.update(replace(state, assistance_factor=xi)).torque.copy() for state in states])
 
 
 @pytest.mark.parametrize("xi", [0.0, 0.5, 0.9, 0.95, 0.999, 1.0 - 1e-6])
@@ -328,8 +331,8 @@ def test_a_new_assistance_factor_waits_for_the_step_change():
 @pytest.mark.parametrize("asked", [-1.0, 2.0])
 def test_a_factor_out_of_range_is_brought_into_it(asked: float):
     controller = hang()
-    controller.reset(STATES[0])
-    for state in STATES[: STARTUP + 3]:
+    controller.reset(walked()[0])
+    for state in walked()[: STARTUP + 3]:
         controller.update(replace(state, assistance_factor=asked))
     assert controller.telemetry[-1] == min(1.0, max(0.0, asked))
 
@@ -389,8 +392,8 @@ def test_telemetry_is_what_its_fields_say():
 def test_haptics_follow_the_swing_leg_and_are_silent_at_full_assistance():
     for xi in (0.5, 1.0):
         controller = hang()
-        controller.reset(STATES[0])
-        for state in STATES[: STARTUP + 200]:
+        controller.reset(walked()[0])
+        for state in walked()[: STARTUP + 200]:
             vibration = controller.update(replace(state, assistance_factor=xi)).vibration
         assert vibration.shape == (len(MOTORS),)
         assert bool(vibration[:4].any()) is (xi < 1.0)
@@ -399,9 +402,9 @@ def test_haptics_follow_the_swing_leg_and_are_silent_at_full_assistance():
 
 def test_a_joint_outside_its_safe_backward_image_is_told():
     controller = hang()
-    controller.reset(STATES[0])
+    controller.reset(walked()[0])
     told = []
-    for cycle, state in enumerate(STATES[: STARTUP + 300]):
+    for cycle, state in enumerate(walked()[: STARTUP + 300]):
         pushed = state.position.copy()
         pushed[SH] += 0.3 * (cycle > STARTUP + 200)
         told.append(controller.update(replace(state, assistance_factor=0.5, position=pushed)).outside)
@@ -413,9 +416,9 @@ def test_a_joint_outside_its_safe_backward_image_is_told():
 def test_flat_foot_does_not_listen_to_an_imu_that_is_silent(silent: tuple[str, ...]):
     def ankles(quaternion: float, age: int) -> np.ndarray:
         controller = hang(config=replace(CONFIG, gentler=()))
-        controller.reset(STATES[0])
+        controller.reset(walked()[0])
         targets = []
-        for state in STATES[: STARTUP + STEP + 100]:
+        for state in walked()[: STARTUP + STEP + 100]:
             attitude, ages = state.imu_quaternion.copy(), np.zeros(4, int)
             for imu in silent[:2]:
                 attitude[IMUS.index(imu), 2] = quaternion
@@ -434,10 +437,10 @@ def test_flat_foot_does_not_listen_to_an_imu_that_is_silent(silent: tuple[str, .
 
 def test_missed_cycles_do_not_stretch_the_step():
     controller = hang()
-    controller.reset(STATES[0])
-    for state in STATES[: STARTUP + STEP - 2]:
+    controller.reset(walked()[0])
+    for state in walked()[: STARTUP + STEP - 2]:
         controller.update(state)
-    late = replace(STATES[STARTUP + STEP + 3], cycle=STARTUP + STEP + 3)
+    late = replace(walked()[STARTUP + STEP + 3], cycle=STARTUP + STEP + 3)
     controller.update(late)
     assert controller.statistics.steps == 1
     np.testing.assert_allclose(controller.telemetry[:12], late.position, atol=math.radians(5.0))
