@@ -8,10 +8,11 @@ OUT ?= runs
 demo: .venv/installed-all ## everything in one process tree: 30 steps in the air with each guide shape
 	$(BIN)/atalante demo --out $(OUT)/demo
 
+# worksteal: the tests of a file stay together until the end, so what they share is made once and not by each worker.
 test: .venv/installed-dev lint ## linters, types, layers and all tests but those that need SocketCAN
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-test-vcan: .venv/installed-dev ## the tests on real SocketCAN, in a kernel of their own where this one has none
+test-vcan: .venv/installed-vcan ## the tests on real SocketCAN, in a kernel of their own where this one has none
 	PYTHON=$(BIN)/python tests/vcan/run.sh
 
 fuzz: .venv/installed-dev ## 10 million random and mutated frames at the HAL and at every emulated node
@@ -20,7 +21,7 @@ fuzz: .venv/installed-dev ## 10 million random and mutated frames at the HAL and
 coverage: .venv/installed-dev ## every line and branch of the safety core is run by its own tests
 	$(BIN)/python tests/mutation/cover.py
 
-mutation: .venv/installed-dev ## mutants of the safety core: 95 % are killed, the others are argued in tests/mutation/SURVIVORS.md
+mutation: .venv/installed-mutation ## mutants of the safety core: 95 % are killed, the others are argued in tests/mutation/SURVIVORS.md
 	$(BIN)/python tests/mutation/mutate.py $(if $(WITHOUT),--without $(WITHOUT))
 
 lint: .venv/installed-dev
@@ -54,3 +55,7 @@ clean:
 .venv/installed-dev: pyproject.toml | .venv/bin/python
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	@touch $@ .venv/installed-all
+
+.venv/installed-mutation .venv/installed-vcan: .venv/installed-%: .venv/installed-dev
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[$*]'
+	@touch $@
