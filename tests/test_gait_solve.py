@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import builtins
 import json
+import os
+import signal
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,7 @@ from click.testing import CliRunner, Result
 from PIL import Image
 
 from atalante_control.gait import load_gait
+from atalante_control.generation import solve
 from atalante_hal.robot import JOINTS, load_robot
 from atalante_tools.cli import cli
 from atalante_tools.gait.figures import draw_animation
@@ -43,6 +47,25 @@ def test_json_is_one_object_with_the_keys_scripts_rely_on(result: tuple[Result, 
     assert "iterations" in outcome.stderr
 
 
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_in_the_midst_of_the_optimiser_is_no_verdict(
+    monkeypatch: pytest.MonkeyPatch, number: int, code: int
+) -> None:
+    class GivenUp:
+        solved, status = False, "no such gait: the impact map cannot hold"
+
+    def optimise(*_: object, **__: object) -> GivenUp:
+        """As CasADi: what is raised meanwhile ends the search."""
+        with suppress(KeyboardInterrupt, SystemExit):
+            os.kill(os.getpid(), number)
+        return GivenUp()
+
+    monkeypatch.setattr("atalante_control.generation.solve.solve", optimise)
+    outcome = run(*PATIENT)
+    assert outcome.exit_code == code
+    assert "no such gait" not in outcome.stderr
+
+
 def test_the_gait_is_one_the_controller_reads(result: tuple[Result, Path]) -> None:
     gait = load_gait(result[1] / "gait.json", load_robot())
     assert gait.duration == 0.8
@@ -69,7 +92,9 @@ def test_people_get_torques_residuals_and_pinocchios_judgement() -> None:
     assert "FAIL" not in outcome.stdout
 
 
-def test_what_cannot_be_walked_ends_in_one_sentence() -> None:
+def test_what_cannot_be_walked_ends_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    # IPOPT gives up after 150 iterations, which is told in no other way.
+    monkeypatch.setitem(solve._OPTIONS, "ipopt.max_iter", 15)
     outcome = run(*PATIENT, "--step-length", "0.4", "--step-duration", "0.4", "--json")
     assert outcome.exit_code == 1
     assert json.loads(outcome.stdout)["status"] != "solved"
