@@ -12,6 +12,7 @@ from atalante_tools.gait.extra import extra
 from atalante_tools.gait.solve import solve
 from atalante_tools.options import SEED, json_option
 from atalante_tools.outcome import FAILED, Failed
+from atalante_tools.signals import stop_requested
 from atalante_tools.terminal import Progress, say, show_json, table
 
 _FOLDER = click.Path(file_okay=False, path_type=Path)
@@ -84,19 +85,20 @@ def library(
     say(f"{points} gaits in {out}, {points - todo} of them solved before")
     progress, began = Progress(), time.monotonic()
     solve = solve_compiled if machine_code else solve_subject
-    try:
-        with closing(collection.generate(solve, jobs=jobs, cluster=cluster)) as outcomes:
-            for done, (_, solved) in enumerate(outcomes, 1):
-                if as_json:
-                    show_json({**solved.gait.parameters, **solved.gait.solver})
-                if progress.due():
-                    left = (time.monotonic() - began) / done * (todo - done)
-                    progress.show(f"{_bar(done / todo)} {done}/{todo} gaits, {_minutes(left)} left")
-    except (KeyboardInterrupt, SystemExit):  # Ctrl-C, SIGTERM
-        progress.clear()
-        say(f"interrupted, {points - len(collection.missing())} of {points} gaits solved; the same command goes on")
-        raise
+    # The optimiser keeps an exception to itself and gives up: a gait that is begun is finished, or it would count as failed.
+    with stop_requested() as stop, closing(collection.generate(solve, jobs=jobs, cluster=cluster)) as outcomes:
+        for done, (_, solved) in enumerate(outcomes, 1):
+            if as_json:
+                show_json({**solved.gait.parameters, **solved.gait.solver})
+            if progress.due():
+                left = (time.monotonic() - began) / done * (todo - done)
+                progress.show(f"{_bar(done / todo)} {done}/{todo} gaits, {_minutes(left)} left")
+            if stop.wanted:
+                break
     progress.clear()
+    if stop.wanted:
+        say(f"interrupted, {points - len(collection.missing())} of {points} gaits solved; the same command goes on")
+        raise SystemExit(stop.exit_code)
     failures = collection.failures()
     for index, status in failures.items():
         say(f"failed: {grid.subject(index)}: {status}")
@@ -172,7 +174,10 @@ def check(file: Path | None, count: int, seed: int, as_json: bool) -> None:
     robot, network = load_robot(), load_network(file)
     progress, deviations = Progress(), []
     for number, subject in enumerate(random_subjects(network.low, network.high, count, seed)):
-        solved = solve_subject(subject)
+        with stop_requested() as stop:
+            solved = solve_subject(subject)
+        if stop.wanted:
+            raise SystemExit(stop.exit_code)
         if not solved.solved:
             raise Failed(solved.status)
         deviations.append(deviation(subject, network.gait(subject, robot), solved.gait, robot))

@@ -11,6 +11,7 @@ import click
 from atalante_tools.gait.extra import extra
 from atalante_tools.options import Picture, json_option, subject_options
 from atalante_tools.outcome import Failed
+from atalante_tools.signals import stop_requested
 from atalante_tools.terminal import Progress, say, show_json, table
 
 if TYPE_CHECKING:
@@ -67,8 +68,12 @@ def solve(
         if progress.due():
             progress.show(f"{subject}: iteration {iteration}, constraints violated by up to {violation:.1e}")
 
-    solved = optimise(subject, kind=kind, progress=show)
+    # The optimiser keeps an exception to itself and gives up: it is let finish, or it would say that there is no such gait.
+    with stop_requested() as stop:
+        solved = optimise(subject, kind=kind, progress=show)
     progress.clear()
+    if stop.wanted:
+        raise SystemExit(stop.exit_code)
     if as_json:
         show_json(_summary(subject, solved))
     if not solved.solved:
