@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from click.testing import CliRunner
 
@@ -36,6 +38,10 @@ PATIENT = ("--mass", "75", "--height", "175")
         (["model", "--show", "model.xyz"], "model.xyz must end in .png or .svg or .pdf"),
         (["gait", "solve", *PATIENT, "--plot", "gait.xyz"], "gait.xyz must end in .png or .svg or .pdf"),
         (["gait", "solve", *PATIENT, "--animate", "gait.png"], "gait.png must end in .gif"),
+        (["gait", "solve", *PATIENT, "--out", "no/gait.json"], "there is no folder no for gait.json"),
+        (["gait", "fit", "--library", ".", "--out", "no/network.npz"], "there is no folder no for network.npz"),
+        (["model", "--urdf", "no/model.urdf"], "there is no folder no for model.urdf"),
+        (["validate", "some.log", "--html", "no/some.html"], "there is no folder no for some.html"),
     ],
 )
 def test_what_no_command_can_use_is_told_before_any_work(arguments: list[str], sentence: str) -> None:
@@ -43,3 +49,10 @@ def test_what_no_command_can_use_is_told_before_any_work(arguments: list[str], s
     assert (result.exit_code, result.stdout) == (2, "")
     assert sentence in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+def test_a_campaign_finds_out_that_its_report_has_no_place_before_it_runs(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    result = CliRunner().invoke(cli, ["faults", "campaign", "F56", "--out", str(tmp_path / "file" / "report")])
+    assert result.exit_code == 1
+    assert result.stderr == f"atalante: {tmp_path}/file/report cannot be used: Not a directory\n"

@@ -43,8 +43,8 @@ class Between(click.FloatRange):
         return number
 
 
-class Picture(click.Path):
-    """A picture to be drawn, of a kind that its suffix names: an option's type. Wrong ones are told before the work."""
+class Written(click.Path):
+    """A file to be written, of a kind that its suffix names: an option's type. What cannot be is told before the work."""
 
     def __init__(self, *suffixes: str) -> None:
         super().__init__(dir_okay=False)
@@ -53,8 +53,10 @@ class Picture(click.Path):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The path."""
         path = Path(str(super().convert(value, param, ctx)))
-        if path.suffix.lower() not in self._suffixes:
+        if self._suffixes and path.suffix.lower() not in self._suffixes:
             self.fail(f"{path} must end in {' or '.join(self._suffixes)}", param, ctx)
+        if not path.parent.is_dir():
+            self.fail(f"there is no folder {path.parent} for {path.name}", param, ctx)
         return path
 
 

@@ -67,7 +67,12 @@ def command(motor: str, level: float, seconds: float, target: Target, as_json: b
         watch.conclude()
     if as_json:
         show_json(
-            {"motor": MOTORS[index], "level": level, "measured": round(strongest, 3), "seconds": controller.elapsed}
+            {
+                "motor": MOTORS[index],
+                "level": level,
+                "measured": round(strongest, 3),
+                "seconds": round(controller.elapsed, 3),
+            }
         )
     else:
         click.echo(f"{MOTORS[index]}: asked for {level:.2f}, measured {strongest:.2f} at most, {seconds:g} s")

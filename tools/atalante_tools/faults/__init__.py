@@ -123,6 +123,7 @@ def campaign_(
     if without := [id_ for id_ in chosen if id_ not in SCENARIOS]:
         raise Misused(f"{without[0]} has no scenario; `atalante faults list` says what proves it")
     tasks = plan(chosen, endurance=endurance, pairs=pairs and not ids)
+    out.mkdir(parents=True, exist_ok=True)  # what cannot be written is told before, not after some minutes
     begun = time.monotonic()
     say(f"{len(tasks)} runs on {f'the workers of {dask}' if dask else f'{jobs} processes'}")
     found = list(_done(tasks, jobs=jobs, dask=dask))

@@ -10,7 +10,7 @@ import click
 
 from atalante_tools.gait.extra import extra
 from atalante_tools.gait.solve import solve
-from atalante_tools.options import SEED, json_option
+from atalante_tools.options import SEED, Written, json_option
 from atalante_tools.outcome import FAILED, Failed
 from atalante_tools.signals import stop_requested
 from atalante_tools.terminal import Progress, say, show_json, table
@@ -109,7 +109,7 @@ def library(
 
 @command.command()
 @click.option("--library", "folder", type=_FOLDER, required=True, metavar="DIR", help="What `gait library` made.")
-@click.option("--out", type=_FILE, required=True, metavar="FILE", help="The network, .npz.")
+@click.option("--out", type=Written(".npz"), required=True, metavar="FILE", help="The network, .npz.")
 @json_option
 def fit(folder: Path, out: Path, as_json: bool) -> None:
     """Fit the gait network to a library; takes a minute. The same library gives the same network.

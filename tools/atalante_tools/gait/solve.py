@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from atalante_tools.gait.extra import extra
-from atalante_tools.options import Picture, json_option, subject_options
+from atalante_tools.options import Written, json_option, subject_options
 from atalante_tools.outcome import Failed
 from atalante_tools.signals import stop_requested
 from atalante_tools.terminal import Progress, say, show_json, table
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from atalante_control.generation.solved import SolvedGait
     from atalante_control.generation.verify import Check
     from atalante_control.subject import Subject
-
-_FILE = click.Path(path_type=Path, dir_okay=False)
 
 
 @click.command(short_help="Optimise the gait of a patient.")
@@ -32,14 +30,14 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
     show_default=True,
     help="The step that repeats, the one from rest into it, or the one from it to rest.",
 )
-@click.option("--out", type=_FILE, metavar="FILE", help="Write the gait, .json.")
+@click.option("--out", type=Written(".json"), metavar="FILE", help="Write the gait, .json.")
 @click.option(
     "--plot",
-    type=Picture(".png", ".svg", ".pdf"),
+    type=Written(".png", ".svg", ".pdf"),
     metavar="FILE",
     help="Angles, torques, centre of pressure, clearance: .png, .svg, .pdf.",
 )
-@click.option("--animate", type=Picture(".gif"), metavar="FILE", help="The step as a stick figure, .gif.")
+@click.option("--animate", type=Written(".gif"), metavar="FILE", help="The step as a stick figure, .gif.")
 @json_option
 def solve(
     subject: Subject | None, kind: Kind, out: Path | None, plot: Path | None, animate: Path | None, as_json: bool

@@ -7,25 +7,27 @@ from typing import TYPE_CHECKING
 
 import click
 
-from atalante_tools.options import Picture, json_option, patient_options
+from atalante_tools.options import Written, json_option, patient_options
 from atalante_tools.outcome import Failed
 from atalante_tools.terminal import say, show_json, table
 
 if TYPE_CHECKING:
     from atalante_control.model import Link, Patient
 
-_FILE = click.Path(path_type=Path, dir_okay=False)
-
 
 @click.command()
 @patient_options(legs=True)
 @click.option(
-    "--urdf", "urdf_file", type=_FILE, metavar="FILE", help="Write the URDF, for PyBullet, Pinocchio and viewers."
+    "--urdf",
+    "urdf_file",
+    type=Written(".urdf", ".xml"),
+    metavar="FILE",
+    help="Write the URDF, for PyBullet, Pinocchio and viewers.",
 )
 @click.option(
     "--show",
     "picture",
-    type=Picture(".png", ".svg", ".pdf"),
+    type=Written(".png", ".svg", ".pdf"),
     is_flag=False,
     flag_value=Path("model.png"),
     metavar="[FILE]",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from atalante_tools.options import Between, json_option
+from atalante_tools.options import Between, Written, json_option
 from atalante_tools.outcome import FAILED, Failed
 from atalante_tools.signals import SIGNALLED, stop_requested
 from atalante_tools.terminal import Progress, say, show_json
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from atalante_tools.validate.report import Report
 
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
-_OUT = click.Path(dir_okay=False, path_type=Path)
 
 
 @click.command()
@@ -50,8 +49,8 @@ _OUT = click.Path(dir_okay=False, path_type=Path)
     help="Thresholds, silenced rules and channels of the project (TOML).",
 )
 @click.option("--list-rules", is_flag=True, help="Print every rule with its source and thresholds, and end.")
-@click.option("--junit", type=_OUT, default=None, metavar="FILE", help="Write the result as JUnit XML.")
-@click.option("--html", "html_file", type=_OUT, default=None, metavar="FILE", help="Write a report with plots.")
+@click.option("--junit", type=Written(), default=None, metavar="FILE", help="Write the result as JUnit XML.")
+@click.option("--html", "html_file", type=Written(), default=None, metavar="FILE", help="Write a report with plots.")
 @json_option
 def command(
     logs: tuple[Path, ...],

@@ -74,7 +74,8 @@ def verdict(result: Report) -> str:
     """One sentence at the end."""
     if result.findings:
         count = sum(finding.count for finding in result.findings)
-        return f"{len(result.findings)} findings ({count} occurrences)"
+        findings = "1 finding" if len(result.findings) == 1 else f"{len(result.findings)} findings"
+        return f"{findings} ({count} {'occurrence' if count == 1 else 'occurrences'})"
     if not result.judge.frames:
         return "nothing was judged"
     silenced = f", {len(result.silenced)} silenced" if result.silenced else ""
