@@ -49,6 +49,10 @@ class Hal:
         assistance_factor: Xi until the pendant sets another.
         controller_fields: (name, length) of what the controller wants recorded, see `types.Controller`.
         gait_hash: of the gait the controller walks, for HAL_STATUS.
+        tap: sees every frame sent and received, for a CAN log.
+
+    Raises:
+        ValueError: the assistance factor is not between 0 and 1.
     """
 
     def __init__(
