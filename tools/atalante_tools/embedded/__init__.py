@@ -18,7 +18,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from atalante_dbc import Network
 from atalante_hal.bus import BusDown
@@ -53,6 +53,9 @@ class EmbeddedRobot(Closing):
     Starting it early is worth while: until `begin` it loads what it needs.
     """
 
+    _open: ClassVar[list[EmbeddedRobot]] = []
+    _cores: ClassVar[set[int]] = set()  # of this thread, before the first of those that are open
+
     def __init__(self) -> None:
         """Start the child.
 
@@ -68,14 +71,20 @@ class EmbeddedRobot(Closing):
             pass_fds=(memory, theirs),
             process_group=0,
         )
-        self._cores = os.sched_getaffinity(0)  # given back by `close`
-        kept, given = halves(self._cores)
-        os.sched_setaffinity(self._child.pid, given)
-        os.sched_setaffinity(0, kept)
         self._begun = False
         os.close(theirs)  # or its end would stay open when it dies
         self.bus = SharedBus("embedded", memory, ours, 0)
         self.bus.patience = _PATIENCE
+        self._part_from_child()
+
+    def _part_from_child(self) -> None:
+        """Give the child cores of its own, shared with other robots that are open: the next loads while the last walks."""
+        if not self._open:
+            EmbeddedRobot._cores = os.sched_getaffinity(0)
+        self._open.append(self)
+        kept, given = halves(self._cores)
+        os.sched_setaffinity(self._child.pid, given)
+        os.sched_setaffinity(0, kept)
 
     @property
     def pid(self) -> int:
@@ -102,9 +111,10 @@ class EmbeddedRobot(Closing):
     def close(self) -> None:
         """Close the bus and see the child off; a second call does nothing. By the thread that made it."""
         self.bus.close()
-        if self._cores:
-            os.sched_setaffinity(0, self._cores)
-            self._cores = set()
+        if self in self._open:
+            self._open.remove(self)
+            if not self._open:
+                os.sched_setaffinity(0, self._cores)
         if not self._begun:
             self._child.kill()  # it is of no use, and nobody waits until it has loaded everything
         try:
