@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 import time
 
 import pytest
+from joblib.externals.loky.process_executor import _ExecutorManagerThread
 
 from atalante_control.fan_out import FanOutError, fan_out
 
@@ -53,6 +55,26 @@ def test_an_iteration_that_is_left_ends_its_processes_without_a_word() -> None:
             return
         time.sleep(0.01)
     pytest.fail(f"process {process} still works")
+
+
+@pytest.mark.parametrize(("error", "told"), [(KeyError, []), (ValueError, [ValueError])])
+def test_that_loky_stumbles_over_calls_it_has_forgotten_is_not_told(
+    error: type[Exception], told: list[type[Exception]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hand_out = _ExecutorManagerThread.add_call_item_to_queue
+
+    def stumble(thread: _ExecutorManagerThread) -> None:
+        if thread.executor_flags.shutdown:
+            raise error
+        hand_out(thread)
+
+    said: list[type[Exception]] = []
+    monkeypatch.setattr(threading, "excepthook", lambda arguments: said.append(arguments.exc_type))
+    monkeypatch.setattr(_ExecutorManagerThread, "add_call_item_to_queue", stumble)
+    results = fan_out(slow, [0.0, 600.0, 600.0, 600.0], jobs=2)
+    next(results)
+    results.close()
+    assert said == told
 
 
 def test_no_result_for_too_long_is_told() -> None:

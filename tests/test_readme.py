@@ -35,8 +35,10 @@ def test_there_are_commands_to_check():
 
 
 @pytest.mark.parametrize("line", [c for c in commands() if c.startswith("atalante ")])
-def test_a_command_of_the_readme_is_one_the_program_takes(line: str):
+def test_a_command_of_the_readme_is_one_the_program_takes(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Parsed by the program's own parser, down to the subcommand; nothing is run."""
+    (tmp_path / "runs").mkdir()  # as the commands before it left it
+    monkeypatch.chdir(tmp_path)
     command: click.Command = cli
     arguments = shlex.split(line)[1:]
     context = click.Context(command)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
+import threading
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -16,6 +17,7 @@ _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 #: Longest wait for a scheduler.
 _MEETING: Final = "10s"
+_LOKY_THREAD: Final = "ExecutorManagerThread"
 
 
 class FanOutError(RuntimeError):
@@ -68,7 +70,7 @@ def fan_out(
         except multiprocessing.TimeoutError as error:  # which is no TimeoutError
             raise TimeoutError(f"no result for {patience:g} s") from error
         finally:
-            with warnings.catch_warnings():
+            with warnings.catch_warnings(), _without_stumbles():
                 warnings.simplefilter("ignore", UserWarning)  # that results are left is what was wanted
                 results.close()
 
@@ -84,6 +86,27 @@ def _without_ctrl_c() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def _without_stumbles() -> Iterator[None]:
+    """Nothing is said of a KeyError in loky's thread.
+
+    Told to kill its processes, it forgets the calls that wait, kills, and then looks one of them up if it was just about to hand
+    it out (`add_call_item_to_queue` in loky 3.6): nothing is left to be done by then.
+    """
+    before = threading.excepthook
+
+    def tell(said: threading.ExceptHookArgs) -> None:
+        stumbled = said.exc_type is KeyError and said.thread is not None and said.thread.name == _LOKY_THREAD
+        if not stumbled:
+            before(said)
+
+    threading.excepthook = tell
+    try:
+        yield
+    finally:
+        threading.excepthook = before
 
 
 @contextmanager
