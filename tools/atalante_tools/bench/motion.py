@@ -97,8 +97,11 @@ def lockstep(effort: Effort) -> Measurement:
     """Wall time of a simulated second: HAL, controller, emulator, and a record into the ring every cycle."""
     with _stack(EmbeddedRobot()) as stack:
         stack.walk(effort)
-    seconds = statistics.median(stack.blocks) / (_BLOCK * PERIOD)
-    return Measurement(seconds, 1.0, (f"{1.0 / seconds:.1f} times real time",))
+    ordered = [block / (_BLOCK * PERIOD) for block in sorted(stack.blocks)]
+    seconds, undisturbed = statistics.median(ordered), ordered[len(ordered) // 10]
+    # Two processes need two whole cores: who shares a core's other half with them takes almost half of their speed, unseen.
+    told = f"{1.0 / seconds:.1f} times real time; {1.0 / undisturbed:.1f} in the tenth of its blocks least disturbed by others"
+    return Measurement(seconds, 1.0, (told,))
 
 
 @dataclass
