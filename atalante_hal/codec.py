@@ -167,12 +167,14 @@ def read_codes(words: Words, plan: Words, codes: Words) -> bool:
     low, high = plan[LOW], plan[HIGH]
     inside = True
     for i in range(len(codes)):
-        code = words[word[i]] >> place[i] & mask[i]
-        if code > largest[i]:  # of a signed signal: negative
-            code -= mask[i] + 1
-        codes[i] = code
+        code = codes[i] = signed(words[word[i]] >> place[i] & mask[i], mask[i], largest[i])
         inside &= low[i] <= code <= high[i]
     return inside
+
+
+def signed(raw: int, mask: int, largest: int) -> int:
+    """The code of raw bits: of a signed signal, what is larger than its largest code is negative."""
+    return raw - mask - 1 if raw > largest else raw
 
 
 def scale(codes: Words, scales: Vector, values: Vector) -> None:
@@ -191,11 +193,9 @@ def read_row(words: Words, behind: int, signals: Words, plan: Words, codes: Word
     """
     inside, invalid = True, False
     for i in signals:
-        code = words[plan[WORD, i] + behind] >> plan[PLACE, i] & plan[MASK, i]
-        invalid |= code == plan[INVALID, i]
-        if code > plan[LARGEST, i]:  # of a signed signal: negative
-            code -= plan[MASK, i] + 1
-        codes[i] = code
+        raw = words[plan[WORD, i] + behind] >> plan[PLACE, i] & plan[MASK, i]
+        invalid |= raw == plan[INVALID, i]
+        code = codes[i] = signed(raw, plan[MASK, i], plan[LARGEST, i])
         inside &= plan[LOW, i] <= code <= plan[HIGH, i]
     if inside:
         return INSIDE

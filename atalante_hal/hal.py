@@ -139,10 +139,10 @@ class Hal:
             in_row = isinstance(foreign, range)
             places = slice(foreign[0], foreign[-1] + 1) if in_row else list(foreign)
             self._supervision.accept(transceiver.scratch[places])
-        findings = self._plausibility.check()
+        self._plausibility.check()
         parts = self._parts
         np.multiply(parts.motor_side, self._to_joint, parts.joint_side)
-        self._supervision.judge(findings)
+        self._supervision.judge()
         header = self._header
         header[0], header[1] = cycle, state.time
         header[7] += count

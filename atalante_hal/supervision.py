@@ -21,7 +21,7 @@ from atalante_hal.image import ReceiveImage
 from atalante_hal.judgement import Judgement
 from atalante_hal.limiter import Limiter
 from atalante_hal.pendant import Pendant
-from atalante_hal.plausibility import Finding, Plausibility
+from atalante_hal.plausibility import Plausibility
 from atalante_hal.record import Record
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.supervisor import MOVING, Conditions, next_state
@@ -97,18 +97,18 @@ class Supervision:
         self._finish: tuple[int | None, int] = None, 0  # step in which FINISH_STEP began, last cycle it may go on
         self._drives_judged = b""  # what the drives said when they were judged last
 
-    def judge(self, findings: tuple[Finding, ...]) -> None:
-        """Judge the cycle whose frames were accepted, unless nothing can have changed. `findings`: of the plausibility."""
+    def judge(self) -> None:
+        """Judge the cycle whose frames were accepted and checked for plausibility, unless nothing can have changed."""
         pendant = self._pendant
         if not (
             self._steady
             and self._image.all_fresh
-            and not findings
+            and not self._plausibility.findings
             and self._transceiver.quiet
             and pendant.signals.tobytes() == pendant.heard
             and self._parts.drive_side.tobytes() == self._drives_judged
         ):
-            self._judge(findings)
+            self._judge()
 
     def accept(self, frames: Frames) -> None:
         """Frames that are no cyclic message to the HAL: status, emergencies, and what nobody may send. Shape (n,)."""
@@ -143,7 +143,7 @@ class Supervision:
         """Nodes that keep the robot out of READY: not heard in time or not trusted yet, no status, another DBC."""
         return self._judgement.missing() | self._heartbeats.missing()
 
-    def _judge(self, findings: tuple[Finding, ...]) -> None:
+    def _judge(self) -> None:
         """Everything that is wrong in this cycle, and what the supervisor makes of it."""
         state, memory, cycle = self._state, self.memory, self._state.cycle
         judgement, pendant = self._judgement, self._pendant
@@ -151,7 +151,7 @@ class Supervision:
         state.joints_valid = judgement.joints_valid
         self._heartbeats.judge(cycle, memory)
         self._transceiver.judge(cycle, memory)
-        for f in findings:
+        for f in self._plausibility.findings:
             memory.raise_dtc(cycle, f.dtc, f.node, value=f.value, confirmed=f.confirmed, text=f.text)
         for dtc, confirmed, value, text in self._reports:
             memory.raise_dtc(cycle, dtc, "HAL", value=value, confirmed=confirmed, text=text)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import itertools
 
-import cantools
 import numpy as np
 import pytest
+from command_limits import database
 
-from atalante_dbc import DBC_FILE
 from atalante_hal.bus import BusDown, BusFull
 from atalante_hal.cia402 import Controlword, DriveState
 from atalante_hal.diagnostics import Dtc, dtcs_of, number_of
@@ -17,7 +16,6 @@ from atalante_hal.robot import JOINTS
 from atalante_hal.types import Command, SupervisorState
 
 S = SupervisorState
-ORACLE = cantools.database.load_file(str(DBC_FILE))
 
 
 def torques(rig) -> np.ndarray:
@@ -172,7 +170,7 @@ def test_every_frame_sent_decodes_with_cantools(rig):
     seen = set()
     for batch in rig.sent:
         for frame in batch:
-            message = ORACLE.get_message_by_frame_id(int(frame["can_id"]))
+            message = database().get_message_by_frame_id(int(frame["can_id"]))
             assert frame["len"] == message.length
             message.decode(frame["data"][: message.length].tobytes())
             seen.add(message.name)
@@ -208,7 +206,7 @@ def test_active_diagnostics_are_in_the_record_and_the_worst_in_the_status(rig):
     )
     rig.run(100)
     status = next(f for f in reversed(rig.sent) if f["can_id"][0] == 0x700)
-    said = ORACLE.decode_message(0x700, status["data"][0, :24].tobytes(), decode_choices=False)
+    said = database().decode_message(0x700, status["data"][0, :24].tobytes(), decode_choices=False)
     assert said["DiagnosticCode"] == number_of(Dtc.NODE_TIMEOUT.bit)
     assert said["HalState"] == S.HOLD
     assert (said["DbcHash"], said["ConfigHash"]) == (rig.hal.network.hash32, rig.hal.robot.hash32)
@@ -219,7 +217,7 @@ def test_the_status_carries_the_hash_of_the_gait_and_the_step(make_rig):
     rig.until(S.ACTIVE)
     rig.walk(120, step=70000)
     status = next(f for f in reversed(rig.sent) if f["can_id"][0] == 0x700)
-    said = ORACLE.decode_message(0x700, status["data"][0, :24].tobytes(), decode_choices=False)
+    said = database().decode_message(0x700, status["data"][0, :24].tobytes(), decode_choices=False)
     assert (said["GaitHash"], said["Step"]) == (0xCAFE, 70000 & 0xFFFF)
 
 

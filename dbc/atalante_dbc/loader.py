@@ -49,11 +49,6 @@ def load(path: Path | None = None) -> Network:
     return _read_once(DBC_FILE) if path is None else _read(path)
 
 
-@cache
-def _read_once(path: Path) -> Network:
-    return _read(path)
-
-
 def _read(path: Path) -> Network:
     try:
         raw = path.read_bytes()
@@ -81,6 +76,9 @@ def _read(path: Path) -> Network:
         data_bitrate=int(_global(database, "DataBitrate")),
         hash32=zlib.crc32(raw),
     )
+
+
+_read_once = cache(_read)
 
 
 def _refuse(path: Path, found: Iterator[tuple[int, str]]) -> None:

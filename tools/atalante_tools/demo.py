@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from atalante_tools.options import EMBEDDED, Target
-from atalante_tools.trial import Options, run_trial, trial_options
+from atalante_tools.trial import SHAPE_NAMES, Options, run_trial, trial_options
 
 
 @click.command()
@@ -13,7 +13,7 @@ from atalante_tools.trial import Options, run_trial, trial_options
     "--shape",
     metavar="NAME",
     multiple=True,
-    help="constant, widening, narrowing, pinched, asymmetric, snap; may be repeated.  [default: all]",
+    help=f"{SHAPE_NAMES}; may be repeated.  [default: all]",
 )
 @trial_options(steps=30, out="runs/demo")
 def command(shape: tuple[str, ...], options: Options, as_json: bool) -> None:

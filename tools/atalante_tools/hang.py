@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from atalante_tools.options import Target, target_options
-from atalante_tools.trial import Options, run_trial, trial_options
+from atalante_tools.trial import SHAPE_NAMES, Options, run_trial, trial_options
 
 
 @click.command()
@@ -14,7 +14,7 @@ from atalante_tools.trial import Options, run_trial, trial_options
     default="constant",
     show_default=True,
     metavar="NAME",
-    help="The guide's: constant, widening, narrowing, pinched, asymmetric, snap.",
+    help=f"The guide's: {SHAPE_NAMES}.",
 )
 @target_options(embedded=True)
 @trial_options(steps=30, out="runs/hang")

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from atalante_tools.rig import Rig
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
+#: Those of `guide_shapes.SHAPES`, for help that imports no controller.
+SHAPE_NAMES = "constant, widening, narrowing, pinched, asymmetric, snap"
 #: Cycles between two looks at the telemetry process.
 _TEND_CYCLES = 250
 
