@@ -19,7 +19,7 @@ from atalante_emulator.wire import Babble, Wire
 from atalante_hal.bus import Bus
 from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
-from atalante_hal.frame import FLAG_BRS, FLAG_FDF, FRAME, ID_ERROR, ID_EXTENDED, Frames, new_frames
+from atalante_hal.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, ID_EXTENDED, Frames, joined, new_frames
 
 #: Class bit of an error frame (linux/can/error.h).
 BUS_OFF: Final = 0x40
@@ -228,7 +228,7 @@ class FaultyBus(WrappedBus):
     def send(self, frames: Frames) -> None:
         """What the nodes say, on its way to the HAL. Raises as the bus does."""
         if self._now() or not self.wire.idle:
-            frames = _together(self._passed(frames, from_hal=False))
+            frames = joined(self._passed(frames, from_hal=False))
         if len(frames):
             self.bus.send(frames)
 
@@ -245,7 +245,7 @@ class FaultyBus(WrappedBus):
             self._for_nodes.append(frames[:count].copy())
         else:
             return count
-        heard = _together(self._for_nodes)
+        heard = joined(self._for_nodes)
         count = min(len(heard), len(frames))
         frames[:count] = heard[:count]
         self._for_nodes = [heard[count:]] if count < len(heard) else []
@@ -278,16 +278,11 @@ class FaultyBus(WrappedBus):
         self._for_nodes += [frame for frame in due if _id(frame) in self._from_hal]
         self._for_nodes += [frame for frame in added if not _id(frame) & ID_ERROR]  # which are no frames of the wire
         if for_hal := [frame for frame in due if _id(frame) not in self._from_hal] + added:
-            self.bus.send(_together(for_hal))
+            self.bus.send(joined(for_hal))
 
 
 def _id(frame: Frames) -> int:
     return int(frame["can_id"][0])
-
-
-def _together(frames: Sequence[Frames]) -> Frames:
-    # Through their bytes: to join records numpy compares the fields of each with those of the one before, forty times as long.
-    return np.frombuffer(bytearray().join([frame.tobytes() for frame in frames]), FRAME)
 
 
 def _cut(frame: Frames, length: int) -> None:

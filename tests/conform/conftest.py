@@ -15,7 +15,7 @@ from atalante_emulator.body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus.pair import PairBus, lockstep_pair
-from atalante_hal.frame import FLAG_BRS, FLAG_FDF, FRAME, Frames, new_frames
+from atalante_hal.frame import FLAG_BRS, FLAG_FDF, Frames, joined, new_frames
 from atalante_hal.robot import Robot
 from atalante_tools.conform.bench import Bench, Limits, LockStep
 from atalante_tools.conform.examination import requirements_of
@@ -54,8 +54,7 @@ class Wire:
         count = self._bus.receive(frames, timeout)
         if self.from_node is not None:
             kept = [self.from_node(frames[place : place + 1].copy()) for place in range(count)]
-            # Through their bytes: numpy takes forty times as long to join records.
-            together = np.frombuffer(b"".join(part.tobytes() for part in [*kept, self.out_of_the_blue()]), FRAME)
+            together = joined([*kept, self.out_of_the_blue()])
             count = len(together)
             frames[:count] = together
         self.sync_sent = False
