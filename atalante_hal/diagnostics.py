@@ -106,7 +106,7 @@ class Dtc(StrEnum):
     TORQUE_SATURATED = "TORQUE_SATURATED", _R.FULL_ASSIST, _S.WARNING, "the limiter cuts the torque"
     GUIDE_OUTSIDE = "GUIDE_OUTSIDE", _R.INFO, _S.INFO, "a joint is outside the virtual guide"
     CYCLE_GAP = "CYCLE_GAP", _R.HOLD, _S.ERROR, "too long between two cycles"
-    OVERRUN = "OVERRUN", _R.HOLD, _S.ERROR, "late cycles in a row"
+    OVERRUN = "OVERRUN", _R.HOLD, _S.ERROR, "late cycles in a row, or a loop that falls behind"
     OPERATOR_STOP = "OPERATOR_STOP", _R.HOLD, _S.INFO, "the operator stops, lets the dead-man go, or is not heard"
     SWING_TIMEOUT = "SWING_TIMEOUT", _R.FINISH_STEP, _S.ERROR, "a joint of the swing leg is not heard for a moment"
     # Outside the loop.

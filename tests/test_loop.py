@@ -7,7 +7,17 @@ import gc
 import numpy as np
 import pytest
 
-from atalante_hal.loop import GAP_TO_HOLD, LockStep, WallClock, run
+from atalante_hal.loop import (
+    COST_BINS,
+    DRIFT_CYCLES,
+    DRIFT_TO_HOLD,
+    GAP_TO_HOLD,
+    Drift,
+    LockStep,
+    Statistics,
+    WallClock,
+    run,
+)
 from atalante_hal.types import Command, SupervisorState
 
 S = SupervisorState
@@ -88,6 +98,10 @@ def test_an_exception_holds_in_the_same_cycle_and_the_loop_goes_on(make_rig):
         ({400: 4e-3}, S.ACTIVE),
         ({400: GAP_TO_HOLD + 1e-3}, S.HOLD),
         ({400: 0.9e-3, 401: 0.9e-3, 402: 0.9e-3}, S.ACTIVE),
+        ({400: 4e-3, 410: 0.9e-3}, S.ACTIVE),
+        ({400: 4e-3, 410: 1.1e-3}, S.HOLD),
+        ({350: 4e-3, 401: 4e-3}, S.ACTIVE),
+        ({352: 4e-3, 401: 4e-3}, S.HOLD),
     ],
 )
 def test_three_late_cycles_in_a_row_or_one_long_gap_end_in_hold(make_rig, lateness, expected):
@@ -98,6 +112,70 @@ def test_three_late_cycles_in_a_row_or_one_long_gap_end_in_hold(make_rig, latene
     assert states[-1] is expected
     assert statistics.overruns == sum(late > 1e-3 for late in lateness.values())
     assert statistics.lateness_max == max(lateness.values())
+
+
+class SimulatedTime:
+    """Monotonic time of a loop whose cycles take `busy` seconds each."""
+
+    def __init__(self, busy: float) -> None:
+        self.now, self.busy = 0.0, busy
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+    def step(self, state) -> bool:
+        self.now += self.busy if state.supervisor is S.ACTIVE else 0.0
+        return state.cycle >= 600
+
+
+@pytest.mark.parametrize(
+    ("busy", "expected"), [(0.99e-3, S.ACTIVE), (1.05e-3, S.ACTIVE), (1.2e-3, S.HOLD), (1.9e-3, S.HOLD)]
+)
+def test_a_loop_that_falls_behind_the_monotonic_clock_ends_in_hold(make_rig, busy, expected):
+    rig = make_rig(controller_fields=Recorder.telemetry_fields)
+    time, states = SimulatedTime(busy), []
+    clock = WallClock(now=lambda: time.now, sleep=time.sleep)
+    run(rig.hal, Recorder(), clock, until=lambda state: states.append(state.supervisor) or time.step(state))
+    assert S.ACTIVE in states
+    assert states[-1] is expected
+    overruns = [event for event in rig.hal.events if event.code == "OVERRUN" and event.severity == "error"]
+    assert bool(overruns) is (expected is S.HOLD)
+    if overruns:
+        assert overruns[0].value > DRIFT_TO_HOLD
+        # 5 ms are lost after 5 ms / (busy - 1 ms) cycles; the next cycle notices, the one after holds.
+        assert states.count(S.ACTIVE) <= DRIFT_TO_HOLD / (busy - 1e-3) + 3
+
+
+def test_the_drift_is_the_time_lost_within_the_window():
+    drift = Drift()
+    assert drift.add(0.0) == 0.0
+    assert drift.add(0.9e-3) == pytest.approx(0.9e-3)
+    assert drift.add(0.9e-3) == pytest.approx(0.9e-3), "the deadlines did not move: nothing more is lost"
+    assert drift.add(1.8e-3) == pytest.approx(1.8e-3)
+    assert drift.add(GAP_TO_HOLD) == pytest.approx(1.8e-3 + GAP_TO_HOLD)
+    assert drift.add(2.0) == pytest.approx(1.8e-3 + GAP_TO_HOLD), "a gap is a diagnostic of its own"
+    for _ in range(DRIFT_CYCLES):
+        lost = drift.add(0.0)
+    assert lost == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_memory_of_cycle_costs_is_bounded_and_its_percentiles_are_exact_to_a_microsecond():
+    statistics = Statistics()
+    size = len(statistics.costs)
+    assert statistics.cost(50) == 0.0
+    for microseconds in [100] * 98 + [250, 99_999]:
+        statistics.costs[min(microseconds, COST_BINS)] += 1
+    assert len(statistics.costs) == size
+    assert statistics.cost(0) == pytest.approx(100e-6)
+    assert statistics.cost(50) == pytest.approx(100e-6)
+    assert statistics.cost(99) == pytest.approx(250e-6)
+    assert statistics.cost(100) == pytest.approx(COST_BINS * 1e-6)
+
+
+def test_every_cycle_of_a_run_is_in_the_histogram_of_costs(make_rig):
+    rig = make_rig(controller_fields=Recorder.telemetry_fields)
+    statistics = run(rig.hal, Recorder(), LockStep(), until=after(50))
+    assert sum(statistics.costs) == statistics.cycles == 50
 
 
 def test_the_loop_ends_in_hold_whatever_ends_it(make_rig):

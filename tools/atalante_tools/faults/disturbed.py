@@ -11,6 +11,7 @@ import numpy as np
 from atalante_hal.bus import Bus, BusDown, BusFull
 from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.frame import Frames
+from atalante_hal.hal import PERIOD
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Command, Controller, State, Vector
 from atalante_tools.faults.scenario import Host
@@ -77,15 +78,25 @@ class DisturbedController:
 
 
 class DisturbedClock:
-    """Lock-step, but late when asked."""
+    """Lock-step, but late or slow when asked."""
 
     def __init__(self, now: Moment) -> None:
         self._now = now
+        self._behind = 0.0  # s, of a slow loop against its deadlines
 
     def wait(self) -> float:
-        """How late the cycle is [s]."""
-        late = self._now.of("late")
-        return 0.0 if late is None else float(late.value)
+        """Return how late the cycle begins [s], as `WallClock.wait` would."""
+        asked = self._now.of("late", "slow")
+        if asked is None:
+            self._behind = 0.0
+            return 0.0
+        if asked.kind == "late":
+            return float(asked.value)
+        self._behind += float(asked.value) - PERIOD
+        late = self._behind
+        if late > PERIOD:
+            self._behind = 0.0
+        return late
 
 
 class DisturbedBus(WrappedBus):

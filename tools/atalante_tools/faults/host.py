@@ -60,7 +60,9 @@ SCENARIOS: Final = (
         "F44",
         (
             Case("2 cycles", (Host("late", 0, 2, 1.5e-3),), state=_ACTIVE, dtc=""),
-            Case("3 cycles", (Host("late", 0, 3, 1.5e-3),)),
+            Case("3 cycles", (Host("late", 0, 3, 1.5e-3),), reacted=3),
+            Case("cycles of 1.9 ms", (Host("slow", 0, 100, 1.9e-3),)),
+            Case("cycles of 1.05 ms", (Host("slow", 0, 100, 1.05e-3),), state=_ACTIVE, dtc=""),
         ),
         lasting=Case("1.5 ms late in every cycle", (Host("late", 0, None, 1.5e-3),)),
     ),

@@ -25,7 +25,8 @@ MID_SWING: Final = 0.35
 class Host:
     """A fault of the computer the HAL runs on, in the HAL's cycles.
 
-    `late`: the cycle begins `value` seconds late. `raise`, `raise_in_reset`: the controller raises the builtin exception `value`.
+    `late`: the cycle begins `value` seconds late. `slow`: each cycle takes `value` seconds instead of its period.
+    `raise`, `raise_in_reset`: the controller raises the builtin exception `value`.
     `ask`: it asks for `value` Nm on every joint. `shake`: it asks the left hip for `value` Nm more and less in turn. `shape`: it
     asks for `value` torques. `bus_down`, `bus_full`: the HAL's end of the bus raises on sending.
     """
