@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
 from pathlib import Path
 
-from atalante_hal.diagnostics import Dtc
+import pytest
+
+from atalante_hal.diagnostics import Dtc, Reaction
+from atalante_hal.supervisor import next_state
 from atalante_hal.types import SupervisorState
-from atalante_tools.supervisor_table import page
+from atalante_tools.supervisor_table import FACTS, a_diagnostic, page
 
 PAGE = Path(__file__).parents[1] / "SUPERVISOR.md"
 
@@ -15,9 +20,19 @@ def test_the_page_is_what_the_function_does():
     assert PAGE.read_text() == page(), "SUPERVISOR.md is stale: type `make supervisor-table`"
 
 
-def test_every_state_with_every_code_is_there():
+def test_every_reaction_has_a_row_in_both_tables_and_every_code_one_in_the_list():
     lines = page().splitlines()
+    for reaction in Reaction:
+        rows = [line for line in lines if line.startswith(f"| {reaction.name} |")]
+        assert [row.count("|") for row in rows] == [len(SupervisorState) + 2] * 2
     for dtc in Dtc:
-        rows = [line for line in lines if line.startswith(f"| `{dtc}` |")]
-        assert len(rows) == 3
-        assert [row.count("|") for row in rows] == [len(SupervisorState) + 2] * 2 + [5]
+        assert sum(line.startswith(f"| `{dtc}` | {dtc.reaction.name} |") for line in lines) == 1
+
+
+@pytest.mark.parametrize("conditions", [conditions for _, conditions in FACTS], ids=[name for name, _ in FACTS])
+def test_all_diagnostics_of_one_reaction_lead_to_the_same_state(conditions):
+    for dtc, state in itertools.product(Dtc, SupervisorState):
+        twin = a_diagnostic(dtc.reaction)
+        after, _ = next_state(state, replace(conditions, diagnostics=frozenset({dtc})))
+        expected, _ = next_state(state, replace(conditions, diagnostics=frozenset({twin})))
+        assert after is expected, (dtc, state)
