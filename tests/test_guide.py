@@ -22,7 +22,7 @@ from atalante_control.deadbeat import Deadbeat
 from atalante_control.gait import HANG_GAIT, PERIOD, bezier, derivative, load_gait
 from atalante_control.guide import GuideConfig, GuideFilter
 from atalante_control.guide_kernel import damped_gate, gate, tick
-from atalante_control.guide_shapes import SHAPES, GuideShape
+from atalante_control.guide_shapes import SHAPES, GuideShape, half_width
 from atalante_hal.robot import load_robot
 
 GAIT = load_gait(HANG_GAIT, load_robot())
@@ -294,6 +294,9 @@ def test_a_ringing_loop_counts_the_worst_signal_not_the_two_extremes():
         {"disturbance": ((-1.0, float("inf")), (-1.0, 1.0))},
         {"disturbance": ((-1.0, 1.0), (-float("inf"), 1.0))},
         {"disturbance": ((-1.0, 1.0), (-2.0, -1.0))},
+        {"disturbance": ((math.nan, 1.0), (-1.0, 1.0))},
+        {"disturbance": ((-1.0, 1.0), (-1.0, math.nan))},
+        {"disturbance": ((30.0, -30.0), (-1.0, 1.0))},
         {"points": 1},
         {"zeta": -1.0},
         {"zeta": float("nan")},
@@ -309,6 +312,30 @@ def test_refuses_a_configuration_that_is_none(bad: dict[str, object]):
     (name,) = bad
     with pytest.raises(ValueError, match=rf"{name}.* not "):
         replace(CONFIG, **bad)
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0, math.nan])
+def test_a_shape_with_a_bad_bound_at_a_cycle_of_the_step_is_refused_when_the_filter_is_made(value: float):
+    """At phase 333 / 800, which lies between those a shape is checked at when it is made, and not at Xi = 0."""
+
+    def fractions(phase: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+        bad = (np.abs(phase - 0.41625) < 1e-5) & (width < half_width(0.4))
+        return np.where(bad, value, 1.0), np.ones_like(phase)
+
+    shape = GuideShape("between", "", fractions)
+    with pytest.raises(ValueError, match=r"'between' must be finite and at least .* at phase 0\.4163"):
+        GuideFilter(CONFIG, shape, DEADBEAT, NOMINAL, FOLLOWING)
+
+
+def test_a_shape_with_a_bad_bound_at_one_factor_is_refused_before_a_step_takes_it():
+    shape = GuideShape(
+        "factor", "", lambda p, w: (np.full_like(p, 0.0 if abs(w - half_width(0.512)) < 1e-9 else 1.0), np.ones_like(p))
+    )
+    f = GuideFilter(CONFIG, shape, DEADBEAT, NOMINAL, FOLLOWING)
+    f.start_step(0.5, (0.0, 0.0), (0.0, 0.0))
+    with pytest.raises(ValueError, match=r"'factor' must be .* and Xi 0\.512"):
+        f.start_step(0.512, (0.0, 0.0), (0.0, 0.0))
+    assert (f.tables[2][:, :, 4:] > 0.0).all()
 
 
 @pytest.mark.parametrize(

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from atalante_control.guide_shapes import SHAPES, GuideShape, half_width
+from atalante_control.guide_shapes import CONSTANT, SHAPES, GuideShape, half_width
 
 PHASE = np.linspace(0.0, 1.0, 801)
 ALL = list(SHAPES.values())
@@ -76,3 +78,64 @@ def test_shapes_do_what_their_names_say():
 
 def test_a_guide_already_narrower_than_the_pinch_stays_as_it_is():
     np.testing.assert_allclose(SHAPES["pinched"].bounds(PHASE, 1.0), half_width(1.0))
+
+
+def at(value: float, side: int = 0, where: Callable[[np.ndarray, float], np.ndarray] | None = None):
+    """Fractions of 1, but of `value` on a side, where `where(phase, half_width)` is true."""
+
+    def fractions(phase: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+        sides = [np.ones_like(phase), np.ones_like(phase)]
+        sides[side] = np.where(np.True_ if where is None else where(phase, width), value, sides[side])
+        return sides[0], sides[1]
+
+    return fractions
+
+
+@pytest.mark.parametrize("side", [0, 1])
+@pytest.mark.parametrize("value", [-1.0, 0.0, -0.0, math.nan, math.inf, -math.inf, 1e-300, 1e-6])
+def test_a_shape_with_a_bound_that_is_none_is_refused_when_it_is_made(value: float, side: int):
+    with pytest.raises(ValueError, match=rf"bounds of the guide shape 'own' must be .*{('upper', 'lower')[side]}"):
+        GuideShape("own", "", at(value, side))
+    with pytest.raises(ValueError, match="'constant' must be finite"):
+        replace(CONSTANT, fractions=at(value, side))
+
+
+def test_a_refusal_names_shape_phase_factor_and_value():
+    negative = at(-0.5, 1, lambda phase, width: np.abs(phase - 0.43) < 3e-4)
+    with pytest.raises(ValueError) as refused:  # noqa: PT011
+        GuideShape("notched", "", negative)
+    assert str(refused.value) == (
+        "bounds of the guide shape 'notched' must be finite and at least 1e-06 rad, got -0.0654498 rad (lower) "
+        "at phase 0.43 and Xi 0"
+    )
+
+
+def test_a_shape_that_closes_after_scaling_is_refused_when_it_is_made():
+    """Its fractions fall below zero in narrow guides alone."""
+    with pytest.raises(ValueError, match=r"'narrow' must be .* and Xi 0\.85"):
+        GuideShape("narrow", "", lambda phase, width: ((width - 0.03) * np.ones_like(phase), np.ones_like(phase)))
+
+
+def test_bounds_that_were_not_looked_at_when_it_was_made_are_refused_when_asked_for():
+    between = GuideShape("between", "", at(-1.0, 0, lambda phase, width: np.abs(phase - 0.41625) < 1e-5))
+    with pytest.raises(ValueError, match=r"'between' must be .* at phase 0\.4163"):
+        between.bounds(PHASE, 0.5)
+
+
+@pytest.mark.parametrize(
+    "fractions",
+    [
+        lambda phase, width: (1.0, 1.0),
+        lambda phase, width: (np.ones(3), np.ones(3)),
+        lambda phase, width: [phase + 1.0],
+    ],
+)
+def test_fractions_of_other_shapes_are_refused(fractions):
+    with pytest.raises(
+        ValueError, match=r"fractions of the guide shape 'own' must return 2 arrays of shape \(2001,\), got"
+    ):
+        GuideShape("own", "", fractions)
+
+
+def test_the_narrowest_shape_is_accepted():
+    assert GuideShape("thin", "", at(2e-4)).bounds(PHASE, 1.0).min() > 0.0

@@ -65,6 +65,7 @@ class GuideFilter:
 
     Attributes:
         joints, flow, step: what `guide_kernel` works on, SH and SK; h, gate and guide in `joints` are of the last tick.
+        nominal: as given, Bezier control points of SH and SK, shape (2, 8) [rad].
         cycles, stride, grid, horizon: cycles of a step, of a grid interval, of the grid points, of the horizon's end.
         time: of every cycle to the horizon's end [s]; `forced`: responses of SH and SK on it that P is made of.
     """
@@ -84,14 +85,18 @@ class GuideFilter:
             nominal: Bezier control points of the swing leg's SH and SK, shape (2, 8) [rad].
             following: of the same joints in the step after, when the leg stands, shape (2, 8) [rad].
             feedforward: of u_f where it is applied, shape (2, 8) [Nm].
+
+        Raises:
+            ValueError: a bound of the shape is not finite or is too small at a cycle of the step, see `GuideShape.bounds`.
         """
-        self.config, self.shape, self.deadbeat = config, shape, deadbeat
+        self.config, self.shape, self.deadbeat, self.nominal = config, shape, deadbeat, nominal
         self.cycles = round(deadbeat.duration / PERIOD)
         self.stride = max(1, -(-self.cycles // config.points))
         beyond = math.ceil(round(config.overlap / PERIOD) / self.stride) * self.stride
         self.horizon = self.cycles + beyond
         self.grid = np.arange(self.cycles % self.stride, self.horizon + 1, self.stride)
         self.time: Vector = np.arange(self.horizon + 1, dtype=np.float64) * PERIOD
+        shape.check(self.time / deadbeat.duration)
 
         self.forced: list[ForcedResponse] = []
         tables = []

@@ -17,6 +17,11 @@ Vector = npt.NDArray[np.float64]
 
 PINCH_WIDTH = math.radians(1.0)  # rad, what the pinched guide closes to
 SNAP_WIDTH = math.radians(0.1)  # rad, what the snapping guide closes to
+#: Smallest bound of a shape [rad], about two encoder counts at the joint. A positive bound far below it overflows the filter's h.
+NARROWEST = 1e-6
+#: Phases and assistance factors at which a shape is checked when it is made.
+_CHECKED_PHASES = np.linspace(0.0, 1.0, 2001)
+_CHECKED_FACTORS = np.linspace(0.0, 1.0, 21).tolist()
 
 
 def half_width(xi: float) -> float:
@@ -32,11 +37,33 @@ def half_width(xi: float) -> float:
 
 @dataclass(frozen=True)
 class GuideShape:
-    """A named shape. `fractions(phase, half_width)` gives the parts of the half-width, upper and lower, each (n,)."""
+    """A named shape. `fractions(phase, half_width)` gives the parts of the half-width, upper and lower, each (n,).
+
+    A shape is evaluated when it is made, at 2001 phases and 21 assistance factors. `GuideFilter` evaluates it again at every
+    cycle of its step, and `bounds` checks whatever it returns.
+
+    Raises:
+        ValueError: a bound is not finite or is smaller than `NARROWEST`, or `fractions` returns other array shapes.
+    """
 
     name: str
     summary: str
     fractions: Callable[[Vector, float], tuple[Vector, Vector]]
+
+    def __post_init__(self) -> None:
+        self.check(_CHECKED_PHASES)
+
+    def check(self, phase: Vector) -> None:
+        """Evaluate the bounds at the phases, for assistance factors from 0 to 1.
+
+        Args:
+            phase: (t - t_i) / T, shape (n,).
+
+        Raises:
+            ValueError: as for `bounds`.
+        """
+        for xi in _CHECKED_FACTORS:
+            self.bounds(phase, xi)
 
     def bounds(self, phase: Vector, xi: float) -> Vector:
         """Distances from the desired trajectory to the guide.
@@ -46,11 +73,28 @@ class GuideShape:
             xi: assistance factor in [0, 1].
 
         Returns:
-            Shape (n, 2) [rad], upper and lower, both positive.
+            Shape (n, 2) [rad], upper and lower, finite and at least `NARROWEST`.
+
+        Raises:
+            ValueError: a bound is not finite or is too small; `fractions` returns other than two arrays of shape (n,); Xi is
+                outside [0, 1].
         """
-        width = half_width(xi)
-        upper, lower = self.fractions(np.clip(phase, 0.0, 1.0), width)
-        return width * np.stack([upper, lower], axis=1)
+        width, phase = half_width(xi), np.clip(phase, 0.0, 1.0)
+        sides = [np.asarray(side, dtype=np.float64) for side in self.fractions(phase, width)]
+        if [side.shape for side in sides] != [phase.shape] * 2:
+            raise ValueError(
+                f"fractions of the guide shape {self.name!r} must return 2 arrays of shape {phase.shape}, "
+                f"got {[side.shape for side in sides]}"
+            )
+        bounds: Vector = width * np.stack(sides, axis=1)
+        valid = (bounds >= NARROWEST) & (bounds < math.inf)
+        if not valid.all():
+            at, side = divmod(int(valid.argmin()), 2)
+            raise ValueError(
+                f"bounds of the guide shape {self.name!r} must be finite and at least {NARROWEST:g} rad, got "
+                f"{bounds[at, side]:g} rad ({('upper', 'lower')[side]}) at phase {phase[at]:.4g} and Xi {xi:g}"
+            )
+        return bounds
 
 
 def _constant(phase: Vector, width: float) -> tuple[Vector, Vector]:
