@@ -136,10 +136,42 @@ def test_a_step_takes_the_gentlest_gains_that_are_certified_with_a_margin(shape:
         taken = controller.guides.index(controller.guide_at(xi))
         assert not any(enough[:taken])
         assert taken == len(kp) - 1 or not never[taken]
-        assert controller.certificate(xi) == certificates[taken]
+        if xi <= CONFIG.fade:
+            assert replace(controller.certificate(xi), joint_torque=None) == certificates[taken]
     # What the stiffest gains keep is never lost to gentler ones.
     stiffest = [certify(controller.guides[-1], xi, box).certified for xi in (0.5, 0.93)]
-    assert [controller.certificate(xi).certified for xi in (0.5, 0.93)] == stiffest
+    assert [certify(controller.guide_at(xi), xi, box).certified for xi in (0.5, 0.93)] == stiffest
+
+
+@pytest.mark.parametrize("shape", list(SHAPES))
+@pytest.mark.parametrize("xi", [0.9 + 1e-9, 0.91, 0.95, 0.99, 1.0])
+def test_no_guide_is_certified_where_the_baseline_is_blended_in(shape: str, xi: float):
+    certificate = hang(shape).certificate(xi)
+    assert not certificate.certified
+    assert certificate.joint_torque is None
+    assert ("fade" if xi < 1.0 else "baseline controller drives every joint") in certificate.reason
+
+
+def test_the_fade_is_that_of_the_configuration():
+    controller = hang("constant", replace(CONFIG, fade=0.4))
+    assert [controller.certificate(xi).certified for xi in (0.4, 0.5)] == [True, False]
+
+
+def test_a_guide_whose_torques_are_not_decoupled_is_not_certified():
+    certificate = hang("constant", replace(CONFIG, decoupled=False)).certificate(0.5)
+    assert not certificate.certified
+    assert certificate.joint_torque is None
+    assert "decoupled=False" in certificate.reason
+
+
+def test_statistics_keep_the_factors_of_the_steps():
+    controller = hang()
+
+    def operator(state: State) -> None:
+        state.assistance_factor = 0.5 if state.cycle < STARTUP + 100 else 0.95
+
+    walk(controller, STARTUP + STEP + 2, each=operator)
+    assert controller.statistics.factors == {0.5, 0.95}
 
 
 def test_a_joint_whose_torque_is_cut_winds_no_integral_up():
@@ -192,7 +224,7 @@ def test_friction_a_fifth_off_does_not_break_the_guide(shape: str, friction: flo
 @pytest.mark.parametrize("xi", [0.0, 0.8, 0.93])
 def test_the_guide_is_kept_at_other_assistance_factors(xi: float):
     controller = hang()
-    assert controller.certificate(xi).certified
+    assert controller.certificate(xi).certified == (xi <= CONFIG.fade)
     walk(controller, STARTUP + 3 * STEP, xi=xi)
     assert controller.statistics.max_ratio <= 1.0
 

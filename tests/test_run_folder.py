@@ -11,7 +11,7 @@ import pytest
 from atalante_tools.outcome import Failed
 from atalante_tools.run_folder import Result, leave, run_folder
 
-WALKED = Result("pinched", True, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0)
+WALKED = Result("pinched", True, 1.97, 1.18, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0)
 
 
 def test_two_runs_do_not_write_into_one_folder(tmp_path: Path) -> None:

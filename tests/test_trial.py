@@ -24,7 +24,7 @@ from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.frame import Frames
 from atalante_hal.hal import Hal
 from atalante_hal.loop import LockStep, run
-from atalante_hal.robot import JOINTS
+from atalante_hal.robot import JOINTS, load_robot
 from atalante_hal.telemetry.process import TelemetrySummary
 from atalante_hal.telemetry.schema import message_class
 from atalante_hal.types import State
@@ -34,7 +34,8 @@ from atalante_tools.run_folder import Result, results_table
 
 ATALANTE = str(Path(sys.executable).with_name("atalante"))
 KEYS = [
-    "shape", "certified", "steps", "max_ratio", "inside", "filter_active", "cycles", "real_time_factor", "frames", "crc_errors",
+    "shape", "certified", "bound_hip_nm", "bound_knee_nm", "steps", "max_ratio", "inside", "filter_active", "cycles",
+    "real_time_factor", "frames", "crc_errors",
 ]  # fmt: skip
 
 
@@ -43,11 +44,11 @@ def atalante(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_table_judges_no_guide_by_a_single_step() -> None:
-    walked = Result("pinched", True, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0)
+    walked = Result("pinched", True, 1.97, 1.18, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0)
     head, two, one = results_table([walked, replace(walked, steps=1)]).splitlines()
     assert head.split("  ")[0].strip() == "shape"
-    assert two.split() == ["pinched", "yes", "2", "0.93", "99.9", "50.0", "4697", "6.2", "90000", "0"]
-    assert one.split() == ["pinched", "yes", "1", "-", "-", "-", "4697", "6.2", "90000", "0"]
+    assert two.split() == ["pinched", "yes", "1.97", "1.18", "2", "0.93", "99.9", "50.0", "4697", "6.2", "90000", "0"]
+    assert one.split() == ["pinched", "yes", "1.97", "1.18", "1", "-", "-", "-", "4697", "6.2", "90000", "0"]
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +78,14 @@ def test_stdout_is_one_object_a_shape(demo):
         assert result["frames"] > 19 * result["cycles"]
         assert 0 <= result["inside"] <= 1
         assert 0 <= result["filter_active"] <= 1
+    bound = (
+        HangController(load_robot(), load_gait(HANG_GAIT, load_robot()), SHAPES["pinched"])
+        .certificate(0.5)
+        .joint_torque
+    )
+    assert bound is not None
+    assert (pinched["bound_hip_nm"], pinched["bound_knee_nm"]) == (bound.hip, bound.knee)
+    assert (snap["bound_hip_nm"], snap["bound_knee_nm"]) == (None, None)
     assert pinched["max_ratio"] <= 1.0
     assert pinched["inside"] == 1.0
     assert snap["max_ratio"] > 1.0
@@ -86,7 +95,24 @@ def test_an_uncertified_guide_is_announced_before_the_run(demo):
     stderr = demo[0].stderr
     announced = stderr.index("snap: NOT CERTIFIED")
     assert announced < stderr.index("ACTIVE on")
-    assert "pinched: certified" in stderr
+    (promise,) = (line for line in stderr.splitlines() if line.startswith("pinched: "))
+    pinched = json.loads(demo[0].stdout.splitlines()[0])
+    hip, knee = pinched["bound_hip_nm"], pinched["bound_knee_nm"]
+    assert promise.startswith(
+        f"pinched: certified on the model at Xi 0.5: built for {hip:.2f} Nm at the hip and {knee:.2f} Nm at the knee together"
+    )
+    assert "no guarantee: joint torque and rate limits, delay" in stderr
+
+
+@pytest.mark.parametrize(("factors", "certified"), [({0.5}, True), ({0.5, 0.9}, True), ({0.5, 0.95}, False)])
+def test_a_run_promises_the_least_of_all_factors_walked(factors: set[float], certified: bool):
+    robot = load_robot()
+    controller = HangController(robot, load_gait(HANG_GAIT, robot), SHAPES["constant"])
+    promise = trial._promise(trial._weakest(controller, factors))
+    assert promise["certified"] == certified
+    bound = controller.certificate(0.5).joint_torque  # the wider the guide, the worse the worst pose
+    assert bound is not None
+    assert promise["bound_hip_nm"] == (bound.hip if certified else None)
 
 
 def test_the_run_folder(demo):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +41,7 @@ class HangStatistics:
     max_ratio: float = 0.0  # largest |e| / q_bound
     min_h_at_start: float = 1.0  # smallest h at a step's first cycle
     hand_overs_exceeded: int = 0  # step changes with a deviation beyond the certified hand-over
+    factors: set[float] = field(default_factory=set)  # assistance factors of the steps
 
     @property
     def inside_fraction(self) -> float:

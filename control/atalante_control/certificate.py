@@ -22,12 +22,22 @@ to hold for a whole walk, and each is computed here, exactly, from the linear fl
    assisted in consecutive steps by its own guide, with |s(0)| up to the last width. The box is an assumption that
    the controller checks at every step change; the largest one admitted is part of the certificate.
 
-By induction over the steps the joint never leaves its guide. The law is sampled every millisecond and the joint is not
-the model: delay, quantisation, friction left over, coupling and the hand-over torque all count as disturbance, so its
-bound has to be set wider than the push one wants to admit. Disturbances are those of the separate inertias: torques tau
-on the coupled hip and knee count as J M^-1 tau (`AssistedInertia.ideal`), which on the light empty leg is several times
-tau. And 1 and 2 hold for the linear loop: where the drive saturates away from the re-centred path, the filter steps the
-two extremes and keeps a torque reserve, which is tested under adversarial pushes, not proved.
+By induction over the steps the joint never leaves its guide, on the model: separate inertias J, each with its own ideal
+torque limit. 1 and 2 hold for the linear loop. Where the ideal torque saturates away from the re-centred path, the filter
+steps the two extremes and keeps a torque reserve; that is tested under adversarial pushes, not proved.
+
+The bounds the filter is built for are torques on those separate inertias. A torque d on the coupled hip and knee counts as
+A d with A = J M(q_SK)^-1, which is several times d on the light empty leg: 1 Nm at the hip counts as (7.6, -3.4) Nm at a
+straight knee, 1 Nm at the knee as (-14.7, 7.7). `joint_torque` turns the bounds into the pair (hip, knee) of real torques
+that is printed: any |d_SH| <= hip and |d_SK| <= knee, together, in any direction and order, stay inside the bounds at
+every knee angle the leg can have inside the guide.
+
+What the pair includes: the mass matrix of SH and SK in the worst pose, deviations at the step change up to the hand-over
+box, sampling. What it does not include, and what a certified guide was left through: the real torque limit of the drives,
+the limiter's torque rate, the delay of the loop, the torque carried over a step change. Errors of friction and inertia,
+velocity noise and the other joints are not included either; they use up the same bounds. The pair is therefore a margin on
+the model, no guarantee for the robot. Where the baseline fades in (Xi between `HangConfig.fade` and 1) another law runs:
+nothing is certified there.
 """
 
 from __future__ import annotations
@@ -39,20 +49,44 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_control.backup import BackupPolicy, ForcedResponse
+from atalante_control.gait import bezier
 from atalante_control.guide import GuideFilter
+from atalante_control.idealization import AssistedInertia
 
 Vector = npt.NDArray[np.float64]
+Pair = tuple[float, float]
 
 _JOINTS = ("SH", "SK")
 _STATES = 41  # errors across the guide at which the image is cut
+#: Direction of the pair of real torques, hip to knee. The largest pair along it is what `joint_torque` returns.
+_DIRECTION = np.array([5.0, 3.0])
+_KNEE_SPACING = math.radians(0.05)  # rad, largest distance between the knee angles at which the mass matrix is taken
 
 
 @dataclass(frozen=True)
 class HandOver:
-    """Deviations from the nominal start of a step with which a joint is handed over to the guide."""
+    """Deviations from the nominal start of a step with which a joint is handed over to the guide.
+
+    Raises:
+        ValueError: a value that is negative or not finite.
+    """
 
     deviation: float = math.radians(2.0)  # rad, largest |s(0)|
     rate: float = 0.5  # rad/s, largest |s'(0)|
+
+    def __post_init__(self) -> None:
+        for name in ("deviation", "rate"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} of the hand-over must be finite and at least 0, got {getattr(self, name)!r}")
+
+
+@dataclass(frozen=True)
+class JointTorque:
+    """Largest disturbances of the real joints, together and in any direction and order, inside the filter's bounds."""
+
+    hip: float  # Nm, at SH
+    knee: float  # Nm, at SK
+    worst_knee: float  # rad, angle of SK at which the pair reaches a bound
 
 
 @dataclass(frozen=True)
@@ -63,23 +97,30 @@ class JointCertificate:
     margin: float  # 1 - largest e / q_bound from the re-centred state; negative: it is left
     tightest_phase: float  # where along the step, t / T
     side: str  # upper or lower
-    u_ext: tuple[float, float]  # Nm, the disturbance bounds asked for
-    u_ext_max: tuple[float, float]  # Nm, the same bounds scaled to where the margin is zero; (0, 0): none is admitted
-    torque: float  # Nm, largest |u_b| along the way
-    torque_limit: float  # Nm, what the filter counts on
+    u_ext: tuple[float, float]  # Nm on the separate inertia, the bounds the filter is built for
+    #: Nm on the separate inertia, the same bounds scaled to where the margin is zero; (0, 0): there is none. A filter built
+    #: for these holds them, the filter at hand does not.
+    u_ext_max: tuple[float, float]
+    torque: float  # Nm on the separate inertia, largest |u_b| along the way
+    torque_limit: float  # Nm on the separate inertia, what the filter counts on
     image_empty_at: float  # first phase at which no state at all is safe; infinity where there is always one
     hand_over_max: float  # the hand-over box may be this much larger before the margin is zero
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """Whether a guide keeps its promise, and if not, why."""
+    """Whether a guide holds on the model, and if not, why.
+
+    `joint_torque` is what the running filter is built for: real torque at the joints. It is None where the guide is not
+    certified, and where `certify` was not given the mass matrix.
+    """
 
     shape: str
     xi: float
     certified: bool
     reason: str  # one sentence
     joints: tuple[JointCertificate, JointCertificate]
+    joint_torque: JointTorque | None = None
 
     @property
     def margin(self) -> float:
@@ -87,12 +128,16 @@ class Certificate:
         return min(joint.margin for joint in self.joints)
 
 
-def certify(guide: GuideFilter, xi: float, hand_over: HandOver | None = None) -> Certificate:
+def certify(
+    guide: GuideFilter, xi: float, hand_over: HandOver | None = None, inertia: AssistedInertia | None = None
+) -> Certificate:
     """Certificate of a guide at an assistance factor.
 
     Args:
         guide: gives shape, gains, inertia, disturbance bounds, gait and deadbeat; it is not changed.
+        xi: assistance factor in [0, 1].
         hand_over: deviations from the baseline controller; None: the default of `HandOver`.
+        inertia: mass matrix of SH and SK, for `Certificate.joint_torque`.
     """
     hand_over = hand_over or HandOver()
     bounds = guide.shape.bounds(guide.time / guide.deadbeat.duration, xi)
@@ -108,7 +153,41 @@ def certify(guide: GuideFilter, xi: float, hand_over: HandOver | None = None) ->
         f"{100 * worst.margin:.0f} % of the guide is left where it is tightest, {worst.joint} at "
         f"{worst.tightest_phase:.2f} T ({worst.side} side)",
         joints,
+        None if inertia is None else joint_torque(guide, xi, hand_over, inertia),
     )
+
+
+def joint_torque(guide: GuideFilter, xi: float, hand_over: HandOver, inertia: AssistedInertia) -> JointTorque:
+    """Largest pair of real torques, 5 at the hip to 3 at the knee, inside the bounds the filter is built for.
+
+    With A = J M(q_SK)^-1 it is the largest pair for which |A| (hip, knee) is at most the bounds, row by row, at every knee
+    angle from the lowest to the highest that the guide and the deadbeat allow along the step. It is rounded down to 0.01 Nm.
+
+    Args:
+        guide: gives gait, deadbeat, shape and disturbance bounds.
+        xi: assistance factor in [0, 1].
+        hand_over: deviations that the deadbeat starts from.
+        inertia: gives M and J.
+    """
+    bounds = np.array([min(-low, high) for low, high in guide.config.disturbance]) + 0.0  # no -0.0
+    low, high = _knee_range(guide, xi, hand_over)
+    angles = np.linspace(low, high, 2 + int((high - low) / _KNEE_SPACING))
+    counts = np.array([np.abs(inertia.ideal_of(float(angle))) @ _DIRECTION for angle in angles])
+    scales = (bounds / counts).min(axis=1)
+    at = int(scales.argmin())
+    hip, knee = (np.floor(100.0 * scales[at] * _DIRECTION) / 100.0).tolist()
+    return JointTorque(hip, knee, float(angles[at]))
+
+
+def _knee_range(guide: GuideFilter, xi: float, hand_over: HandOver) -> Pair:
+    """Lowest and highest angle of SK along a step inside the guide: q_nom + s + e [rad]."""
+    time = guide.time[: guide.cycles + 1]
+    phase = time / guide.deadbeat.duration
+    upper, lower = guide.shape.bounds(phase, xi).T
+    nominal = bezier(guide.nominal[1:], phase)[:, 0]
+    # As for the margin, a corner of the hand-over box is the worst.
+    moved = np.abs(guide.deadbeat.basis(time)[0]).T @ [hand_over.deviation, hand_over.rate]
+    return float((nominal - moved - lower).min()), float((nominal + moved + upper).max())
 
 
 def largest_assistance(guide: GuideFilter, margin: float, hand_over: HandOver | None = None) -> float:
@@ -176,21 +255,21 @@ def _joint(guide: GuideFilter, bounds: Vector, joint: int, hand_over: HandOver) 
 
 
 def _complaint(joint: JointCertificate) -> str:
+    """Return why a joint is not certified, empty if it is; in parts of the bounds, which are not the joint's Nm."""
     if math.isfinite(joint.image_empty_at):
         return (
             f"no state of {joint.joint} is safe: at {joint.tightest_phase:.2f} T the guide is narrower, or closes faster, "
-            f"than the backup policy holds against {joint.u_ext[0]:.3g} to {joint.u_ext[1]:.3g} Nm"
+            "than the backup policy holds against the disturbance its filter is built for"
         )
-    if joint.margin < 0.0:
+    if not joint.margin >= 0.0:
         return (
             f"{joint.joint} may leave the guide by {-100 * joint.margin:.0f} % at {joint.tightest_phase:.2f} T "
-            f"({joint.side} side) under {joint.u_ext[0]:.3g} to {joint.u_ext[1]:.3g} Nm; it holds against "
-            f"{joint.u_ext_max[0]:.3g} to {joint.u_ext_max[1]:.3g} Nm"
+            f"({joint.side} side) under the disturbance its filter is built for"
         )
     if joint.torque > joint.torque_limit:
         return (
-            f"the backup policy of {joint.joint} asks for {joint.torque:.0f} Nm from the re-centred state and the drive "
-            f"gives {joint.torque_limit:.0f} Nm"
+            f"the backup policy of {joint.joint} needs {100 * joint.torque / joint.torque_limit:.0f} % of the torque it may "
+            "count on, from the re-centred state"
         )
     return ""
 

@@ -11,6 +11,7 @@ assistive torque, every other joint the baseline torque. What the paper leaves o
   no guide ever moves under a joint inside a step, so the certificate of each step stays true, whatever the operator does.
 - *Xi towards 1.* The assisted joints get w u_t + (1 - w) (u_i + u_f + u_v), with w a smoothstep from 0 at Xi = 0.9 to
   exactly 1 at Xi = 1: there it is the baseline torque to the last bit. Their integrals take the same share w.
+  No guide is certified for Xi between 0.9 and 1.
 - *Gains.* A stiff backup policy holds a narrow guide, and in a wide one asks for more torque than there is. Each step takes
   the gentlest of a few gains with which its guide is certified, with a margin, at its Xi; the command is continuous in Xi but
   where they change.
@@ -208,13 +209,23 @@ class HangController:
         )
 
     def certificate(self, xi: float) -> Certificate:
-        """What this controller's guide promises at an assistance factor; nothing at Xi = 1, where no guide acts."""
-        certificate = certify(self.guide_at(xi), xi, self.config.hand_over)
-        if baseline_share(xi, self.config.fade) < 1.0:
+        """Return what the filter of the steps at an assistance factor is built for, and whether its guide is certified.
+
+        It is not where the certificate's law is not the one that runs: while the baseline fades in, at Xi = 1 and with
+        `HangConfig.decoupled` off.
+        """
+        config = self.config
+        certificate = certify(self.guide_at(xi), xi, config.hand_over, self._inertia)
+        share = baseline_share(xi, config.fade)
+        if share == 1.0:
+            reason = "at Xi = 1 the baseline controller drives every joint alone"
+        elif share > 0.0:
+            reason = f"fade: between Xi {config.fade:g} and 1 the baseline is blended in, which the certificate does not cover"
+        elif not config.decoupled:
+            reason = "hip and knee are coupled (decoupled=False), and the certificate is that of separate inertias"
+        else:
             return certificate
-        return replace(
-            certificate, certified=False, reason="at Xi = 1 the baseline controller drives every joint alone"
-        )
+        return replace(certificate, certified=False, reason=reason, joint_torque=None)
 
     def reset(self, state: State) -> None:
         """Start from where the joints are, and from the torque they have."""
@@ -317,6 +328,7 @@ class HangController:
         self._command.step = (self._command.step or 0) + 1
         config, n = self.config, len(JOINTS)
         xi = min(1.0, max(0.0, state.assistance_factor))
+        self.statistics.factors.add(xi)
         self._w = baseline_share(xi, config.fade)
         leg = _LEG if stance == LEFT else 0
         self._share.fill(1.0)

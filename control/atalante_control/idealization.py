@@ -124,12 +124,18 @@ class AssistedInertia:
     def ideal(self, knee: float, hip_rate: float, knee_rate: float, tau: Pair) -> Pair:
         """Inverse of `torques`: what real torques `tau` without gravity are to the separate inertias [Nm]."""
         c1, c2 = self.torques(knee, hip_rate, knee_rate, (0.0, 0.0))
+        on_hip, on_knee = (self.ideal_of(knee) @ (tau[0] - c1, tau[1] - c2)).tolist()
+        return on_hip, on_knee
+
+    def ideal_of(self, knee: float) -> Vector:
+        """Return A = J M^-1, by which real torques without velocity torques count on the separate inertias. Shape (2, 2).
+
+        Args:
+            knee: angle of SK [rad].
+        """
         m11, m12, m22 = self.block(knee)
-        r1, r2, determinant = tau[0] - c1, tau[1] - c2, m11 * m22 - m12 * m12
-        return (
-            self.inertias[0] * (m22 * r1 - m12 * r2) / determinant,
-            self.inertias[1] * (m11 * r2 - m12 * r1) / determinant,
-        )
+        inverse: Vector = np.array([[m22, -m12], [-m12, m11]]) / (m11 * m22 - m12 * m12)
+        return np.reshape(self.inertias, (2, 1)) * inverse
 
 
 def law_of(friction: Friction, inertia: AssistedInertia, decoupled: bool) -> npt.NDArray[np.void]:

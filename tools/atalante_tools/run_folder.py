@@ -23,7 +23,11 @@ class Result:
     """One shape; the keys of `--json` and of summary.json."""
 
     shape: str
-    certified: bool
+    certified: bool  # on the model, at every assistance factor that was walked
+    bound_hip_nm: (
+        float | None
+    )  # real torque the filter is built for, together with that at the knee; None: not certified
+    bound_knee_nm: float | None
     steps: int  # completed right-stance steps
     max_ratio: float  # largest |e| / q_bound from the first completed step on
     inside: float  # share of that time both assisted joints were in the guide
@@ -91,12 +95,13 @@ def _figure(out: Path) -> str:
 
 def results_table(results: Sequence[Result]) -> str:
     """The results for a person."""
-    head = ["shape", "certified", "steps", "max |e|/q_bound", "inside %", "filter active %", "cycles", "x real time",
-            "frames", "CRC errors"]  # fmt: skip
+    head = ["shape", "certified", "bound hip Nm", "bound knee Nm", "steps", "max |e|/q_bound", "inside %", "filter active %",
+            "cycles", "x real time", "frames", "CRC errors"]  # fmt: skip
     rows = [
         [
             r.shape,
             "yes" if r.certified else "NO",
+            *("-" if bound is None else f"{bound:.2f}" for bound in (r.bound_hip_nm, r.bound_knee_nm)),
             str(r.steps),
             *_judged(r),
             str(r.cycles),

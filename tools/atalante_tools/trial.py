@@ -6,8 +6,9 @@ guide shape -> certificate (announced) -> steps -> recording, summary.json, figu
 from __future__ import annotations
 
 import functools
+import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -23,6 +24,7 @@ from atalante_tools.signals import stop_requested
 from atalante_tools.terminal import say, show_json
 
 if TYPE_CHECKING:
+    from atalante_control.certificate import Certificate
     from atalante_control.controller import HangController
     from atalante_control.gait import Gait
     from atalante_control.guide_shapes import GuideShape
@@ -141,7 +143,7 @@ def _walk_all(
         network, robot = atalante_dbc.load(), load_robot()
         exoskeleton, gait, controllers = _controllers(options.subject, robot, shapes)
         stop = stack.enter_context(stop_requested())
-        certified: dict[str, bool] = {}
+        promised: dict[str, Certificate] = {}
         telemetry: TelemetryProcess | None = None
         last = [*controllers][-1]
         for name, controller in controllers.items():
@@ -149,15 +151,17 @@ def _walk_all(
                 apart = _start_robot(target, stack) if name != last else None
                 if telemetry is None:
                     # Promises come when the bus is there to keep them on.
-                    certified = {shape: _announce(guarded, options.xi) for shape, guarded in controllers.items()}
+                    promised = {shape: guarded.certificate(options.xi) for shape, guarded in controllers.items()}
+                    _announce(promised.values())
                     telemetry = _telemetry(target, options, outlet, rig.hal, network, gait.hash32)
                     stack.enter_context(telemetry)
                     stack.callback(_tell_losses, telemetry)
                     _tell_where(telemetry)
-                telemetry.begin_run(name, {"shape": name, "xi": options.xi, "certified": certified[name]})
+                telemetry.begin_run(name, {"shape": name, "xi": options.xi, **_promise(promised[name])})
                 walk = _Walk(rig, controller, telemetry, name, options.steps)
                 statistics = walk.run(stop)
-                results.append(_result(name, certified[name], controller, rig.hal, statistics))
+                factors = controller.statistics.factors or {options.xi}
+                results.append(_result(_weakest(controller, factors), controller, rig.hal, statistics))
                 if as_json:
                     show_json(asdict(results[-1]))
                 walk.conclude()
@@ -240,16 +244,38 @@ def _controllers(
     return exoskeleton, gait, made
 
 
-def _announce(controller: HangController, xi: float) -> bool:
-    """Say before the run what the guide promises."""
-    certificate = controller.certificate(xi)
-    name = certificate.shape
-    if certificate.certified:
-        admitted = ", ".join(f"{j.joint} {j.u_ext_max[0]:+.0f} to {j.u_ext_max[1]:+.0f} Nm" for j in certificate.joints)
-        say(f"{name}: certified at Xi {xi:g}: {certificate.reason}; admits {admitted}")
-    else:
-        say(f"{name}: NOT CERTIFIED at Xi {xi:g}, the guide may be left: {certificate.reason}")
-    return certificate.certified
+def _announce(certificates: Collection[Certificate]) -> None:
+    """Print before the run what each filter is built for, and what is not included in it."""
+    for certificate in certificates:
+        name, xi, bound = certificate.shape, certificate.xi, certificate.joint_torque
+        if bound is None:
+            say(f"{name}: NOT CERTIFIED at Xi {xi:g}, the guide may be left: {certificate.reason}")
+            continue
+        say(
+            f"{name}: certified on the model at Xi {xi:g}: built for {bound.hip:.2f} Nm at the hip and {bound.knee:.2f} Nm at "
+            f"the knee together (worst pose: knee at {math.degrees(bound.worst_knee):.0f} deg); {certificate.reason}"
+        )
+    if any(certificate.certified for certificate in certificates):
+        say(
+            "certified is a margin on the model, no guarantee: joint torque and rate limits, delay, the torque carried over a "
+            "step change and errors of friction and mass are not included"
+        )
+
+
+def _promise(certificate: Certificate) -> dict[str, Any]:
+    """Return `certified` and the bounds, as in `Result`."""
+    bound = certificate.joint_torque
+    return {
+        "certified": certificate.certified,
+        "bound_hip_nm": None if bound is None else bound.hip,
+        "bound_knee_nm": None if bound is None else bound.knee,
+    }
+
+
+def _weakest(controller: HangController, factors: Iterable[float]) -> Certificate:
+    """Return the certificate that promises least of those at the assistance factors."""
+    certificates = [controller.certificate(xi) for xi in factors]
+    return min(certificates, key=lambda c: -1.0 if c.joint_torque is None else c.joint_torque.hip)
 
 
 #: Processor cores for HAL, telemetry and a robot in a process of its own.
@@ -339,11 +365,11 @@ def _tell_losses(telemetry: TelemetryProcess) -> None:
         say("the telemetry process has died: the recording may end early")
 
 
-def _result(name: str, certified: bool, controller: HangController, hal: Hal, statistics: Statistics) -> Result:
+def _result(certificate: Certificate, controller: HangController, hal: Hal, statistics: Statistics) -> Result:
     walked = controller.statistics
     return Result(
-        shape=name,
-        certified=certified,
+        shape=certificate.shape,
+        **_promise(certificate),
         steps=walked.steps,
         max_ratio=round(walked.max_ratio, 4),
         inside=round(walked.inside_fraction, 4),
