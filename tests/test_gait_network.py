@@ -7,12 +7,14 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from atalante_control import gait_network
+from atalante_control.array_file import CHECKSUM, write_arrays
 from atalante_control.gait import SIGN, SWAP, Gait, check_gait, motion
 from atalante_control.gait_network import (
     INPUTS,
@@ -137,16 +139,21 @@ def test_a_saved_network_is_read_back_to_the_bit(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"format": np.array("atalante-gait-network/9")}, "format is"),
-        ({"inputs": np.array(["mass"])}, "with the inputs mass, height, step_length, step_duration"),
-        ({"surprise": np.zeros(3)}, "surprise does not belong there"),
-        ({"bias_1": None}, "bias_1 does not belong there or is missing"),
-        ({"low": np.zeros(3)}, "low and high are 4 numbers"),
-        ({"weights_0": np.full((4, 5), np.nan)}, "weights_0 is an array of finite 64-bit numbers"),
-        ({"weights_0": np.zeros((3, 5))}, "weights_0 has 4 rows"),
-        ({"bias_0": np.zeros(4)}, "weights_0 has 4 rows and as many columns as bias_0"),
-        ({"weights_1": np.zeros((5, 8)), "bias_1": np.zeros(8)}, f"last layer has {OUTPUTS} columns"),
-        ({"bias_1": np.arange(96.0)}, "the angles of a gait continue in the next step"),
+        ({"format": np.array("atalante-gait-network/9")}, "format must be"),
+        ({"inputs": np.array(["mass"])}, "inputs must be mass, height, step_length, step_duration"),
+        ({"format": np.zeros(())}, "format must be text"),
+        ({"surprise": np.zeros(3)}, "'surprise.npy' does not belong there"),
+        ({"bias_1": None}, "bias_1 is missing"),
+        ({"weights_3": np.zeros((4, 5))}, "weights_2 is missing"),
+        ({"low": np.zeros(3)}, "low and high must be 4 numbers"),
+        ({"weights_0": np.full((4, 5), np.nan)}, "weights_0 must be an array of finite 64-bit numbers"),
+        ({"weights_0": np.full((4, 5), np.inf)}, "weights_0 must be an array of finite 64-bit numbers"),
+        ({"weights_0": np.full((4, 5), "1.0")}, "weights_0 must be an array of finite 64-bit numbers"),
+        ({"weights_0": np.zeros((3, 5))}, "weights_0 must have 4 rows"),
+        ({"bias_0": np.zeros(4)}, "weights_0 must have 4 rows and as many columns, 1 to 128, as bias_0"),
+        ({"weights_0": np.zeros((4, 129)), "bias_0": np.zeros(129)}, "weights_0 must have 4 rows"),
+        ({"weights_1": np.zeros((5, 8)), "bias_1": np.zeros(8)}, f"last layer must have {OUTPUTS} columns"),
+        ({"bias_1": np.arange(96.0)}, "the angles of a gait must continue in the next step"),
     ],
 )
 def test_a_file_that_is_no_network_is_refused(
@@ -156,8 +163,10 @@ def test_a_file_that_is_no_network_is_refused(
     save_network(drawn(3), path)
     with np.load(path) as file:
         arrays = {**dict(file), **change}
-    np.savez(path, allow_pickle=False, **{name: array for name, array in arrays.items() if array is not None})
-    with pytest.raises(NetworkError, match=re.escape(str(path)) + ".*" + sentence):
+    write_arrays(path, {name: array for name, array in arrays.items() if array is not None and name != CHECKSUM})
+    with pytest.raises(
+        NetworkError, match=re.escape(str(path)) + ".*" + sentence + ".*make it with `atalante gait fit`$"
+    ):
         load_network(path)
 
 
@@ -165,10 +174,32 @@ def test_a_file_that_is_no_network_is_refused(
 def test_a_broken_file_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "network.npz"
     path.write_bytes(content)
-    with pytest.raises(NetworkError, match=re.escape(f"{path} is no gait network; `atalante gait fit` makes one")):
+    with pytest.raises(NetworkError, match=re.escape(f"{path} is no gait network: ") + ".*`atalante gait fit`$"):
         load_network(path)
     with pytest.raises(NetworkError, match="nowhere"):
         load_network(tmp_path / "nowhere.npz")
+
+
+def test_a_network_that_could_not_be_read_is_not_written(tmp_path: Path) -> None:
+    network = drawn(4)
+    endless = replace(
+        network, layers=(*network.layers[:-1], Layer(network.layers[-1].weights, np.full(OUTPUTS, np.inf)))
+    )
+    with pytest.raises(NetworkError, match=r"network\.npz cannot hold this network: bias_1 must be an array of finite"):
+        save_network(endless, tmp_path / "network.npz")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_network_of_the_package_asks_for_its_installation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "network.npz"
+    path.write_bytes(gait_network.DEFAULT_NETWORK.read_bytes()[:1000])
+    monkeypatch.setattr(gait_network, "DEFAULT_NETWORK", path)
+    with pytest.raises(
+        NetworkError, match=re.escape(f"{path} is no gait network: ") + ".*; install atalante-hal again$"
+    ):
+        load_network()
 
 
 def test_walking_needs_none_of_the_training_stack() -> None:

@@ -8,14 +8,16 @@ well or badly. Speeds jump by what the fit keeps of the impact, under 0.02 rad/s
 
 from __future__ import annotations
 
-import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from atalante_control.array_file import ArrayFileError, read_arrays, write_arrays
 from atalante_control.gait import DEGREE, SIGN, SWAP, Gait
 from atalante_control.stance_dynamics import stance_dynamics
 from atalante_control.subject import Subject
@@ -23,11 +25,14 @@ from atalante_hal.robot import JOINTS, Robot
 
 Vector = npt.NDArray[np.float64]
 
-FORMAT = "atalante-gait-network/1"
+FORMAT = "atalante-gait-network/2"
 DEFAULT_NETWORK = Path(__file__).with_name("gaits") / "network.npz"
 #: What the network is told, in this order, and the unit.
 INPUTS = {"mass": "kg", "height": "m", "step_length": "m", "step_duration": "s"}
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
+LAYERS_MAX = 4
+WIDTH_MAX = 128  # numbers between two layers
+_PERIODICITY_DEFECT = 1e-9  # rad, of the weights of one neuron
 _LEG_TOLERANCE = 1e-3  # m, thigh and shank against Winter's, which the network was fitted to
 
 
@@ -110,58 +115,97 @@ def periodicity() -> Vector:
 
 
 def save_network(network: GaitNetwork, path: Path) -> None:
-    """Write the file `load_network` reads."""
-    arrays = {f"{kind}_{i}": array for i, layer in enumerate(network.layers) for kind, array in layer._asdict().items()}
+    """Write the file `load_network` reads.
+
+    Raises:
+        NetworkError: the network is not one that `load_network` accepts.
+    """
+    layers = {f"{kind}_{i}": array for i, layer in enumerate(network.layers) for kind, array in layer._asdict().items()}
     about = {"format": np.array(FORMAT), "version": np.array(network.version), "inputs": np.array(list(INPUTS))}
-    np.savez_compressed(path, allow_pickle=False, low=network.low, high=network.high, **about, **arrays)
+    arrays = {"low": network.low, "high": network.high, **about, **layers}
+    try:
+        _network(arrays)
+    except ArrayFileError as error:
+        raise NetworkError(f"{path} cannot hold this network: {error}") from error
+    write_arrays(path, arrays)
 
 
 def load_network(path: Path | None = None) -> GaitNetwork:
-    """Read a network strictly; the one that ships with the package unless another is named.
+    """Read a network strictly.
+
+    Args:
+        path: of a file of `save_network`; the one that ships with the package unless given.
 
     Raises:
-        NetworkError: not a file of `save_network`: an unknown or missing array, a wrong shape, a number that is not
-            finite, a last layer whose gaits would not be periodic.
+        NetworkError: the file cannot be read or is damaged, an array is unknown or missing or has a wrong shape, a number
+            is not finite, or the last layer gives gaits that are not periodic. The message names the file and what makes
+            a good one.
     """
+    remedy = "make it with `atalante gait fit`" if path else "install atalante-hal again"
     path = path or DEFAULT_NETWORK
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            arrays = dict(file)
+        return _network(read_arrays(path, _names(LAYERS_MAX), _size_max()))
     except OSError as error:
         raise NetworkError(f"{path} cannot be read: {error.strerror or error}") from error
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise NetworkError(f"{path} is no gait network; `atalante gait fit` makes one") from error
-    if str(arrays.pop("format", "")) != FORMAT or arrays.pop("inputs", np.array([])).tolist() != list(INPUTS):
-        raise NetworkError(f"{path}: format is {FORMAT!r} with the inputs {', '.join(INPUTS)}")
-    version = str(arrays.pop("version", ""))
-    for name, array in arrays.items():
-        if array.dtype != np.float64 or not np.isfinite(array).all():
-            raise NetworkError(f"{path}: {name} is an array of finite 64-bit numbers")
-        array.setflags(write=False)
+    except ArrayFileError as error:
+        raise NetworkError(f"{path} is no gait network: {error}; {remedy}") from error
+
+
+def _names(depth: int) -> list[str]:
+    """Return the names of the arrays of a network with so many layers."""
+    layers = [f"{kind}_{i}" for i in range(depth) for kind in Layer._fields]
+    return ["format", "version", "inputs", "low", "high", *layers]
+
+
+def _size_max() -> int:
+    """Return the bytes that a file of the largest network may have; half a kilobyte an array is for headers and texts."""
+    widths = [len(INPUTS), *(LAYERS_MAX - 1) * [WIDTH_MAX], OUTPUTS]
+    numbers = 2 * len(INPUTS) + sum((rows + 1) * columns for rows, columns in pairwise(widths))
+    return np.dtype(np.float64).itemsize * numbers + 512 * len(_names(LAYERS_MAX))
+
+
+def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
+    """Return the network of arrays by name. Raises `ArrayFileError` unless they are one."""
     depth = sum(name.startswith("weights_") for name in arrays)
-    expected = {"low", "high", *(f"{kind}_{i}" for i in range(depth) for kind in Layer._fields)}
-    if not depth or set(arrays) != expected:
-        wrong = sorted(expected ^ set(arrays)) or ["weights_0"]
-        raise NetworkError(
-            f"{path}: {wrong[0]} does not belong there or is missing; valid are {', '.join(sorted(expected))}"
-        )
+    expected = _names(max(1, depth))
+    if missing := [name for name in expected if name not in arrays]:
+        raise ArrayFileError(f"{missing[0]} is missing; {', '.join(expected)} are required")
+    if unknown := sorted(set(arrays) - set(expected)):
+        raise ArrayFileError(f"{unknown[0]} does not belong there; valid arrays are {', '.join(expected)}")
+    about = {name: arrays[name] for name in ("format", "version", "inputs")}
+    for name, array in about.items():
+        if array.dtype.kind != "U" or array.ndim != (name == "inputs"):
+            raise ArrayFileError(f"{name} must be text, got {array.dtype} of shape {array.shape}")
+    if str(about["format"]) != FORMAT:
+        raise ArrayFileError(f"format must be {FORMAT!r}, got {str(about['format'])!r:.40}")
+    if about["inputs"].tolist() != list(INPUTS):
+        raise ArrayFileError(f"inputs must be {', '.join(INPUTS)}, got {about['inputs'].tolist()!r:.80}")
+    for name, array in arrays.items():
+        if name not in about and (array.dtype != np.float64 or not np.isfinite(array).all()):
+            raise ArrayFileError(f"{name} must be an array of finite 64-bit numbers")
     layers = tuple(Layer(arrays[f"weights_{i}"], arrays[f"bias_{i}"]) for i in range(depth))
     low, high = arrays["low"], arrays["high"]
     width = len(INPUTS)
     if low.shape != (width,) or high.shape != (width,) or not (low < high).all():
-        raise NetworkError(f"{path}: low and high are {width} numbers each, low below high")
+        raise ArrayFileError(f"low and high must be {width} numbers each, low below high")
+    if depth > LAYERS_MAX:
+        raise ArrayFileError(f"a network must have at most {LAYERS_MAX} layers, got {depth}")
     for i, (weights, bias) in enumerate(layers):
-        if weights.ndim != 2 or weights.shape[0] != width or bias.shape != weights.shape[1:]:
-            raise NetworkError(f"{path}: weights_{i} has {width} rows and as many columns as bias_{i} has numbers")
-        width = weights.shape[1]
+        columns = bias.size
+        if weights.shape != (width, columns) or bias.shape != (columns,) or not 1 <= columns <= WIDTH_MAX:
+            raise ArrayFileError(
+                f"weights_{i} must have {width} rows and as many columns, 1 to {WIDTH_MAX}, as bias_{i} has numbers, "
+                f"got shapes {weights.shape} and {bias.shape}"
+            )
+        width = columns
     if width != OUTPUTS:
-        raise NetworkError(f"{path}: the last layer has {OUTPUTS} columns, not {width}")
+        raise ArrayFileError(f"the last layer must have {OUTPUTS} columns, got {width}")
     defect = np.abs(periodicity()[: len(JOINTS)] @ np.vstack([layers[-1].weights, layers[-1].bias]).T).max()
-    if defect > 1e-9:
-        raise NetworkError(
-            f"{path}: the angles of a gait continue in the next step, not with a jump of {defect:.2g} rad"
+    if not defect <= _PERIODICITY_DEFECT:
+        raise ArrayFileError(
+            f"the angles of a gait must continue in the next step, got weights with a jump of {defect:.2g} rad"
         )
-    return GaitNetwork(low, high, layers, version)
+    return GaitNetwork(low, high, layers, str(about["version"]))
 
 
 def _inputs(subject: Subject) -> Vector:

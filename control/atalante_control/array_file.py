@@ -1,0 +1,147 @@
+"""Small .npz files, read strictly: `file -> directory, sizes -> checksums -> headers -> named arrays`.
+
+A file decides nothing about memory. The directory of the zip archive is checked against the names and the size that the
+caller expects before a member is read, and decompression stops at the size that was declared. The CRC-32 of the zip format
+covers the bytes of each member but not which name they belong to, so one more member holds a SHA-256 over all names, types,
+shapes and bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import zipfile
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[Any]
+
+CHECKSUM: Final = "sha256"
+_SUFFIX: Final = ".npy"
+_FLOAT: Final = np.dtype("<f8")
+
+
+class ArrayFileError(ValueError):
+    """The file does not hold the expected arrays; the message is a part of a sentence that does not name the file."""
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
+    """Write a file that `read_arrays` reads back to the bit. Write it completely or not at all.
+
+    Args:
+        path: of the file, replaced if there is one.
+        arrays: 64-bit floats and texts by name.
+    """
+    content = {**arrays, CHECKSUM: np.array(_checksum(arrays))}
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for name, array in content.items():
+            member = io.BytesIO()
+            np.lib.format.write_array(member, np.asarray(array, order="C"), version=(1, 0), allow_pickle=False)
+            # A ZipInfo made from a name has a fixed date: the same arrays give the same file.
+            archive.writestr(zipfile.ZipInfo(name + _SUFFIX), member.getvalue(), zipfile.ZIP_DEFLATED)
+    unfinished = path.with_name(f"{path.name}.new")
+    unfinished.write_bytes(packed.getvalue())
+    unfinished.replace(path)
+
+
+def read_arrays(path: Path, allowed: Collection[str], size_max: int) -> dict[str, Array]:
+    """Read the arrays of a file that `write_arrays` wrote.
+
+    Args:
+        path: of the file.
+        allowed: names of the arrays that the file may hold.
+        size_max: bytes the file may have, and bytes its members may have together after decompression.
+
+    Returns:
+        The arrays by name, read-only, each 64-bit floats or text.
+
+    Raises:
+        OSError: the file cannot be read.
+        ArrayFileError: anything else.
+    """
+    with path.open("rb") as stream:
+        packed = stream.read(size_max + 1)
+    if len(packed) > size_max:
+        raise ArrayFileError(f"it must have at most {size_max} bytes")
+    try:
+        with zipfile.ZipFile(io.BytesIO(packed)) as archive:
+            members = _checked_directory(archive, allowed, size_max)
+            arrays = {name: _array(name, _member(archive, member)) for name, member in members.items()}
+    except ArrayFileError:
+        raise
+    except Exception as error:  # zipfile and numpy raise a dozen types on damaged bytes, struct.error among them
+        raise ArrayFileError(f"its zip archive or an array in it is damaged ({type(error).__name__})") from error
+    expected = _checksum(arrays | {CHECKSUM: None})
+    if (received := str(arrays.pop(CHECKSUM))) != expected:
+        raise ArrayFileError(f"{CHECKSUM} must be that of the other arrays, {expected}, got {received!r:.80}")
+    return arrays
+
+
+def _checked_directory(archive: zipfile.ZipFile, allowed: Collection[str], size_max: int) -> dict[str, zipfile.ZipInfo]:
+    """Return the members by the name of their array, once their names, compression and declared sizes are as expected."""
+    members: dict[str, zipfile.ZipInfo] = {}
+    for member in archive.infolist():
+        name = member.filename.removesuffix(_SUFFIX)
+        if member.filename != name + _SUFFIX or name not in (CHECKSUM, *allowed):
+            raise ArrayFileError(
+                f"{member.filename[:40]!r} does not belong there; valid arrays are {', '.join(sorted(allowed))}"
+            )
+        if name in members:
+            raise ArrayFileError(f"{name} must be there once, got it twice")
+        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise ArrayFileError(f"{name} must be stored or deflated, got compression {member.compress_type}")
+        members[name] = member
+    if CHECKSUM not in members:
+        raise ArrayFileError(f"{CHECKSUM} is missing")
+    if (declared := sum(member.file_size for member in members.values())) > size_max:
+        raise ArrayFileError(f"its arrays must have at most {size_max} bytes together, got {declared} declared")
+    return members
+
+
+def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
+    """Return the bytes of a member, at most as many as declared; zipfile compares their CRC-32."""
+    with archive.open(member) as stream:
+        # With a size: `read()` would decompress everything there is before it looks at what was declared.
+        content = stream.read(member.file_size + 1)
+    if len(content) != member.file_size:
+        raise ArrayFileError(f"{member.filename} must have the {member.file_size} bytes declared, got {len(content)}")
+    return content
+
+
+def _array(name: str, content: bytes) -> Array:
+    """Return the array of a .npy file in memory, read-only, which its bytes fill exactly."""
+    stream = io.BytesIO(content)
+    if (version := np.lib.format.read_magic(stream)) != (1, 0):
+        raise ArrayFileError(f"{name} must have .npy version 1.0, got {version[0]}.{version[1]}")
+    shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(stream)
+    if dtype != _FLOAT and not (dtype.kind == "U" and dtype.isnative):
+        raise ArrayFileError(f"{name} must be an array of 64-bit floats or text, got {dtype}")
+    if fortran_order:
+        raise ArrayFileError(f"{name} must be in C order")
+    data = content[stream.tell() :]
+    # In integers of Python: a product of numpy's could wrap around.
+    size = dtype.itemsize
+    for length in shape:
+        size *= length
+    if len(data) != size:
+        raise ArrayFileError(f"{name} must have the {size} bytes of its shape {shape}, got {len(data)}")
+    if dtype.kind == "U":
+        data.decode("utf-32")  # numpy would notice only when the text is read
+    array = np.frombuffer(data, dtype).reshape(shape).copy()
+    array.setflags(write=False)
+    return array
+
+
+def _checksum(arrays: Mapping[str, Array | None]) -> str:
+    """Return the SHA-256 over name, type, shape and bytes of each array but the checksum, in hexadecimal digits."""
+    digest = hashlib.sha256()
+    for name, array in sorted(arrays.items()):
+        if array is not None:
+            digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+            digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
