@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from atalante_control.gait import (
     Gait,
     GaitError,
     bezier,
+    check_gait,
     derivative,
     load_gait,
     power_basis,
@@ -119,9 +122,9 @@ def test_what_the_library_will_need_is_kept(tmp_path: Path):
         (lambda d: d.update(speed=1), "speed is unknown; valid keys are format, name, duration, joints"),
         (lambda d: d.pop("duration"), "duration is missing"),
         (lambda d: d.update(format="atalante-gait/9"), "format is 'atalante-gait/1'"),
-        (lambda d: d.update(duration="0.8"), "duration is a number of seconds"),
-        (lambda d: d.update(duration=True), "duration is a number of seconds"),
-        (lambda d: d.update(duration=30.0), "duration is a number of seconds from 0.3 to 3.0"),
+        (lambda d: d.update(duration="0.8"), "duration must be a number of seconds"),
+        (lambda d: d.update(duration=True), "duration must be a number of seconds"),
+        (lambda d: d.update(duration=30.0), "duration must be a number of seconds from 0.3 to 3.0"),
         (lambda d: d.update(duration=0.8004), "whole number of milliseconds"),
         (lambda d: d.update(name=""), "name is a text"),
         (lambda d: d.update(parameters={"mass": "75"}), "parameters is an object of finite numbers"),
@@ -174,11 +177,78 @@ def test_loader_refuses_a_jump_at_the_step_change(tmp_path: Path):
 
 def test_loader_refuses_what_the_robot_cannot_do(tmp_path: Path):
     said = refused(tmp_path, shift(document(), "left_SA", (3, 4), -0.2))
-    assert "joints.left_SA leaves its range" in said
-    assert "[-0.279, 0.157] rad" in said
+    assert re.search(
+        r"angle of joints\.left_SA must be -15\.986 to 8\.9954 deg, got -1[67]\.\d+ deg "
+        r"at phase 0\.\d+ of the right-stance step, [01]\.\d+ deg beyond$",
+        said,
+    )
     fast = document()
     fast["duration"] = 0.3  # the same way in less than half the time
-    assert "joints.left_SK leaves its range" in refused(tmp_path, fast)
+    assert "speed of joints.left_SK must be -4 to 4 rad/s, got " in refused(tmp_path, fast)
+
+
+def knees_bent_by(angle: float) -> Gait:
+    points = HANG.coefficients.copy()
+    points[[JOINTS.index("left_SK"), JOINTS.index("right_SK")]] += angle
+    return replace(HANG, coefficients=points)
+
+
+def test_a_limit_that_is_left_between_two_cycles_is_found():
+    knee = JOINTS.index("left_SK")
+    phase = np.linspace(0.0, 1.0, 2_000_001)
+    most, sampled = bezier(HANG.coefficients[[knee]], phase).max(), HANG.tables().q[:, knee].max()
+    assert most - sampled > 1e-7
+    limit = ROBOT.position_max[knee]
+    gait = knees_bent_by(limit - (most + sampled) / 2.0)
+    assert gait.tables().q[:, knee].max() < limit
+    with pytest.raises(
+        GaitError, match=r"angle of joints\.left_SK must be 0 to 110\.01 deg, got 110\.01 deg at phase 0\.\d+"
+    ):
+        check_gait(gait, ROBOT)
+    check_gait(knees_bent_by(limit - most), ROBOT)  # touched, not left
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"coefficients": HANG.coefficients[:11]}, r"joints must be 64-bit floats of shape \(12, 8\), got float64 of shape \(11"),
+        ({"coefficients": HANG.coefficients.astype(np.float32)}, "joints must be 64-bit floats .*, got float32"),
+        ({"coefficients": HANG.coefficients.tolist()}, "joints must be 64-bit floats .*, got list"),
+        ({"coefficients": None}, "joints must be 64-bit floats .*, got NoneType"),
+        ({"feedforward": np.zeros((12, 7))}, "feedforward must be 64-bit floats"),
+        ({"feedforward": np.full((12, 8), np.nan)}, r"feedforward\.left_FH must be finite, got nan as control point 0"),
+        ({"coefficients": np.where(np.arange(8) == 3, np.inf, HANG.coefficients)}, r"joints\.left_FH must be finite, got inf"),
+        ({"coefficients": np.full((12, 8), 1.7e308) * (-1.0) ** np.arange(8)}, "must be .* deg|jumps by"),
+        ({"duration": math.nan}, "duration must be a number of seconds from 0.3 to 3.0, got nan"),
+        ({"duration": 0.2}, "duration must be a number of seconds from 0.3 to 3.0, got 0.2"),
+        ({"duration": 0.8005}, "duration must be a whole number of milliseconds, got 0.8005 s"),
+    ],
+)  # fmt: skip
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_a_malformed_gait_is_refused_whoever_made_it(change: dict[str, Any], said: str):
+    with pytest.raises(GaitError, match=said):
+        check_gait(replace(HANG, **change), ROBOT)
+
+
+def test_a_duration_of_numpy_is_a_duration():
+    check_gait(replace(HANG, duration=np.float64(0.8)), ROBOT)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_feedforward_and_gravity_together_keep_the_torque_limit(sign: float):
+    hip = JOINTS.index("right_SH")
+    most = ROBOT.torque_max[hip]
+    feedforward = np.zeros((12, 8))
+    feedforward[hip] = sign * 0.6 * most
+    gait = replace(HANG, feedforward=feedforward)
+
+    def gravity(share: float) -> Any:
+        return lambda pose: share * most * (np.arange(12) == hip)
+
+    check_gait(gait, ROBOT, gravity=gravity(0.4 * sign))
+    check_gait(gait, ROBOT, gravity=gravity(-0.9 * sign))
+    with pytest.raises(GaitError, match=r"feedforward and gravity of joints\.right_SH must be -219 to 219 Nm, got "):
+        check_gait(gait, ROBOT, gravity=gravity(0.401 * sign))
 
 
 def test_a_written_gait_is_read_back_to_the_bit(tmp_path: Path) -> None:

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from mcap.reader import make_reader
 
+from atalante_control import gait_network
 from atalante_control.controller import HangConfig, HangController
 from atalante_control.gait import HANG_GAIT, load_gait
+from atalante_control.gait_network import load_network, save_network
 from atalante_control.guide_shapes import SHAPES
 from atalante_emulator.body import PyBulletBody
 from atalante_emulator.emulator import Emulator
@@ -299,3 +303,34 @@ def test_a_subject_out_of_range_gets_the_range(arguments, code, says, tmp_path: 
     assert done.exit_code == code, done.stderr
     assert says in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["hang", "demo"])
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (
+            lambda points: points + 2.84,
+            r"GAIT_INVALID: gait '75 kg, 1.75 m, step 0.15 m in 0.9 s': angle of joints\.\w+_SK must be 0 to 110\.01 deg, "
+            r"got \d+\.\d+ deg at phase \d\.\d+ of the \w+-stance step, 8\d deg beyond",
+        ),
+        (lambda points: points + 1e200, "control points of a gait must be at most 6.28 rad, got 1e\\+200 rad"),
+    ],
+    ids=["86 degrees", "no angle"],
+)
+def test_a_network_of_wrong_weights_is_not_walked(
+    command: str, change: Any, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    network = load_network()
+    bias = network.layers[-1].bias.copy().reshape(len(JOINTS), -1)
+    knees = [JOINTS.index("left_SK"), JOINTS.index("right_SK")]
+    bias[knees] = change(bias[knees])
+    last = network.layers[-1]._replace(bias=bias.ravel())
+    path, out = tmp_path / "network.npz", tmp_path / "run"
+    save_network(replace(network, layers=(*network.layers[:-1], last)), path)
+    monkeypatch.setattr(gait_network, "DEFAULT_NETWORK", path)
+    who = ["--mass", "75", "--height", "1.75", "--step-length", "0.15", "--step-duration", "0.9"]
+    done = CliRunner().invoke(cli, [command, "--steps", "1", "--out", str(out), *who])
+    assert done.exit_code == 1, done.stderr
+    assert re.fullmatch(f"atalante: {says}.*\n", done.stderr)
+    assert not out.exists()

@@ -40,6 +40,7 @@ from atalante_control.gait import PERIOD, Gait, bezier
 from atalante_control.gravity import Gravity
 from atalante_control.guide import GuideConfig, GuideFilter
 from atalante_control.guide_shapes import GuideShape
+from atalante_control.hanging import check_hung
 from atalante_control.haptics import intensity
 from atalante_control.idealization import AssistedInertia, Friction, law_of
 from atalante_control.impact import step_over
@@ -127,13 +128,18 @@ class HangController:
         config: HangConfig | None = None,
         exoskeleton: ExoskeletonParameters | None = None,
     ) -> None:
-        """Prepare every table; nothing is allocated in the loop."""
+        """Prepare every table; nothing is allocated in the loop.
+
+        Raises:
+            GaitError: the gait leaves a limit of the robot or cannot be repeated, see `hanging.check_hung`.
+        """
         self.config = config = config or HangConfig()
         exoskeleton = exoskeleton or ExoskeletonParameters()
         articulated = pinocchio_model(urdf(exoskeleton, robot))
+        self._gravity = Gravity(articulated)
+        check_hung(gait, robot, articulated, self._gravity, config.ankle_offset)
         self._cycles = gait.cycles
         self._deadbeat = Deadbeat(gait.duration, config.alpha)
-        self._gravity = Gravity(articulated)
         self._pid = Pid(config.gains)
 
         gaits = {RIGHT: gait, LEFT: gait.mirrored()}

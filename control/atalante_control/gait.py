@@ -11,7 +11,7 @@ import json
 import math
 import sys
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import comb
 from pathlib import Path
@@ -89,7 +89,7 @@ class Gait:
 
     def tables(self) -> StepTables:
         """The step on the cycle grid."""
-        phase = np.arange(self.cycles + 1) / self.cycles
+        phase = _cycle_phases(self)
         uf = np.zeros_like(self.coefficients) if self.feedforward is None else self.feedforward
         tables = (*motion(self.coefficients, self.duration, phase), bezier(uf, phase))
         return StepTables(*map(_read_only, tables))
@@ -172,7 +172,7 @@ def load_gait(path: Path, robot: Robot) -> Gait:
         raise GaitError(f"{path}: solver is an object, not {solver!r}")
     gait = Gait(
         name,
-        _duration(path, document["duration"]),
+        _check_duration(document["duration"], str(path)),
         _control_points(path, "joints", document["joints"]),
         _control_points(path, "feedforward", document["feedforward"]) if "feedforward" in document else None,
         {key: float(value) for key, value in parameters.items()},
@@ -194,47 +194,115 @@ def write_gait(gait: Gait, path: Path) -> None:
     unfinished.replace(path)
 
 
-def check_gait(gait: Gait, robot: Robot, where: str = "gait") -> None:
-    """Refuse a gait that jumps at the step change or leaves the robot's limits.
+def check_gait(
+    gait: Gait, robot: Robot, where: str = "gait", gravity: Callable[[Vector], Vector] | None = None
+) -> None:
+    """Refuse a gait that is malformed, jumps at the step change or leaves the robot's limits.
+
+    Angles, speeds and torques are compared with their limits in every cycle and at every turning point between cycles.
+
+    Args:
+        gait: a right-stance step that repeats; its mirror image is checked too.
+        robot: with the limits.
+        where: first words of the message, for example the name of the file.
+        gravity: torque that the controller adds to the feedforward at a pose, (12,) [rad] to (12,) [Nm]; the torque limits
+            are those of the sum. Without it they are those of the feedforward alone.
 
     Raises:
-        GaitError: names the joint, what it does and what is allowed.
+        GaitError: names the joint, what is allowed, what was found and at which phase.
     """
-    right, left = gait.tables(), gait.mirrored().tables()
+    _check_form(gait, where)
+    steps = {"right": gait, "left": gait.mirrored()}
+    right, left = (step.tables() for step in steps.values())
     for end, start, limit, unit in (
         (right.q[-1], left.q[0], POSITION_JUMP, "rad"),
         (right.qd[-1], left.qd[0], VELOCITY_JUMP, "rad/s"),
     ):
         jump = np.abs(end - start)
         worst = int(jump.argmax())
-        if jump[worst] > limit:
+        if not jump[worst] <= limit:
             raise GaitError(
                 f"{where}: joints.{JOINTS[worst]} jumps by {jump[worst]:.4g} {unit} at the step change; "
                 f"at most {limit:.4g} {unit} is allowed against the mirrored start"
             )
     # The mirrored step has mirrored limits: checking both steps also covers limits that are not symmetric.
-    for tables in (right, left):
-        for values, low, high, unit in (
-            (tables.q, robot.position_min, robot.position_max, "rad"),
-            (tables.qd, -robot.velocity_max, robot.velocity_max, "rad/s"),
-            (tables.uf, -robot.torque_max, robot.torque_max, "Nm"),
-        ):
-            beyond = np.maximum(values - high, low - values).max(axis=0)
-            worst = int(beyond.argmax())
-            if beyond[worst] > ROUNDING:
-                raise GaitError(
-                    f"{where}: joints.{JOINTS[worst]} leaves its range by {beyond[worst]:.4g} {unit}; "
-                    f"it is [{low[worst]:.4g}, {high[worst]:.4g}] {unit}"
-                )
+    for stance, step in steps.items():
+        for phases in (_cycle_phases, _turning_points):
+            _check_limits(step, phases(step), robot, gravity, where, stance)
 
 
-def _duration(path: Path, value: Any) -> float:
+def _check_form(gait: Gait, where: str) -> None:
+    """Refuse arrays of another shape or type, numbers that are not finite and durations off the cycle grid."""
+    shape = len(JOINTS), DEGREE + 1
+    for key, array in (("joints", gait.coefficients), ("feedforward", gait.feedforward)):
+        if array is None and key == "feedforward":
+            continue
+        if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
+            got = f"{array.dtype} of shape {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+            raise GaitError(f"{where}: {key} must be 64-bit floats of shape {shape}, got {got}")
+        wrong = np.argwhere(~np.isfinite(array))
+        if len(wrong):
+            joint, point = wrong[0]
+            raise GaitError(
+                f"{where}: {key}.{JOINTS[joint]} must be finite, got {array[joint, point]} as control point {point}"
+            )
+    _check_duration(
+        float(gait.duration) if isinstance(gait.duration, float) else gait.duration, where
+    )  # numpy's is one
+
+
+def _check_limits(
+    gait: Gait, phase: Vector, robot: Robot, gravity: Callable[[Vector], Vector] | None, where: str, stance: str
+) -> None:
+    """Refuse a step with an angle, speed or torque beyond its limit at one of the phases (n,)."""
+    q, qd, _ = motion(gait.coefficients, gait.duration, phase)
+    torque = np.zeros_like(q) if gait.feedforward is None else bezier(gait.feedforward, phase)
+    if gravity is not None:
+        torque = torque + np.array([gravity(pose) for pose in q]).reshape(q.shape)
+    source = "feedforward" if gravity is None else "feedforward and gravity"
+    for quantity, values, low, high, unit, scale in (
+        ("angle", q, robot.position_min, robot.position_max, "deg", math.degrees(1.0)),
+        ("speed", qd, -robot.velocity_max, robot.velocity_max, "rad/s", 1.0),
+        (source, torque, -robot.torque_max, robot.torque_max, "Nm", 1.0),
+    ):
+        beyond = np.maximum(values - high, low - values)
+        if not beyond.max(initial=0.0) <= ROUNDING:
+            row, joint = np.unravel_index(int(beyond.argmax()), beyond.shape)
+            found, least, most = (scale * x for x in (values[row, joint], low[joint], high[joint]))
+            raise GaitError(
+                f"{where}: {quantity} of joints.{JOINTS[joint]} must be {least:.5g} to {most:.5g} {unit}, got "
+                f"{found:.5g} {unit} at phase {phase[row]:.3f} of the {stance}-stance step, "
+                f"{scale * beyond[row, joint]:.2g} {unit} beyond"
+            )
+
+
+def _cycle_phases(gait: Gait) -> Vector:
+    """Return the phases of the cycles of a step, both ends included. Shape (N + 1,)."""
+    return np.arange(gait.cycles + 1) / gait.cycles
+
+
+def _turning_points(gait: Gait) -> Vector:
+    """Return the phases in [0, 1] at which the angle, the speed or the feedforward of a joint is largest or smallest.
+
+    A pair of roots that rounding made complex gives its real part, which is a phase like any other. Shape (n,).
+    """
+    slope = derivative(gait.coefficients)
+    slopes = [slope, derivative(slope)]
+    if gait.feedforward is not None:
+        slopes.append(derivative(gait.feedforward))
+    roots = [np.roots(row[::-1]).real for rows in slopes for row in power_basis(rows)]
+    phases = np.concatenate(roots)
+    return phases[(phases >= 0.0) & (phases <= 1.0)]
+
+
+def _check_duration(value: Any, where: str) -> float:
+    """Return a duration [s]. Raises `GaitError` unless it is a whole number of cycles in `DURATION_RANGE`."""
     low, high = DURATION_RANGE
     if not (_is_number(value) and low <= value <= high):
-        raise GaitError(f"{path}: duration is a number of seconds from {low} to {high}, not {value!r}")
+        raise GaitError(f"{where}: duration must be a number of seconds from {low} to {high}, got {value!r}")
     cycles = value / PERIOD
     if abs(cycles - round(cycles)) > 1e-6:
-        raise GaitError(f"{path}: duration is a whole number of milliseconds, not {value!r} s")
+        raise GaitError(f"{where}: duration must be a whole number of milliseconds, got {value!r} s")
     return float(value)
 
 

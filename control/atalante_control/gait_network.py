@@ -33,6 +33,7 @@ OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # numbers between two layers
 _PERIODICITY_DEFECT = 1e-9  # rad, of the weights of one neuron
+_ANGLE_MAX = 2.0 * np.pi  # rad, of a control point
 _LEG_TOLERANCE = 1e-3  # m, thigh and shank against Winter's, which the network was fitted to
 
 
@@ -68,10 +69,18 @@ class GaitNetwork:
         """The subject's gait, its feedforward by inverse dynamics of the trajectory it puts out.
 
         Raises:
-            NetworkError: a parameter outside the range of the network, or legs that are not Winter's.
+            NetworkError: a parameter outside the range of the network, legs that are not Winter's, or weights that give
+                angles of which no torque can be computed. Limits of the robot are not checked here, see `check_gait`.
         """
         self.check(subject)
-        coefficients = self.coefficients(_inputs(subject))
+        with np.errstate(over="ignore", invalid="ignore"):
+            coefficients = self.coefficients(_inputs(subject))
+        largest = np.abs(coefficients).max()
+        if not largest <= _ANGLE_MAX:
+            raise NetworkError(
+                f"control points of a gait must be at most {_ANGLE_MAX:.3g} rad, got {largest:.3g} rad for {subject}: "
+                "fit the network again with `atalante gait fit`"
+            )
         coefficients.setflags(write=False)
         feedforward = stance_dynamics(robot, subject.patient).feedforward(coefficients, subject.step_duration)
         made = {"method": "gait network", "version": self.version}

@@ -9,18 +9,53 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 import pinocchio
 
-from atalante_control.gait import Gait, control_points, motion
-from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
-from atalante_hal.robot import Robot
+from atalante_control.gait import Gait, check_gait, control_points, motion
+from atalante_control.gravity import Gravity
+from atalante_control.model import ArticulatedModel, ExoskeletonParameters, pinocchio_model, urdf
+from atalante_hal.robot import JOINTS, Robot
+
+Vector = npt.NDArray[np.float64]
 
 _SAMPLES = 33  # phases the eight control points are fitted at
+_SAGITTAL_ANKLES = np.array([float(joint.endswith("_SA")) for joint in JOINTS])
+_LEVEL = (1.0, 0.0, 0.0, 0.0)  # attitude of the pelvis, unit quaternion wxyz
 
 
 def hung(gait: Gait, exoskeleton: ExoskeletonParameters, robot: Robot) -> Gait:
     """The gait with u_f of the hanging empty exoskeleton: the torques of its inertia alone, since u_g is added to it."""
-    model, into, out_of = pinocchio_model(urdf(exoskeleton, robot))
+    return replace(gait, feedforward=_feedforward(gait, pinocchio_model(urdf(exoskeleton, robot))))
+
+
+def check_hung(gait: Gait, robot: Robot, articulated: ArticulatedModel, gravity: Gravity, ankle_offset: float) -> None:
+    """Refuse a gait that the hanging exoskeleton must not or cannot walk.
+
+    The torque limits hold for the sum of u_g, pelvis level, and u_f; where the gait has no u_f, it is that of `hung`.
+
+    Args:
+        gait: a right-stance step that repeats, from whichever source.
+        robot: with the limits.
+        articulated: the empty exoskeleton, pelvis fixed.
+        gravity: of the same exoskeleton.
+        ankle_offset: added to both sagittal ankles [rad].
+
+    Raises:
+        GaitError: see `check_gait`.
+    """
+    where = f"gait {gait.name!r}"
+    check_gait(gait, robot, where)
+    # A constant added to all control points of a polynomial is added to the polynomial.
+    coefficients = gait.coefficients + ankle_offset * _SAGITTAL_ANKLES[:, None]
+    feedforward = _feedforward(gait, articulated) if gait.feedforward is None else gait.feedforward
+    walked = replace(gait, coefficients=coefficients, feedforward=feedforward)
+    check_gait(walked, robot, where, lambda pose: gravity.torque(pose, _LEVEL).copy())
+
+
+def _feedforward(gait: Gait, articulated: ArticulatedModel) -> Vector:
+    """Return u_f of the hanging empty exoskeleton as control points, (12, 8) [Nm]."""
+    model, into, out_of = articulated
     data = model.createData()
     phase = np.linspace(0.0, 1.0, _SAMPLES)
     torque = np.zeros((_SAMPLES, model.nv))
@@ -30,4 +65,4 @@ def hung(gait: Gait, exoskeleton: ExoskeletonParameters, robot: Robot) -> Gait:
     ):
         q[into], v[out_of], a[out_of] = position, velocity, acceleration
         torque[row] = pinocchio.rnea(model, data, q, v, a) - pinocchio.computeGeneralizedGravity(model, data, q)
-    return replace(gait, feedforward=control_points(phase, torque[:, out_of]))
+    return control_points(phase, torque[:, out_of])

@@ -239,8 +239,9 @@ def _controllers(
         exoskeleton = exoskeleton.fitted(subject.patient)
         gait = hung(load_network().gait(subject, robot), exoskeleton, robot)
         config = HangConfig(feedforward=True)
-        say(f"gait of the network: {subject}; nobody is in the exoskeleton")
     made = {name: HangController(robot, gait, shape, config, exoskeleton) for name, shape in shapes.items()}
+    if subject is not None:  # the gait was accepted
+        say(f"gait of the network: {subject}; nobody is in the exoskeleton")
     return exoskeleton, gait, made
 
 
