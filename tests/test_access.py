@@ -9,7 +9,7 @@ import socket
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,10 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
+from mcap.reader import make_reader
 
 from atalante_hal.telemetry.access import Access, AccessError, load_telemetry_file
-from atalante_hal.telemetry.process import TelemetryConfig, TelemetryError
+from atalante_hal.telemetry.process import TelemetryConfig, TelemetryError, TelemetryProcess
 from atalante_hal.telemetry.publisher import Publisher
 from atalante_tools.cli import cli
 
@@ -234,6 +235,63 @@ class TestTelemetryFile:
         assert result.exit_code == 1
         assert result.stderr.startswith(f"atalante: CONFIG_INVALID: {folder / 'telemetry.toml'}: lisen is unknown")
         assert not (folder / "run").exists()
+
+
+class TestCommand:
+    """`atalante hang --telemetry FILE` from start to end, with each kind of file that the README has."""
+
+    @pytest.mark.parametrize(
+        "keys",
+        [
+            (),
+            ("users",),
+            ("certificate", "private_key"),
+            ("certificate", "private_key", "client_ca", "users"),
+        ],
+        ids=["plain", "users", "tls", "everything"],
+    )
+    def test_a_run_ends_well_and_a_subscriber_gets_its_messages(
+        self, keys: tuple[str, ...], authority: Authority, users: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        folder, transport = users.parent, {}
+        authority.issue("robot")
+        if "certificate" in keys:
+            transport |= trusting(authority, authority.issue("desk") if "client_ca" in keys else None)
+        if "users" in keys:
+            transport |= user("lab", "secret")
+        names = {"certificate": "robot.pem", "private_key": "robot.key", "client_ca": "lab.pem", "users": "users.txt"}
+        listen = endpoint("tls" if "certificate" in keys else "tcp")
+        lines = [f'listen = "{listen}"', *(f'{key} = "{names[key]}"' for key in keys)]
+        (folder / "telemetry.toml").write_text("\n".join(lines))
+        got: list[zenoh.Sample] = []
+        begin_run = TelemetryProcess.begin_run
+
+        with ExitStack() as stack:
+
+            def subscribe_first(telemetry: TelemetryProcess, *arguments: Any) -> None:
+                assert telemetry.endpoint == listen
+                session = stack.enter_context(client(listen, transport))
+                stack.enter_context(session.declare_subscriber("atalante/*/joint_states", got.append))
+                list(session.get("atalante/exo/none", timeout=1.0))  # the subscription arrives before the answer
+                begin_run(telemetry, *arguments)
+
+            monkeypatch.setattr(TelemetryProcess, "begin_run", subscribe_first)
+            out = folder / "run"
+            command = ["hang", "--steps", "2", "--telemetry", str(folder / "telemetry.toml"), "--out", str(out)]
+            result = CliRunner().invoke(cli, command)
+            assert (result.exit_code, result.exception) == (0, None), result.stderr
+            for _ in range(TRIES):
+                if got:
+                    break
+                time.sleep(0.05)
+        assert str(got[0].encoding) == "application/protobuf;atalante.v1.JointStates"
+        summary = json.loads((out / "summary.json").read_text())
+        assert summary["telemetry"] == str(folder / "telemetry.toml")
+        assert [shape["steps"] for shape in summary["shapes"]] == [2]
+        assert (out / "guide_shapes.png").read_bytes().startswith(b"\x89PNG")
+        with (out / "recording.mcap").open("rb") as file:
+            counts = make_reader(file).get_summary().statistics.channel_message_counts
+        assert min(counts.values()) > 0
 
 
 def test_a_configuration_made_in_code_is_checked_as_well() -> None:

@@ -111,8 +111,14 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
             if results:
                 if not as_json:
                     click.echo(results_table(results))
-                asked = {key: value for key, value in asdict(options).items() if key not in ("out", "can_log")}
-                leave(options.out, asked | {"version": version("atalante-hal")}, results)
+                leave(options.out, _asked(options), results)
+
+
+def _asked(options: Options) -> dict[str, Any]:
+    """Return what the user asked for as JSON types: a path as text, without the files that the run itself writes."""
+    asked = {key: value for key, value in asdict(options).items() if key not in ("out", "can_log")}
+    telemetry = None if options.telemetry is None else str(options.telemetry)
+    return {**asked, "telemetry": telemetry, "version": version("atalante-hal")}
 
 
 def _require_format(can_log: Path) -> None:
