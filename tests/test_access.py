@@ -149,6 +149,15 @@ class TestLoopback:
             spy = trusting(authority, stranger.issue("spy"))
             assert not anybody_hears(publisher, (spy, None), (trusting(authority), None))
 
+    def test_quic_lets_in_who_has_certificate_and_password_and_nobody_else(
+        self, authority: Authority, users: Path
+    ) -> None:
+        access = Access(*authority.issue("robot"), client_ca=authority.certificate, users=users)
+        desk, lab = trusting(authority, authority.issue("desk")), user("lab", "secret")
+        with Publisher("exo", STREAMS, endpoint("quic"), access) as publisher:
+            assert hears(publisher, desk | lab)
+            assert not anybody_hears(publisher, (desk, None), (trusting(authority) | lab, None))
+
     def test_users_without_tls(self, users: Path) -> None:
         with Publisher("exo", STREAMS, endpoint("tcp"), Access(users=users)) as publisher:
             assert hears(publisher, user("lab", "secret"))
@@ -203,11 +212,7 @@ class TestTelemetryFile:
             ('certificate = "robot.pem"', "certificate and private_key belong together"),
             ('private_key = "robot.key"', "certificate and private_key belong together"),
             ('client_ca = "lab.pem"', "client_ca asks subscribers for certificates"),
-            ('listen = "tls/127.0.0.1:7447"', "listen is tcp/127.0.0.1:7447, not tls/127.0.0.1:7447"),
-            (
-                'listen = "tcp/127.0.0.1:7447"\ncertificate = "robot.pem"\nprivate_key = "robot.key"',
-                "listen is tls/127.0.0.1:7447, not tcp/127.0.0.1:7447",
-            ),
+            ('connect = "tcp/127.0.0.1:7447"', "connect is unknown; valid keys are robot, listen, certificate"),
             ('certificate = "robot.pem"\nprivate_key = "open.key"', "open.key can be read by others; type: chmod 600"),
             ('users = "open.key"', "open.key can be read by others"),
             ('users = "empty"', "has a line name:password for each user"),
@@ -221,6 +226,68 @@ class TestTelemetryFile:
             self.read(folder, text)
         assert said in str(refused.value)
         assert "\n" not in str(refused.value)
+
+    @pytest.mark.parametrize(
+        "listen",
+        [
+            "tcp/127.0.0.1:7447",
+            "udp/127.0.0.1:7447",
+            "ws/127.0.0.1:7447",
+            "unixsock-stream/robot.sock",
+            "serial//dev/ttyS0",
+            "vsock/-1:7447",
+            "TLS/127.0.0.1:7447",
+            " tls/127.0.0.1:7447",
+            "tls/127.0.0.1:7447 ",
+            "tls /127.0.0.1:7447",
+            "tls/127.0.0.1:7447\\n",
+            "tls/127.0.0.1:7447,udp/127.0.0.1:7448",
+            "tls/127.0.0.1:7447;udp/127.0.0.1:7448",
+            "tls/127.0.0.1:7447#enable_mtls=false",
+            "tls/127.0.0.1:7447?rel=0",
+            "tls/udp/127.0.0.1:7447",
+            "tls/127.0.0.1:0",
+            "tls/127.0.0.1:65536",
+            "tls/127.0.0.1",
+            "tls/:7447",
+            "tls",
+            "127.0.0.1:7447",
+        ],
+    )
+    def test_with_a_certificate_only_plain_tls_and_quic_endpoints_are_accepted(self, folder: Path, listen: str) -> None:
+        with pytest.raises(AccessError) as refused:
+            self.read(folder, f'listen = "{listen}"\ncertificate = "robot.pem"\nprivate_key = "robot.key"')
+        valid = "listen must be tls/HOST:PORT or quic/HOST:PORT because a certificate is given, got "
+        assert valid in str(refused.value)
+        assert "\n" not in str(refused.value)
+
+    @pytest.mark.parametrize(
+        ("listen", "valid"),
+        [
+            ("tls/127.0.0.1:7447", "tcp/HOST:PORT unless certificate and private_key are given"),
+            ("quic/127.0.0.1:7447", "tcp/HOST:PORT unless certificate and private_key are given"),
+            ("udp/127.0.0.1:7447", "tcp/HOST:PORT, got 'udp/"),
+            ("udp/224.0.0.224:7446", "tcp/HOST:PORT, got 'udp/"),
+            ("ws/127.0.0.1:7447", "tcp/HOST:PORT, got 'ws/"),
+            ("TCP/127.0.0.1:7447", "tcp/HOST:PORT, got 'TCP/"),
+            ("tcp/127.0.0.1:7447#iface=eth0", "tcp/HOST:PORT, got "),
+            ("nonsense", "tcp/HOST:PORT, got 'nonsense'"),
+        ],
+    )
+    def test_without_a_certificate_only_plain_tcp_endpoints_are_accepted(
+        self, folder: Path, listen: str, valid: str
+    ) -> None:
+        with pytest.raises(AccessError, match=f"listen must be {valid}"):
+            self.read(folder, f'listen = "{listen}"')
+
+    @pytest.mark.parametrize("host", ["127.0.0.1", "[::1]", "robot-7.lab.example"])
+    @pytest.mark.parametrize(("protocols", "files"), [(("tcp",), ()), (("tls", "quic"), ("robot.pem", "robot.key"))])
+    def test_addresses_and_names_of_hosts_are_accepted(
+        self, folder: Path, host: str, protocols: tuple[str, ...], files: tuple[str, ...]
+    ) -> None:
+        access = Access(*(folder / name for name in files))
+        for protocol in protocols:
+            access.check_endpoint(f"{protocol}/{host}:7447")
 
     @pytest.mark.parametrize("content", ["lab", "lab:", ":secret", "lab:secret\n\nother:x"])
     def test_refuses_users_that_are_none(self, users: Path, content: str) -> None:
@@ -295,5 +362,11 @@ class TestCommand:
 
 
 def test_a_configuration_made_in_code_is_checked_as_well() -> None:
-    with pytest.raises(TelemetryError, match="it needs certificate and private_key"):
+    with pytest.raises(TelemetryError, match="unless certificate and private_key are given"):
         TelemetryConfig(listen="tls/127.0.0.1:7447")
+
+
+def test_a_configuration_made_in_code_is_protected_by_its_certificate(authority: Authority) -> None:
+    certificate, key = authority.issue("robot")
+    with pytest.raises(TelemetryError, match="listen must be tls/HOST:PORT or quic/HOST:PORT"):
+        TelemetryConfig(listen="udp/127.0.0.1:7447", certificate=certificate, private_key=key)

@@ -6,6 +6,7 @@ default loopback is this machine. What a subscriber may do is the same for all: 
 
 from __future__ import annotations
 
+import re
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,13 @@ from typing import Any
 
 #: Keys of a telemetry file; the last four are files, relative to it.
 _TEXTS, _FILES = ("robot", "listen"), ("certificate", "private_key", "client_ca", "users")
+
+
+#: Protocols of an endpoint that a certificate protects, and of one without; the first of each is the default.
+_PROTECTED, _UNPROTECTED = ("tls", "quic"), ("tcp",)
+#: One endpoint: protocol, host, port. A Zenoh endpoint may go on with `?` and `#`, which override TLS settings of the files.
+_ENDPOINT = re.compile(r"(?P<protocol>[^/]+)/(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):(?P<port>[0-9]{1,5})", re.ASCII)
+_LARGEST_PORT = 65535
 
 
 class AccessError(RuntimeError):
@@ -49,20 +57,28 @@ class Access:
                 raise AccessError(f"users {self.users} has a line name:password for each user, and nothing else")
 
     @property
-    def protocol(self) -> str:
-        """What the endpoint speaks, first part of a Zenoh locator."""
-        return "tls" if self.certificate is not None else "tcp"
+    def protocols(self) -> tuple[str, ...]:
+        """Protocols that the endpoint may speak, first parts of a Zenoh locator; the first is the default."""
+        return _PROTECTED if self.certificate is not None else _UNPROTECTED
 
     def check_endpoint(self, listen: str) -> None:
-        """Refuse an endpoint that does not speak the protocol the files are for.
+        """Accept one endpoint that speaks a protocol the files protect, and nothing else.
+
+        Args:
+            listen: Zenoh endpoint, PROTOCOL/HOST:PORT.
 
         Raises:
-            AccessError: with the endpoint that is meant.
+            AccessError: it is another protocol, not one plain endpoint, or its port is 0 or too large.
         """
-        protocol, _, address = listen.partition("/")
-        if {protocol, self.protocol} == {"tls", "tcp"}:
-            reason = "a certificate is given" if self.protocol == "tls" else "it needs certificate and private_key"
-            raise AccessError(f"listen is {self.protocol}/{address}, not {listen}: {reason}")
+        found = _ENDPOINT.fullmatch(listen)
+        if found and found["protocol"] in self.protocols and 0 < int(found["port"]) <= _LARGEST_PORT:
+            return
+        valid = " or ".join(f"{protocol}/HOST:PORT" for protocol in self.protocols)
+        if self.certificate is not None:
+            valid += " because a certificate is given"
+        elif found and found["protocol"] in _PROTECTED:
+            valid += " unless certificate and private_key are given"
+        raise AccessError(f"listen must be {valid}, got {listen!r}")
 
     def transport(self) -> dict[str, Any]:
         """The part of Zenoh's configuration under `transport`."""
@@ -96,7 +112,9 @@ def load_telemetry_file(path: Path) -> dict[str, Any]:
             raise AccessError(f"{path}: {key} is a text that is not empty, not {value!r}")
     files = {key: path.parent / document[key] for key in _FILES if key in document}
     try:
-        Access(**files).check_endpoint(document.get("listen", Access(**files).protocol + "/"))
+        access = Access(**files)
+        if "listen" in document:
+            access.check_endpoint(document["listen"])
     except AccessError as error:
         raise AccessError(f"{path}: {error}") from error
     return {**{key: document[key] for key in _TEXTS if key in document}, **files}

@@ -162,7 +162,7 @@ def _open(robot: str, listen: str | None, access: Access) -> tuple[zenoh.Session
             ) from error
     refused = ""
     for port in range(DEFAULT_PORT, DEFAULT_PORT + PORTS_TRIED):
-        endpoint = f"{access.protocol}/{DEFAULT_HOST}:{port}"
+        endpoint = f"{access.protocols[0]}/{DEFAULT_HOST}:{port}"
         try:
             return zenoh.open(_parsed(robot, endpoint, access)), endpoint
         except zenoh.ZError as error:
