@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from atalante_hal.telemetry.process import Recording
 from atalante_tools.outcome import Failed
 from atalante_tools.run_folder import Result, leave, run_folder
 
@@ -47,10 +48,12 @@ def test_of_half_a_recording_there_is_a_summary_and_no_figure(
     recording: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "recording.mcap").write_bytes(recording)
-    leave(tmp_path, {"steps": 2}, [WALKED])
+    leave(tmp_path, {"steps": 2}, [WALKED], Recording(("recording.mcap", "recording-1.mcap"), False, 7))
     said = capsys.readouterr().err.splitlines()
     assert said[0].startswith("no figure: recording.mcap is not whole")
-    assert said[1] == f"in {tmp_path}: recording.mcap, summary.json"
+    assert said[1] == f"in {tmp_path}: recording.mcap, recording-1.mcap, summary.json"
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert (summary["steps"], summary["shapes"][0]["shape"]) == (2, "pinched")
+    files = ["recording.mcap", "recording-1.mcap"]
+    assert summary["recording"] == {"files": files, "complete": False, "missing_cycles": 7}
     assert not (tmp_path / "guide_shapes.png").exists()

@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import re
 import signal
+import socket
 import subprocess
 import sys
+import time
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,12 +32,13 @@ from atalante_hal.frame import Frames
 from atalante_hal.hal import Hal
 from atalante_hal.loop import LockStep, run
 from atalante_hal.robot import JOINTS, load_robot
-from atalante_hal.telemetry.process import TelemetrySummary
+from atalante_hal.telemetry.process import Recording, TelemetryProcess, TelemetrySummary
 from atalante_hal.telemetry.schema import message_class
 from atalante_hal.types import State
 from atalante_tools import trial
 from atalante_tools.cli import cli
 from atalante_tools.run_folder import Result, results_table
+from tests.process.test_telemetry_faults import cycles_without_index
 
 ATALANTE = str(Path(sys.executable).with_name("atalante"))
 KEYS = [
@@ -66,8 +70,9 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[subprocess.Completed
     return done, out
 
 
-def test_stdout_is_one_object_a_shape(demo):
-    results = [json.loads(line) for line in demo[0].stdout.splitlines()]
+def test_stdout_is_one_object_a_shape_and_one_of_the_recording(demo):
+    *results, recording = [json.loads(line) for line in demo[0].stdout.splitlines()]
+    assert recording == {"recording": {"files": ["recording.mcap"], "complete": True, "missing_cycles": 0}}
     assert [list(result) for result in results] == [KEYS, KEYS]
     pinched, snap = results
     assert (pinched["shape"], pinched["certified"], snap["shape"], snap["certified"]) == (
@@ -125,6 +130,7 @@ def test_the_run_folder(demo):
     summary = json.loads((out / "summary.json").read_text())
     assert [list(shape) for shape in summary["shapes"]] == [KEYS, KEYS]
     assert (summary["steps"], summary["xi"], summary["seed"]) == (2, 0.5, 3)
+    assert summary["recording"] == {"files": ["recording.mcap"], "complete": True, "missing_cycles": 0}
     assert (out / "guide_shapes.png").read_bytes().startswith(b"\x89PNG")
     cycles = sum(shape["cycles"] for shape in summary["shapes"])
     # 30 steps of six shapes are 300,000 cycles; the default folder stays under 30 MB.
@@ -229,13 +235,16 @@ def test_bad_input_gets_one_sentence_that_says_what_is_valid(arguments, code, sa
     assert not out.exists()
 
 
+RECORDING = Recording(("recording.mcap",), False, 70)
+
+
 class Child:
     """A telemetry process at its end."""
 
     notices = ("nothing is published: no port",)
 
     def __init__(self, *summary: str, complete: bool) -> None:
-        self._summary = TelemetrySummary(complete=complete, notices=summary)
+        self._summary = TelemetrySummary(complete=complete, notices=summary, recording=RECORDING)
 
     def close(self) -> TelemetrySummary:
         return self._summary
@@ -251,8 +260,65 @@ class Child:
     ],
 )
 def test_what_was_not_recorded_is_told_once(notices, complete, said, capsys):
-    trial._tell_losses(Child(*notices, complete=complete))
+    walked = trial.Walked()
+    trial._close(Child(*notices, complete=complete), walked)
+    assert walked.recording is RECORDING
     assert capsys.readouterr().err == said
+
+
+def kill_and_take_the_port(telemetry: TelemetryProcess) -> socket.socket:
+    """Kill the telemetry process when it has handled what was written, and listen where it listened."""
+    child, squatter = telemetry._child, socket.socket()
+    assert child is not None
+    while telemetry.records.taken != telemetry.records.written:
+        time.sleep(0.001)
+    telemetry.event(0, "MARK", "it is taken when the records before it are handled")
+    while telemetry.events.taken != telemetry.events.written:
+        time.sleep(0.001)
+    child.kill()
+    child.wait()
+    host, port = telemetry.endpoint.partition("/")[2].split(":")
+    squatter.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    squatter.bind((host, int(port)))
+    squatter.listen()
+    return squatter
+
+
+def test_a_recording_with_a_gap_fails_the_run_and_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    tend, calls, endpoints = TelemetryProcess.tend, [0], []
+
+    with ExitStack() as stack:
+
+        def kill_once(telemetry: TelemetryProcess) -> None:
+            calls[0] += 1
+            if calls[0] == 5:
+                endpoints.append(telemetry.endpoint)
+                stack.enter_context(kill_and_take_the_port(telemetry))
+            tend(telemetry)
+            if calls[0] == 5:
+                telemetry._restarting.join()
+                endpoints.append(telemetry.endpoint)
+
+        monkeypatch.setattr(TelemetryProcess, "tend", kill_once)
+        command = ["hang", "--steps", "2", "--record-rate", "1000", "--json", "--out", str(tmp_path)]
+        done = CliRunner().invoke(cli, command)
+    assert done.exit_code == 1, done.stderr
+    walked, recording = (json.loads(line) for line in done.stdout.splitlines())
+    first, second = (cycles_without_index(tmp_path / name) for name in ("recording.mcap", "recording-1.mcap"))
+    assert first == list(range(1, 1 + len(first)))
+    assert second == list(range(walked["cycles"] + 1 - len(second), walked["cycles"] + 1))
+    missing = walked["cycles"] - len(first) - len(second)
+    assert missing > 0
+    files = ["recording.mcap", "recording-1.mcap"]
+    assert recording == {"recording": {"files": files, "complete": False, "missing_cycles": missing}}
+    assert json.loads((tmp_path / "summary.json").read_text())["recording"] == recording["recording"]
+    old, new = endpoints
+    assert old != new
+    assert done.stderr.index(f"telemetry on Zenoh at {old}") < done.stderr.index(f"telemetry on Zenoh at {new}")
+    said = (
+        f"atalante: the recording is not complete: {missing} cycles are missing from recording.mcap, recording-1.mcap"
+    )
+    assert done.stderr.splitlines()[-1] == said
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -281,7 +347,7 @@ def test_a_patient_s_gait_of_the_network_is_walked_inside_a_certified_guide(tmp_
                     "--step-duration", "0.8", "--out", str(tmp_path), "--json")  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "gait of the network: 75 kg, 1.75 m, step 0.16 m in 0.8 s" in done.stderr
-    result = json.loads(done.stdout)
+    result = json.loads(done.stdout.splitlines()[0])
     assert result["certified"]
     assert result["max_ratio"] < 1.0
     assert result["inside"] == 1.0

@@ -1,6 +1,7 @@
 """The telemetry process: `python -m atalante_hal.telemetry ORDER`, started by `process.TelemetryProcess` and nobody else.
 
-ORDER is JSON: the configuration and the inherited descriptors of the rings. One JSON line on stdout says that everything is
+ORDER is JSON: the configuration, the inherited descriptors of the rings, how many processes this one comes after, and
+the endpoint of the last of them. One JSON line on stdout says that everything is
 open (or what could not be had), another at the end what became of it.
 """
 
@@ -36,12 +37,23 @@ _LAST_WORDS = 1.0
 class Outlets:
     """The sinks that a configuration asks for, opened; those that may be refused come before the one with a socket.
 
+    Args:
+        restarts: telemetry processes that this one replaces.
+        before: endpoint of the last of them.
+
     Raises:
         SinkError: a file or an endpoint that was asked for cannot be had. Whatever is only a default (publishing on a free
-            port of the loopback) becomes a notice instead.
+            port of the loopback) becomes a notice instead, as does every endpoint of a restart: the recording goes on.
     """
 
-    def __init__(self, config: TelemetryConfig, records: RingReader, frames: RingReader | None) -> None:
+    def __init__(
+        self,
+        config: TelemetryConfig,
+        records: RingReader,
+        frames: RingReader | None,
+        restarts: int = 0,
+        before: str | None = None,
+    ) -> None:
         self.notices: list[str] = []
         self.publisher: Publisher | None = None
         self.recorder: Recorder | None = None
@@ -54,9 +66,9 @@ class Outlets:
             self.recorder = _open_recorder(config, streams, records.meta["about"])
         if config.publish:
             try:
-                self.publisher = _open_publisher(config, streams)
+                self.publisher = _open_publisher(config, streams, before)
             except SinkError as error:
-                if config.listen is not None:
+                if config.listen is not None and not restarts:
                     raise
                 self.notices.append(f"nothing is published: {error}")
 
@@ -92,10 +104,11 @@ class Outlets:
                     self.notices.append(str(error))
 
     def summary(self) -> dict[str, int]:
-        """What went where: published and recorded messages, logged frames."""
+        """Return what went where: published and recorded messages, logged frames, and whether the recording has its end."""
         return {
             "published": self.publisher.messages if self.publisher is not None else 0,
             "recorded": self.recorder.messages if self.recorder is not None else 0,
+            "finished": self.recorder is not None and self.recorder.finished,
             "frames_logged": self.can_log.frames if self.can_log is not None else 0,
         }
 
@@ -118,12 +131,12 @@ def _open_recorder(config: TelemetryConfig, streams: list[tuple[str, str]], abou
     return Recorder(config.recording, streams, {**about, "record_rate_hz": config.record_rate})
 
 
-def _open_publisher(config: TelemetryConfig, streams: list[tuple[str, str]]) -> Publisher:
+def _open_publisher(config: TelemetryConfig, streams: list[tuple[str, str]], before: str | None) -> Publisher:
     try:
         from atalante_hal.telemetry.publisher import Publisher
     except ImportError as error:
         raise SinkError("TELEMETRY_DOWN", f"{error.name} is missing: {_INSTALL}") from error
-    return Publisher(config.robot, streams, config.listen, config.access)
+    return Publisher(config.robot, streams, config.listen, config.access, before)
 
 
 def _say(line: dict[str, Any]) -> None:
@@ -152,7 +165,7 @@ def main(order: str) -> int:
         records, events = (stack.enter_context(RingReader(fds[name])) for name in ("records", "events"))
         frames = stack.enter_context(RingReader(fds["frames"])) if "frames" in fds else None
         try:
-            outlets = Outlets(config, records, frames)
+            outlets = Outlets(config, records, frames, ordered["restarts"], ordered["endpoint"])
         except SinkError as error:
             _say({"error": str(error)})
             return 1
@@ -164,6 +177,7 @@ def main(order: str) -> int:
             sinks=outlets.sinks(config),
             loop_every=CYCLES_PER_SECOND // config.loop_rate,
             can_log=outlets.can_log,
+            recorder=outlets.recorder,
         )
         _say({"endpoint": outlets.endpoint, "notices": outlets.notices})
         while outlets.notices:
@@ -172,6 +186,7 @@ def main(order: str) -> int:
             service.run(stop)
         finally:
             outlets.close_files()
+            service.settle()
         losses = {"lost": records.lost, "frames_lost": frames.lost if frames is not None else 0}
         _say({**outlets.summary(), **losses, "notices": [*outlets.notices, *service.notices]})
         signal.setitimer(signal.ITIMER_REAL, _LAST_WORDS)  # SIGALRM ends the process wherever it waits

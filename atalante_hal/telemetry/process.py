@@ -2,9 +2,9 @@
 
 The child is a fresh interpreter (`python -m atalante_hal.telemetry`, see `service`), never a fork, in a process group of
 its own: the terminal's Ctrl-C goes to the loop, which then closes the rings. It may be killed, stopped or starved at any
-time: `write` never waits for it, except in lock-step with a recording of every cycle or a CAN log, and there not for
-long. A loop that calls `tend` now and then gets a new child for one that died or hangs: same rings, same endpoint, files
-of its own beside those of the first.
+time: `write` never waits for it, except in lock-step with a recording or a CAN log, and there not for
+long. A loop that calls `tend` now and then gets a new child for one that died or hangs: same rings, the same endpoint or,
+if that is taken, another one as at the first start, files of its own beside those of the first.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class TelemetryConfig:
     recording: Path | None = None  # MCAP file
     record_rate: int = 100  # Hz of robot time; 1000 is every cycle
     can_log: Path | None = None  # every frame, format by suffix
-    lock_step: bool = False  # virtual time; the loop waits for a recorder that asked for everything
+    lock_step: bool = False  # virtual time; the loop waits for a recorder and a CAN log
     slots: int = 1024  # records a ring holds: cycles that telemetry may be late
     patience: float = 5.0  # s, longest wait of the loop for a recorder in lock-step, once
     certificate: Path | None = None  # these four: see `access.Access`
@@ -96,11 +96,6 @@ class TelemetryConfig:
         """Who may subscribe."""
         return Access(self.certificate, self.private_key, self.client_ca, self.users)
 
-    @property
-    def every_cycle(self) -> bool:
-        """Whether the recording wants every cycle."""
-        return self.recording is not None and self.record_rate == CYCLES_PER_SECOND
-
     def to_json(self) -> dict[str, Any]:
         """As what `json.dumps` takes."""
         return {name: str(value) if isinstance(value, Path) else value for name, value in asdict(self).items()}
@@ -110,6 +105,17 @@ class TelemetryConfig:
         """The inverse of `to_json`."""
         paths = {name: Path(values[name]) for name in _PATHS if values[name] is not None}
         return cls(**{**values, **paths})
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What became of the recording of a session."""
+
+    files: tuple[str, ...]  # names, in order: one of the first child and one of each child that replaced another
+    complete: bool  # one file with its index, and no cycle is missing
+    missing_cycles: (
+        int  # cycles of the loop that are in no file; at 100 Hz the nine between two messages count with them
+    )
 
 
 @dataclass(frozen=True)
@@ -124,6 +130,7 @@ class TelemetrySummary:
     frames_lost: int = 0  # records of the frame ring, one a cycle
     restarts: int = 0  # children that died or hung and were replaced
     notices: tuple[str, ...] = field(default=())  # what went wrong, one sentence each
+    recording: Recording | None = None  # None: no recording was asked for
 
 
 class TelemetryProcess(Closing):
@@ -151,7 +158,7 @@ class TelemetryProcess(Closing):
         about: Mapping[str, object] | None = None,
     ) -> None:
         self.config, self.layout = config, layout
-        self.endpoint: str | None = None  # where subscribers connect, once started
+        self.endpoint: str | None = None  # where subscribers connect, once started; a restart may change it
         self.notices: tuple[str, ...] = ()  # of the start, one sentence each
         self._start_ns = 0 if config.lock_step else time.time_ns()
         self._runs = 0
@@ -160,6 +167,8 @@ class TelemetryProcess(Closing):
         self._child: subprocess.Popen[bytes] | None = None
         self._restarts = 0
         self._mishaps: list[str] = []  # of children, one sentence each
+        self._recordings: list[str] = []  # names of the files that were begun
+        self._last_endpoint: str | None = None  # not None once something was published
         self._restarting: threading.Thread | None = None
         self._progress = (0, 0.0)  # records taken when `tend` looked, and since when [s]
         meta = {
@@ -172,7 +181,7 @@ class TelemetryProcess(Closing):
         self.records = RingWriter(
             layout.size * 8,
             config.slots,
-            lossless=lossless and config.every_cycle,
+            lossless=lossless and config.recording is not None,
             patience=config.patience,
             meta=meta,
         )
@@ -193,15 +202,23 @@ class TelemetryProcess(Closing):
             TelemetryError: a file or an endpoint that was asked for cannot be had, or the child was not ready in time [s].
         """
         try:
-            self._launch(self.config, timeout)
+            self.notices = self._launch(self.config, timeout)
         except BaseException:  # Ctrl-C while it waits, too
             self.close(0.0)
             raise
 
-    def _launch(self, config: TelemetryConfig, timeout: float) -> None:
+    def _launch(self, config: TelemetryConfig, timeout: float) -> tuple[str, ...]:
+        """Start a child and wait until it is ready; return its notices, one sentence each. Raises as `start`."""
         rings = {"records": self.records, "events": self.events, "frames": self.frames}
         fds = {name: ring.fd for name, ring in rings.items() if ring is not None}
-        order = json.dumps({"config": config.to_json(), "rings": fds})
+        order = json.dumps(
+            {
+                "config": config.to_json(),
+                "rings": fds,
+                "restarts": self._restarts,
+                "endpoint": self._last_endpoint,
+            }
+        )
         self._child = subprocess.Popen(
             [sys.executable, "-P", "-m", "atalante_hal.telemetry", order],
             stdin=subprocess.DEVNULL,
@@ -214,12 +231,18 @@ class TelemetryProcess(Closing):
             raise TelemetryError(f"the telemetry process was not ready within {timeout:.0f} s")
         if "error" in told:
             raise TelemetryError(told["error"])
-        self.endpoint, self.notices = told["endpoint"], tuple(told["notices"])
+        self.endpoint = told["endpoint"]
+        self._last_endpoint = self.endpoint or self._last_endpoint
+        if config.recording is not None:
+            self._recordings.append(config.recording.name)
+        return tuple(told["notices"])
 
     def tend(self) -> None:
         """Look after the child; call it a few times a second. A dead one, or one that hangs, is replaced in the background.
 
-        The replacement goes on reading where the other one stopped, under the endpoint it had, into files with a number.
+        The replacement goes on reading where the other one stopped, into files with a number. It listens on the endpoint
+        the other one had. If that is taken it does as a first child does, but does not fail: `endpoint` is then another
+        one, or None.
         """
         if self._closed or self._child is None or (self._restarting is not None and self._restarting.is_alive()):
             return
@@ -253,14 +276,14 @@ class TelemetryProcess(Closing):
         self._progress = 0, 0.0
         config = replace(
             self.config,
-            listen=self.endpoint,  # subscribers reconnect by themselves
             recording=_numbered(self.config.recording, self._restarts),
             can_log=_numbered(self.config.can_log, self._restarts),
         )
         try:
-            self._launch(config, _RESTART)
+            self._mishaps.extend(self._launch(config, _RESTART))
         except TelemetryError as error:
             self._mishaps.append(str(error))
+            self._end(self._child, 0.0)
 
     def tap(self, now: Callable[[], int] = time.time_ns, stamps: Callable[[], Stamps] | None = None) -> RingTap:
         """What the HAL hands its frames to, for the CAN log; one for the session.
@@ -325,21 +348,38 @@ class TelemetryProcess(Closing):
         if self._restarting is not None:
             self._restarting.join()
         rings = [ring for ring in (self.frames, self.events, self.records) if ring is not None]
-        summary = TelemetrySummary(lost=self.records.lost, restarts=self._restarts, notices=tuple(self._mishaps))
+        told: dict[str, Any] | None = None
         if self._tap is not None:
             self._tap.flush()
         for ring in rings:
             ring.finish()
         if self._child is not None:
             told = self._listen(timeout)
-            if told is not None and "error" not in told:
-                facts = {**told, "notices": (*self._mishaps, *told["notices"])}
-                summary = TelemetrySummary(complete=not self._restarts, restarts=self._restarts, **facts)
             self._end(self._child, _LAST_WORDS if told is not None else 0.0)
             self._child = None
+        summary = self._summary(told if told is not None and "error" not in told else None)
         for ring in rings:
             ring.close()
         return summary
+
+    def _summary(self, told: Mapping[str, Any] | None) -> TelemetrySummary:
+        """Sum up the session when no child is left.
+
+        Args:
+            told: the last line of the child that ended by itself; None when there is none.
+        """
+        facts = {"lost": self.records.lost, "notices": (), "finished": False, **(told or {})}
+        finished = facts.pop("finished") and not self._restarts
+        notices = tuple(dict.fromkeys((*self._mishaps, *facts.pop("notices"))))
+        missing = self.records.written - self.records.kept
+        recording = Recording(tuple(self._recordings), finished and not missing, missing)
+        return TelemetrySummary(
+            complete=told is not None and not self._restarts,
+            restarts=self._restarts,
+            notices=notices,
+            recording=recording if self.config.recording is not None else None,
+            **facts,
+        )
 
     @staticmethod
     def _end(child: subprocess.Popen[bytes], patience: float) -> None:
@@ -355,6 +395,8 @@ class TelemetryProcess(Closing):
         """The next line of the child as JSON; None when it says nothing within `timeout` [s] or is gone."""
         assert self._child is not None
         assert self._child.stdout is not None
+        if self._child.stdout.closed:
+            return None
         pipe, line = self._child.stdout.fileno(), b""
         give_up = time.monotonic() + timeout
         with selectors.DefaultSelector() as selector:

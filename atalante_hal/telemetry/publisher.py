@@ -43,17 +43,24 @@ class Publisher(Closing):
         streams: (key, message type) of each stream; the events come by themselves.
         listen: Zenoh endpoint such as tcp/127.0.0.1:7447; None takes the first free port from 7447 on the loopback.
         access: TLS and users.
+        before: endpoint of the publisher that this one replaces, where its subscribers reconnect; tried first when
+            `listen` is None.
 
     Raises:
         SinkError: the endpoint cannot be listened on.
     """
 
     def __init__(
-        self, robot: str, streams: Iterable[tuple[str, str]], listen: str | None = None, access: Access = OPEN
+        self,
+        robot: str,
+        streams: Iterable[tuple[str, str]],
+        listen: str | None = None,
+        access: Access = OPEN,
+        before: str | None = None,
     ) -> None:
         self.messages = 0
         self._stack = ExitStack()
-        self._session, self.endpoint = _open(robot, listen, access)
+        self._session, self.endpoint = _open(robot, listen, access, before)
         self._stack.enter_context(self._session)
         self._publishers: dict[str, zenoh.Publisher | zenoh.ext.AdvancedPublisher] = {
             key: self._session.declare_publisher(
@@ -150,7 +157,7 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
     }
 
 
-def _open(robot: str, listen: str | None, access: Access) -> tuple[zenoh.Session, str]:
+def _open(robot: str, listen: str | None, access: Access, before: str | None) -> tuple[zenoh.Session, str]:
     """A session and the endpoint it listens on."""
     if listen is not None:
         try:
@@ -161,16 +168,16 @@ def _open(robot: str, listen: str | None, access: Access) -> tuple[zenoh.Session
                 f"Zenoh cannot listen on {listen}: {_reason(error)}; give another endpoint, such as tcp/127.0.0.1:7448",
             ) from error
     refused = ""
-    for port in range(DEFAULT_PORT, DEFAULT_PORT + PORTS_TRIED):
-        endpoint = f"{access.protocols[0]}/{DEFAULT_HOST}:{port}"
+    ports = range(DEFAULT_PORT, DEFAULT_PORT + PORTS_TRIED)
+    defaults = [f"{access.protocols[0]}/{DEFAULT_HOST}:{port}" for port in ports]
+    for endpoint in dict.fromkeys([before, *defaults] if before is not None else defaults):
         try:
             return zenoh.open(_parsed(robot, endpoint, access)), endpoint
         except zenoh.ZError as error:
             refused = _reason(error)
-            _log.info("port %d is not free, trying the next", port)
-    last = DEFAULT_PORT + PORTS_TRIED - 1
+            _log.info("%s is not free, trying the next", endpoint)
     raise SinkError(
-        "TELEMETRY_DOWN", f"Zenoh found no free port from {DEFAULT_PORT} to {last} on {DEFAULT_HOST}: {refused}"
+        "TELEMETRY_DOWN", f"Zenoh found no free port from {ports[0]} to {ports[-1]} on {DEFAULT_HOST}: {refused}"
     )
 
 

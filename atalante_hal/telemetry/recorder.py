@@ -35,6 +35,8 @@ class Recorder(Closing):
     def __init__(self, path: Path, streams: Iterable[tuple[str, str]], about: Mapping[str, object]) -> None:
         self.path = path
         self.messages = 0
+        self.saved = 0  # of `messages`, those that are in the file even if this process is killed
+        self.finished = False  # closed with its index: every message is in the file
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("wb")
@@ -49,6 +51,7 @@ class Recorder(Closing):
                 self._channels[key] = self._writer.register_channel(f"/{key}", "protobuf", schema)
             self._writer.add_metadata("session", _texts(about))
             self._file.flush()
+            self._length = self._file.tell()
         except OSError as error:
             raise self._failed(error) from error
 
@@ -59,18 +62,24 @@ class Recorder(Closing):
             timestamp: log time [ns].
 
         Raises:
-            SinkError: the disk is full or gone; the recorder is closed then.
+            SinkError: the disk is full or gone; the recorder is closed then, and refuses every further message.
         """
+        if self._file.closed:
+            raise SinkError("RECORD_STOPPED", f"the recording {self.path} is closed")
         try:
             self._writer.add_message(self._channels[key], timestamp, payload, timestamp, cycle & 0xFFFFFFFF)
+            self.messages += 1
+            if self._file.tell() != self._length:  # the chunk is full and written, with this message
+                self._file.flush()
+                self._length, self.saved = self._file.tell(), self.messages
         except OSError as error:
             raise self._failed(error) from error
-        self.messages += 1
 
     def begin_run(self, number: int, about: Mapping[str, object]) -> None:
         """Note that a run begins; raises as `put`."""
         try:
             self._writer.add_metadata(f"run/{number}", _texts(about))
+            self._length = self._file.tell()
         except OSError as error:
             raise self._failed(error) from error
 
@@ -87,6 +96,7 @@ class Recorder(Closing):
             self._file.close()
         except OSError as error:
             raise self._failed(error) from error
+        self.saved, self.finished = self.messages, True
 
     def _failed(self, error: OSError) -> SinkError:
         with contextlib.suppress(OSError):  # what the buffer still holds does not fit either

@@ -36,7 +36,7 @@ VERSION = 1
 # The header as 64-bit words; writer and reader have a cache line of their own.
 _MAGIC, _VERSION, _RECORD_SIZE, _STRIDE, _SLOTS, _META_LENGTH, _NOTES_SIZE, _DATA = range(8)
 _WRITTEN, _CLOSED, _WRITER_PID, _NOTES_LENGTH, _LOSSLESS = range(8, 13)
-_READ, _LOST, _READER_PID = range(16, 19)
+_READ, _LOST, _READER_PID, _KEPT = range(16, 20)
 _HEADER_BYTES = 256
 
 _WRITER_BYTE, _READER_BYTE = 0, 1  # of the file, locked while the process lives
@@ -78,6 +78,11 @@ class _Ring:
     def lost(self) -> int:
         """Records the reader has missed so far."""
         return self._header[_LOST]
+
+    @property
+    def kept(self) -> int:
+        """Records whose content the readers have saved so far: what a killed reader had not saved is not among them."""
+        return self._header[_KEPT]
 
     @property
     def lossless(self) -> bool:
@@ -288,6 +293,14 @@ class RingReader(_Ring, Closing):
         header[_LOST] += intact - self._next
         header[_READ] = self._next = written
         return self._batch[intact - first : count, : self.record_size]
+
+    def keep(self, records: int) -> None:
+        """Add records to those whose content is saved.
+
+        Args:
+            records: number of records that `read` returned and that are on the disk since the last call.
+        """
+        self._header[_KEPT] += records
 
     @property
     def position(self) -> int:

@@ -26,6 +26,7 @@ from atalante_hal.telemetry.sink import EVENTS, MessageSink, SinkError
 if TYPE_CHECKING:  # these need protobuf and python-can, which a session may do without
     from atalante_hal.telemetry.can_log import CanLog
     from atalante_hal.telemetry.messages import Encoder
+    from atalante_hal.telemetry.recorder import Recorder
 
 _POLL = 0.005  # s, between looks at empty rings
 _LOOK_FOR_WRITER = 0.2  # s, between looks whether the writer lives, while nothing comes
@@ -51,6 +52,7 @@ class Service:
         sinks: each with the number of cycles from one message of a stream to the next.
         loop_every: cycles from one message of loop statistics to the next.
         can_log: where the frames go.
+        recorder: the one of `sinks` that writes a file; counts in the ring which records are saved.
     """
 
     def __init__(
@@ -63,12 +65,17 @@ class Service:
         sinks: Sequence[tuple[MessageSink, int]],
         loop_every: int,
         can_log: CanLog | None,
+        recorder: Recorder | None = None,
     ) -> None:
         self._records, self._events, self._frames = records, events, frames
         self._encoder, self._sinks, self._loop_every, self._can_log = encoder, list(sinks), loop_every, can_log
         self._runs = [Run(0, "", records.meta["start_ns"], 0)]
         self._cycle, self._timestamp = 0, self._runs[0].start_ns  # of the record seen last
         self._lost, self._lost_reported = 0, -math.inf
+        self._recorder, self._saved = recorder, 0  # messages of the recorder that were saved when last looked at
+        self._handled = self._kept = (
+            0  # records whose messages were all put; those of them counted as saved in the ring
+        )
         self.notices: list[str] = []  # what went wrong, one sentence each
 
     def run(self, stop: Sequence[object]) -> None:
@@ -83,6 +90,11 @@ class Service:
                 if not self._records.writer_alive:
                     break
         self.step()
+
+    def settle(self) -> None:
+        """Count every record as saved if the recording is finished; call it after the recorder was closed."""
+        if self._recorder is not None and self._recorder.finished:
+            self._keep()
 
     def step(self) -> bool:
         """Handle everything that is in the rings; whether there was anything."""
@@ -123,8 +135,9 @@ class Service:
         due = cycles % self._loop_every == 0
         for _, every in self._sinks:
             due |= cycles % every == 0
-        window_from = 0
+        window_from, before = 0, self._handled
         for place in np.flatnonzero(due).tolist():
+            self._handled = before + place
             cycle, run = int(cycles[place]), self._run_of(first + place)
             sample = encoder.sample(records[place], cycle, run.start_ns, run.number, run.name)
             sinks = [sink for sink, every in self._sinks if cycle % every == 0]
@@ -136,6 +149,7 @@ class Service:
                 window_from = place + 1
                 payload = encoder.window.encode(sample, self._records.lost)
                 self._put([sink for sink, _ in self._sinks], encoder.window.key, payload, sample.timestamp, cycle)
+        self._handled = before + len(records)
         encoder.window.add(records[window_from:])
         self._cycle = int(cycles[-1])
         self._timestamp = self._run_of(first + len(records) - 1).start_ns + round(records[-1, encoder.time_at] * 1e9)
@@ -160,6 +174,14 @@ class Service:
                 sink.put(key, payload, timestamp, cycle)
             except SinkError as error:
                 self._give_up(sink, error)
+        if self._recorder is not None and self._recorder.saved != self._saved:
+            self._saved = self._recorder.saved
+            self._keep()
+
+    def _keep(self) -> None:
+        """Count the records handled so far as saved."""
+        self._records.keep(self._handled - self._kept)
+        self._kept = self._handled
 
     def _give_up(self, failed: MessageSink, error: SinkError) -> None:
         """Go on without a sink."""

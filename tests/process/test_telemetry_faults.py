@@ -8,15 +8,17 @@ from __future__ import annotations
 import os
 import resource
 import signal
+import socket
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 from mcap.exceptions import EndOfFile
+from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
-from mcap_protobuf.decoder import DecoderFactory
 
 from atalante_hal.frame import Frames
 from atalante_hal.telemetry import process as process_module
@@ -133,9 +135,13 @@ def test_f46_a_full_disk_ends_the_recording_alone(drive: Drive, tmp_path: Path) 
         drive.until(subscriber.heard)
         drive.run(CYCLES)
         drive.until(lambda: "events" in subscriber.heard())  # RECORD_STOPPED goes out where it still can
+    written = telemetry.records.written
     summary = telemetry.close()
     assert summary.complete
     assert summary.notices == (f"the recording {tmp_path / 'r.mcap'} stopped: File too large",)
+    assert summary.recording is not None
+    assert not summary.recording.complete
+    assert summary.recording.missing_cycles == written - len(cycles_without_index(tmp_path / "r.mcap"))
     drive.compare()
 
 
@@ -206,30 +212,79 @@ def test_f49_telemetry_that_dies_or_hangs_is_started_again(drive: Drive, how: si
     again = recorded(tmp_path / "run-1.mcap")
     assert [message.cycle for message in again] == list(range(again[0].cycle, drive.rig.hal.state.cycle + 1))
     # What the first child had written is there, without an index: it was not asked.
-    assert cycles_without_index(path)[:100] == list(range(begin, begin + 100))
+    kept = cycles_without_index(path)
+    assert kept[:100] == list(range(begin, begin + 100))
+    assert summary.recording is not None
+    assert summary.recording.files == ("run.mcap", "run-1.mcap")
+    assert not summary.recording.complete
+    if how is signal.SIGKILL:  # a stopped one may be stopped anywhere
+        assert summary.recording.missing_cycles == again[0].cycle - 1 - kept[-1]
+    drive.compare()
+
+
+def squat(endpoint: str) -> socket.socket:
+    """A program that is not ours, listening where telemetry did."""
+    host, port = endpoint.partition("/")[2].split(":")
+    squatter = socket.socket()
+    squatter.setsockopt(
+        socket.SOL_SOCKET, socket.SO_REUSEADDR, 1
+    )  # what was connected may still be waiting for its end
+    squatter.bind((host, int(port)))
+    squatter.listen()
+    return squatter
+
+
+@pytest.mark.parametrize("asked", [False, True], ids=["default endpoint", "endpoint asked for"])
+def test_f49_a_restart_whose_port_is_taken_records_on(
+    drive: Drive, asked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = int(free_endpoint().rsplit(":", 1)[1])
+    (tmp_path / "sitecustomize.py").write_text(
+        f"import atalante_hal.telemetry.publisher as p; p.DEFAULT_PORT = {port}\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    listen = f"tcp/127.0.0.1:{port}"
+    path = tmp_path / "run.mcap"
+    config = TelemetryConfig(listen=listen if asked else None, recording=path, record_rate=1000, lock_step=True)
+    telemetry = drive.start(config)
+    assert telemetry.endpoint == listen
+    first = pid_of(telemetry)
+    os.kill(first, signal.SIGKILL)
+    assert telemetry._child is not None
+    telemetry._child.wait()
+    with squat(listen):
+        drive.until(lambda: telemetry._restarting is not None and not telemetry._restarting.is_alive())
+        assert telemetry.alive
+        assert pid_of(telemetry) != first
+        if asked:
+            assert telemetry.endpoint is None
+        else:
+            assert telemetry.endpoint not in (None, listen)
+            with Subscriber(telemetry) as subscriber:
+                drive.until(subscriber.heard)
+        drive.run(100)
+        summary = telemetry.close()
+    assert summary.restarts == 1
+    assert summary.recording is not None
+    assert not summary.recording.complete
+    again = [message.cycle for message in recorded(tmp_path / "run-1.mcap")]
+    assert again == list(range(again[0], drive.rig.hal.state.cycle + 1))
+    assert bool([notice for notice in summary.notices if f"cannot listen on {listen}" in notice]) is asked
     drive.compare()
 
 
 def cycles_without_index(path: Path) -> list[int]:
-    """Cycles in a recording that nobody finished."""
-    found = []
-    factory, schemas, channels = DecoderFactory(), {}, {}
-    try:
-        with path.open("rb") as file:
-            for record in StreamReader(file, record_size_limit=None).records:
-                kind = type(record).__name__
-                if kind == "Schema":
-                    schemas[record.id] = record
-                elif kind == "Channel":
-                    channels[record.id] = record
-                elif kind == "Message" and channels[record.channel_id].topic == "/joint_states":
-                    schema = schemas[channels[record.channel_id].schema_id]
-                    decode = factory.decoder_for("protobuf", schema)
-                    assert decode is not None
-                    found.append(decode(record.data).cycle)
-    except EndOfFile:
-        pass
-    return found
+    """Cycles that have all their messages in a recording, which may end anywhere."""
+    topics: dict[int, str] = {}
+    streams: dict[str, set[int]] = {}
+    with path.open("rb") as file, suppress(EndOfFile):
+        for record in StreamReader(file, record_size_limit=None).records:
+            if isinstance(record, Channel) and record.topic not in ("/loop", "/events"):
+                topics[record.id] = record.topic
+                streams.setdefault(record.topic, set())  # the end of a file repeats its channels
+            elif isinstance(record, Message) and record.channel_id in topics:
+                streams[topics[record.channel_id]].add(record.sequence)
+    return sorted(set.intersection(*streams.values())) if streams else []
 
 
 def test_f49_a_child_that_never_lives_is_given_up(drive: Drive) -> None:

@@ -25,7 +25,7 @@ from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
 from atalante_hal.telemetry.layout import Layout
-from atalante_hal.telemetry.process import TelemetryConfig, TelemetryError, TelemetryProcess
+from atalante_hal.telemetry.process import Recording, TelemetryConfig, TelemetryError, TelemetryProcess
 from atalante_hal.telemetry.schema import DESCRIPTORS
 
 FOREVER = 3600.0  # s of patience: a writer that waits hangs the test
@@ -85,6 +85,7 @@ class TestSession:
                 assert telemetry.records.lossless, number
             summary = telemetry.close()
         assert (summary.complete, summary.lost, summary.published, summary.notices) == (True, 0, 0, ())
+        assert summary.recording == Recording(("recording.mcap",), True, 0)
         states, system = recorded(path), recorded(path, "/system")
         assert [message.cycle for message in states] == [*range(1, 501)] * 2
         assert [message.position[3] for message in states[:500]] == [cycle / 8 for cycle in range(1, 501)]
@@ -99,6 +100,17 @@ class TestSession:
             about = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
         assert about["session"] == {"seed": "3", "record_rate_hz": "1000"}
         assert about["run/1"] == {"name": "pinched", "start_ns": "1500000000", "xi": "0.5"}
+
+    @pytest.mark.parametrize("cycles", [5, 1999])
+    def test_in_lock_step_no_cycle_is_lost_at_any_rate(self, layout: Layout, tmp_path: Path, cycles: int) -> None:
+        config = TelemetryConfig(
+            recording=tmp_path / "r.mcap", record_rate=100, lock_step=True, publish=False, slots=16, patience=FOREVER
+        )
+        with TelemetryProcess(config, layout) as telemetry:
+            write(telemetry, range(1, cycles + 1))
+            summary = telemetry.close()
+        assert summary.recording == Recording(("r.mcap",), True, 0)
+        assert [message.cycle for message in recorded(tmp_path / "r.mcap")] == list(range(10, cycles + 1, 10))
 
     def test_two_sessions_in_lock_step_make_the_same_recording(self, layout: Layout, tmp_path: Path) -> None:
         for name in ("one", "two"):
@@ -252,6 +264,7 @@ class TestDeath:
         cycles = [message.cycle for message in recorded(path)]
         assert cycles[-1] == 1999
         assert len(cycles) + summary.lost == 2000
+        assert summary.recording == Recording(("recording.mcap",), False, summary.lost)
         assert summary.lost >= 2000 - 2 * 64
         assert [event.code for event in recorded(path, "/events")] == ["TELEMETRY_DROPPED"]
 
@@ -340,6 +353,9 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(layout: Layout, tmp_pa
     assert summary.complete
     assert summary.lost == 0
     assert summary.notices == (f"the recording {tmp_path / 'r.mcap'} stopped: File too large",)
+    assert summary.recording is not None
+    assert not summary.recording.complete
+    assert 0 < summary.recording.missing_cycles <= 2000
 
 
 class TestRefusals:

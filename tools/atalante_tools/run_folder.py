@@ -12,10 +12,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from atalante_tools.outcome import Failed
 from atalante_tools.terminal import say, table
+
+if TYPE_CHECKING:
+    from atalante_hal.telemetry.process import Recording
 
 
 @dataclass(frozen=True)
@@ -63,16 +66,17 @@ def run_folder(out: Path) -> Iterator[None]:
             out.rmdir()
 
 
-def leave(out: Path, asked: Mapping[str, Any], results: Sequence[Result]) -> None:
+def leave(out: Path, asked: Mapping[str, Any], results: Sequence[Result], recording: Recording) -> None:
     """Write summary.json and the figure, and say where everything is.
 
     Args:
         asked: what the user asked for, first in the summary.
+        recording: its files, and whether they have every cycle.
     """
-    summary = {**asked, "shapes": [asdict(result) for result in results]}
+    summary = {**asked, "recording": asdict(recording), "shapes": [asdict(result) for result in results]}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     figure = _figure(out)
-    say(f"in {out}: recording.mcap, summary.json{f', {figure}' if figure else ''}")
+    say(f"in {out}: {', '.join([*recording.files, 'summary.json', *([figure] if figure else [])])}")
 
 
 def _figure(out: Path) -> str:

@@ -10,7 +10,7 @@ import math
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -19,6 +19,7 @@ import click
 
 from atalante_tools.names import find
 from atalante_tools.options import SEED, Between, Target, json_option, options_as, subject_options
+from atalante_tools.outcome import Failed
 from atalante_tools.run_folder import Result, leave, results_table, run_folder
 from atalante_tools.signals import stop_requested
 from atalante_tools.terminal import say, show_json
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from atalante_hal.hal import Hal
     from atalante_hal.loop import Statistics
     from atalante_hal.robot import Robot
-    from atalante_hal.telemetry.process import TelemetryProcess
+    from atalante_hal.telemetry.process import Recording, TelemetryProcess
     from atalante_hal.types import State
     from atalante_tools.embedded import EmbeddedRobot
     from atalante_tools.rig import Rig
@@ -58,6 +59,14 @@ class Options:
     can_log: Path | None
     telemetry: Path | None  # telemetry file: endpoint, TLS, users
     subject: Subject | None = None  # whose gait of the network; None: the gait drawn for the air
+
+
+@dataclass
+class Walked:
+    """What a trial has so far; complete once its telemetry is closed."""
+
+    results: list[Result] = field(default_factory=list)  # one a shape
+    recording: Recording | None = None  # None: the telemetry was not started
 
 
 def _record_rate(text: str) -> int:
@@ -93,6 +102,7 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
 
     Raises:
         Failed, FaultLatched: the robot left ACTIVE before the steps were done; what was walked until then is kept.
+        Failed: the steps were done and the recording is not complete.
         SystemExit: a signal ended it.
     """
     from atalante_control.guide_shapes import SHAPES
@@ -103,15 +113,31 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
     if options.can_log is not None:
         _require_format(options.can_log)
     outlet = load_telemetry_file(options.telemetry) if options.telemetry else {}
-    results: list[Result] = []
+    walked = Walked()
     with run_folder(options.out):
         try:
-            _walk_all(target, wanted, options, outlet, results, as_json=as_json)
+            _walk_all(target, wanted, options, outlet, walked, as_json=as_json)
         finally:
-            if results:
-                if not as_json:
-                    click.echo(results_table(results))
-                leave(options.out, _asked(options), results)
+            if walked.results and walked.recording is not None:
+                if as_json:
+                    show_json({"recording": asdict(walked.recording)})
+                else:
+                    click.echo(results_table(walked.results))
+                leave(options.out, _asked(options), walked.results, walked.recording)
+    _require_complete(walked.recording)
+
+
+def _require_complete(recording: Recording | None) -> None:
+    """Refuse a recording with gaps.
+
+    Raises:
+        Failed: cycles are missing, or its file has no end; names the files and the number of cycles.
+    """
+    if recording is not None and not recording.complete:
+        raise Failed(
+            f"the recording is not complete: {recording.missing_cycles} cycles are missing from "
+            f"{', '.join(recording.files)}"
+        )
 
 
 def _asked(options: Options) -> dict[str, Any]:
@@ -136,11 +162,11 @@ def _walk_all(
     shapes: Mapping[str, GuideShape],
     options: Options,
     outlet: Mapping[str, Any],
-    results: list[Result],
+    walked: Walked,
     *,
     as_json: bool,
 ) -> None:
-    """Walk behind each shape in turn and append what became of it to `results`; raises as `run_trial`."""
+    """Walk behind each shape in turn and add what became of it and of the recording to `walked`; raises as `run_trial`."""
     import atalante_dbc
     from atalante_hal.robot import load_robot
 
@@ -161,15 +187,15 @@ def _walk_all(
                     _announce(promised.values())
                     telemetry = _telemetry(target, options, outlet, rig.hal, network, gait.hash32)
                     stack.enter_context(telemetry)
-                    stack.callback(_tell_losses, telemetry)
-                    _tell_where(telemetry)
+                    stack.callback(_close, telemetry, walked)
+                    report_endpoint = _EndpointReport(telemetry)
                 telemetry.begin_run(name, {"shape": name, "xi": options.xi, **_promise(promised[name])})
-                walk = _Walk(rig, controller, telemetry, name, options.steps)
+                walk = _Walk(rig, controller, telemetry, report_endpoint, name, options.steps)
                 statistics = walk.run(stop)
                 factors = controller.statistics.factors or {options.xi}
-                results.append(_result(_weakest(controller, factors), controller, rig.hal, statistics))
+                walked.results.append(_result(_weakest(controller, factors), controller, rig.hal, statistics))
                 if as_json:
-                    show_json(asdict(results[-1]))
+                    show_json(asdict(walked.results[-1]))
                 walk.conclude()
 
 
@@ -177,12 +203,18 @@ class _Walk:
     """One shape: the loop, its telemetry and its progress line."""
 
     def __init__(
-        self, rig: Rig, controller: HangController, telemetry: TelemetryProcess, name: str, steps: int
+        self,
+        rig: Rig,
+        controller: HangController,
+        telemetry: TelemetryProcess,
+        report_endpoint: _EndpointReport,
+        name: str,
+        steps: int,
     ) -> None:
         from atalante_tools.rig import Watch
 
         self._rig, self._controller, self._telemetry = rig, controller, telemetry
-        self._name, self._steps = name, steps
+        self._report_endpoint, self._name, self._steps = report_endpoint, name, steps
         self._told = 0
         self._watch_of = functools.partial(Watch, rig, done=self._done, describe=self._describe)
         hal = rig.hal
@@ -206,6 +238,7 @@ class _Walk:
         self._telemetry.write(hal.record)
         if not hal.state.cycle % _TEND_CYCLES:
             self._telemetry.tend()
+            self._report_endpoint()
         if len(hal.events) != self._told:
             self._tell()
 
@@ -355,16 +388,29 @@ def _telemetry(
     )
 
 
-def _tell_where(telemetry: TelemetryProcess) -> None:
-    for notice in telemetry.notices:
-        say(notice)
-    if telemetry.endpoint:
-        say(f"telemetry on Zenoh at {telemetry.endpoint}, keys atalante/{telemetry.config.robot}/**")
+class _EndpointReport:
+    """Print where subscribers connect: when it is made, and on each call after a restart that changed the endpoint."""
+
+    def __init__(self, telemetry: TelemetryProcess) -> None:
+        for notice in telemetry.notices:
+            say(notice)
+        self._telemetry = telemetry
+        self._endpoint: str | None = None
+        self()
+
+    def __call__(self) -> None:
+        """Print the endpoint unless it is the one printed last."""
+        endpoint = self._telemetry.endpoint
+        if endpoint != self._endpoint:
+            self._endpoint = endpoint
+            keys = f"keys atalante/{self._telemetry.config.robot}/**"
+            say(f"telemetry on Zenoh at {endpoint}, {keys}" if endpoint else "telemetry is no longer published")
 
 
-def _tell_losses(telemetry: TelemetryProcess) -> None:
-    """Close it, and say what it could not record or publish."""
+def _close(telemetry: TelemetryProcess, walked: Walked) -> None:
+    """Close the telemetry, print what it could not record or publish, and add its recording to `walked`."""
     summary = telemetry.close()
+    walked.recording = summary.recording
     for notice in summary.notices:
         if notice not in telemetry.notices:  # those were told at the start
             say(notice)
