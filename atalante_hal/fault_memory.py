@@ -5,7 +5,10 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 from atalante_hal.diagnostics import Dtc, Severity, event_code
 from atalante_hal.telemetry.events import Event
@@ -13,6 +16,57 @@ from atalante_hal.telemetry.events import Event
 #: A diagnostic that ends and begins again is told anew after so many cycles, pending or confirmed: a bad line does not fill
 #: the log.
 QUIET_PENDING, QUIET_CONFIRMED = 1000, 20
+
+
+#: Newest events that are kept: about 2 MB, in a process whose memory is locked.
+EVENTS_KEPT = 4096
+
+
+class EventLog:
+    """Keep the newest events and count all of them.
+
+    Events are numbered from 0 in the order they are appended. The number of an event stays the same when older ones are
+    dropped; its index among those that are kept does not.
+
+    Args:
+        capacity: largest number of events that are kept.
+    """
+
+    def __init__(self, capacity: int = EVENTS_KEPT) -> None:
+        self._kept: deque[Event] = deque(maxlen=capacity)
+        #: Events appended so far, which is the number of the next one.
+        self.count = 0
+
+    def append(self, event: Event) -> None:
+        """Add an event; the oldest is dropped if the log is full."""
+        self._kept.append(event)
+        self.count += 1
+
+    def since(self, number: int) -> list[Event]:
+        """Return the events from a number on, oldest first, as far as they are kept.
+
+        Args:
+            number: of the first event, such as an earlier `count`.
+        """
+        wanted = min(self.count - number, len(self._kept))
+        return list(islice(reversed(self._kept), max(0, wanted)))[::-1]
+
+    @property
+    def dropped(self) -> int:
+        """Events that are not kept any more."""
+        return self.count - len(self._kept)
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __iter__(self) -> Iterator[Event]:
+        return iter(self._kept)
+
+    def __getitem__(self, index: int) -> Event:
+        return self._kept[index]
+
+    def __repr__(self) -> str:
+        return repr(list(self._kept))
 
 
 @dataclass(slots=True)
@@ -33,7 +87,7 @@ class FaultMemory:
 
     def __init__(self) -> None:
         #: What began, in order.
-        self.events: list[Event] = []
+        self.events = EventLog()
         self.active: dict[tuple[Dtc, str], Entry] = {}
         #: Bits of the active codes, of the confirmed ones: `diagnostics.dtcs_of`.
         self.bits = 0

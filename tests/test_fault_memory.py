@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from atalante_hal.diagnostics import Dtc
-from atalante_hal.fault_memory import QUIET_CONFIRMED, QUIET_PENDING, FaultMemory
+from atalante_hal.fault_memory import EVENTS_KEPT, QUIET_CONFIRMED, QUIET_PENDING, EventLog, FaultMemory
+from atalante_hal.telemetry.events import Event
 
 
 @pytest.fixture
@@ -20,7 +21,7 @@ def told(memory: FaultMemory) -> list[tuple[int, str, str, str, float]]:
 def test_nothing_is_active_at_first(memory: FaultMemory):
     assert (memory.bits, memory.confirmed) == (0, frozenset())
     memory.close_cycle(1)
-    assert (memory.active, memory.bits, memory.confirmed, memory.events) == ({}, 0, frozenset(), [])
+    assert (memory.active, memory.bits, memory.confirmed, [*memory.events]) == ({}, 0, frozenset(), [])
 
 
 def test_a_diagnostic_is_told_when_it_begins_and_not_while_it_lasts(memory: FaultMemory):
@@ -114,3 +115,33 @@ def test_who_and_what_is_meant(memory: FaultMemory):
 def test_what_is_raised_without_a_value_has_none(memory: FaultMemory):
     memory.raise_dtc(3, Dtc.NODE_RESET, "LEFT_SK")
     assert told(memory) == [(3, "NODE_RESET", "LEFT_SK", "error", 0.0)]
+
+
+def test_events_that_never_end_take_bounded_memory_and_are_counted(memory: FaultMemory):
+    total = EVENTS_KEPT + 100
+    for number in range(total):
+        memory.raise_dtc(number * QUIET_CONFIRMED, Dtc.OVER_TEMP, "LEFT_SK", value=number)
+        memory.close_cycle(number * QUIET_CONFIRMED)
+        memory.close_cycle(number * QUIET_CONFIRMED + 1)
+    events = memory.events
+    assert (len(events), events.count, events.dropped) == (EVENTS_KEPT, total, 100)
+    assert [event.value for event in events] == list(range(100, total))
+
+
+def test_events_since_a_number_are_each_returned_once_while_older_ones_are_dropped():
+    log, seen, number = EventLog(4), [], 0
+    for burst in (0, 1, 3, 4, 2, 4):
+        for _ in range(burst):
+            log.append(Event(log.count, "READY", ""))
+        seen += [event.cycle for event in log.since(number)]
+        number = log.count
+    assert seen == list(range(14))
+    assert (log[0].cycle, log[-1].cycle, log.dropped) == (10, 13, 10)
+
+
+@pytest.mark.parametrize(("number", "cycles"), [(0, [2, 3, 4, 5]), (1, [2, 3, 4, 5]), (4, [4, 5]), (6, []), (9, [])])
+def test_events_since_a_number_are_those_that_are_kept(number: int, cycles: list[int]):
+    log = EventLog(4)
+    for cycle in range(6):
+        log.append(Event(cycle, "READY", ""))
+    assert [event.cycle for event in log.since(number)] == cycles

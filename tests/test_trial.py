@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 import signal
@@ -27,6 +28,7 @@ from atalante_control.guide_shapes import SHAPES
 from atalante_emulator.body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
+from atalante_hal import fault_memory
 from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.frame import Frames
 from atalante_hal.hal import Hal
@@ -34,7 +36,7 @@ from atalante_hal.loop import LockStep, run
 from atalante_hal.robot import JOINTS, load_robot
 from atalante_hal.telemetry.process import Recording, TelemetryProcess, TelemetrySummary
 from atalante_hal.telemetry.schema import message_class
-from atalante_hal.types import State
+from atalante_hal.types import State, SupervisorState
 from atalante_tools import trial
 from atalante_tools.cli import cli
 from atalante_tools.run_folder import Result, results_table
@@ -315,10 +317,20 @@ def test_a_recording_with_a_gap_fails_the_run_and_is_counted(tmp_path: Path, mon
     old, new = endpoints
     assert old != new
     assert done.stderr.index(f"telemetry on Zenoh at {old}") < done.stderr.index(f"telemetry on Zenoh at {new}")
-    said = (
-        f"atalante: the recording is not complete: {missing} cycles are missing from recording.mcap, recording-1.mcap"
-    )
-    assert done.stderr.splitlines()[-1] == said
+    said = f"one file with every cycle, got recording.mcap, recording-1.mcap with {missing} cycles missing"
+    assert done.stderr.splitlines()[-1] == f"atalante: the recording must be {said}"
+
+
+def test_every_event_is_recorded_of_a_hal_that_keeps_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(fault_memory, "EventLog", functools.partial(fault_memory.EventLog, 1))
+    done = CliRunner().invoke(cli, ["hang", "--steps", "1", "--out", str(tmp_path)])
+    assert done.exit_code == 0, done.stderr
+    with (tmp_path / "recording.mcap").open("rb") as file:
+        events = [
+            message_class("Event").FromString(message.data).code
+            for _, _, message in make_reader(file).iter_messages(topics=["/events"])
+        ]
+    assert [code for code in events if code in SupervisorState.__members__] == ["READY", "ACTIVE", "HOLD"]
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

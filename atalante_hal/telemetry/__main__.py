@@ -1,8 +1,8 @@
 """The telemetry process: `python -m atalante_hal.telemetry ORDER`, started by `process.TelemetryProcess` and nobody else.
 
-ORDER is JSON: the configuration, the inherited descriptors of the rings, how many processes this one comes after, and
-the endpoint of the last of them. One JSON line on stdout says that everything is
-open (or what could not be had), another at the end what became of it.
+ORDER is JSON: the configuration, the inherited descriptors of the rings, the number of processes before this one, and the
+endpoint of the last of them. One JSON line on stdout says that everything is open (or what could not be had), another at the
+end what became of it.
 """
 
 from __future__ import annotations

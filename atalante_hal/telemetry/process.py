@@ -2,9 +2,9 @@
 
 The child is a fresh interpreter (`python -m atalante_hal.telemetry`, see `service`), never a fork, in a process group of
 its own: the terminal's Ctrl-C goes to the loop, which then closes the rings. It may be killed, stopped or starved at any
-time: `write` never waits for it, except in lock-step with a recording or a CAN log, and there not for
-long. A loop that calls `tend` now and then gets a new child for one that died or hangs: same rings, the same endpoint or,
-if that is taken, another one as at the first start, files of its own beside those of the first.
+time: `write` never waits for it, except in lock-step with a recording or a CAN log, and there not for long. A loop that
+calls `tend` now and then gets a new child for one that died or hangs: same rings, the same endpoint or, if that is taken,
+another one as at the first start, files of its own beside those of the first.
 """
 
 from __future__ import annotations
@@ -113,9 +113,7 @@ class Recording:
 
     files: tuple[str, ...]  # names, in order: one of the first child and one of each child that replaced another
     complete: bool  # one file with its index, and no cycle is missing
-    missing_cycles: (
-        int  # cycles of the loop that are in no file; at 100 Hz the nine between two messages count with them
-    )
+    missing_cycles: int  # of the loop, in no file; at 100 Hz the cycles between two messages belong to the second one
 
 
 @dataclass(frozen=True)
@@ -211,14 +209,8 @@ class TelemetryProcess(Closing):
         """Start a child and wait until it is ready; return its notices, one sentence each. Raises as `start`."""
         rings = {"records": self.records, "events": self.events, "frames": self.frames}
         fds = {name: ring.fd for name, ring in rings.items() if ring is not None}
-        order = json.dumps(
-            {
-                "config": config.to_json(),
-                "rings": fds,
-                "restarts": self._restarts,
-                "endpoint": self._last_endpoint,
-            }
-        )
+        before = {"restarts": self._restarts, "endpoint": self._last_endpoint}
+        order = json.dumps({"config": config.to_json(), "rings": fds, **before})
         self._child = subprocess.Popen(
             [sys.executable, "-P", "-m", "atalante_hal.telemetry", order],
             stdin=subprocess.DEVNULL,

@@ -99,7 +99,7 @@ class Stepper:
 
     @property
     def codes(self) -> list[str]:
-        """Diagnostic codes of everything that happened so far."""
+        """Return the diagnostic codes of the events so far, the newest `fault_memory.EVENTS_KEPT` of them."""
         return [event.code for event in self.hal.events]
 
     def cycle(self) -> State:

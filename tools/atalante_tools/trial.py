@@ -135,8 +135,8 @@ def _require_complete(recording: Recording | None) -> None:
     """
     if recording is not None and not recording.complete:
         raise Failed(
-            f"the recording is not complete: {recording.missing_cycles} cycles are missing from "
-            f"{', '.join(recording.files)}"
+            f"the recording must be one file with every cycle, got {', '.join(recording.files)} "
+            f"with {recording.missing_cycles} cycles missing"
         )
 
 
@@ -239,14 +239,14 @@ class _Walk:
         if not hal.state.cycle % _TEND_CYCLES:
             self._telemetry.tend()
             self._report_endpoint()
-        if len(hal.events) != self._told:
+        if hal.events.count != self._told:
             self._tell()
 
     def _tell(self) -> None:
         events = self._rig.hal.events
-        for event in events[self._told :]:
+        for event in events.since(self._told):
             self._telemetry.event(event.cycle, event.code, event.text, event.severity, event.node, event.value)
-        self._told = len(events)
+        self._told = events.count
 
     def _done(self, state: State) -> bool:
         return self._controller.statistics.steps >= self._steps

@@ -33,6 +33,7 @@ from atalante_tools.rig import Rig, open_hal
 
 if TYPE_CHECKING:
     from atalante_emulator.pendant import Operator
+    from atalante_hal.telemetry.events import Event
 
 Vector = npt.NDArray[np.float64]
 #: What the controller records of its guide: tracking error of the assisted joints, and how far off the guide is.
@@ -124,6 +125,8 @@ class _Run:
         self._moment = Moment([one for one in case.happens if isinstance(one, Host)], moment)
         self._witness = Witness()
         self._seen: list[_Seen] = []
+        self._events: list[Event] = []  # without the HOLD in which the loop ends
+        self._counted = 0  # events of the HAL that are in `_events` or were dropped
 
     def go(self, until: Callable[[State], bool]) -> None:
         """Run the rig until `until(state)`; the operator presses START when the HAL is first READY."""
@@ -152,7 +155,8 @@ class _Run:
             def record() -> None:
                 self.states.append(hal.state.supervisor)
                 self._seen.append(_Seen.of(rig))
-                self._told = len(hal.events)
+                self._events += hal.events.since(self._counted)
+                self._counted = hal.events.count
 
             def over(state: State) -> bool:
                 nonlocal waiting
@@ -163,7 +167,6 @@ class _Run:
                 return until(state)
 
             run(hal, controller, DisturbedClock(self._moment), until=over, record=record)
-            self._events = tuple(hal.events[: self._told])  # without the HOLD in which the loop ends
             self._messages = hal.messages
 
     def _before(self, cycle: int, operator: Operator) -> None:
@@ -185,7 +188,7 @@ class _Run:
             over=None if ends is None else self._begins + ends,
             pressed=pressed,
             states=tuple(self.states),
-            events=self._events,
+            events=tuple(self._events),
             commands=Commands(shared.network, cycles[keep], frames[keep]),
             messages=self._messages,
             **{name: np.array(column) for name, column in zip(_Seen._fields, columns, strict=True)},
