@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
 import threading
@@ -20,9 +19,8 @@ import atalante_tools.hil  # noqa: F401
 
 pytest_plugins = ["pytester"]
 
-#: The example of the README, as it stands there.
-README = Path(__file__).parent.parent / "README.md"
-(EXAMPLE,) = re.findall(r"<!-- example: pytest -->\n```python\n(.*?)```", README.read_text(), re.DOTALL)
+#: The fault test of the documentation.
+EXAMPLE = (Path(__file__).parent.parent / "examples" / "test_lost_frames.py").read_text()
 VIRTUAL = ("--can-interface", "virtual", "--can-channel")
 
 
@@ -52,8 +50,7 @@ def test_a_pytest_that_does_not_use_it_does_not_pay_for_it():
 # -- on the embedded robot ---------------------------------------------------------------------------------------------
 
 
-def test_the_example_of_the_readme_passes(run):
-    assert sum(bool(line.strip()) for line in EXAMPLE.splitlines()) <= 10
+def test_the_example_passes(run):
     run(EXAMPLE).assert_outcomes(passed=1)
 
 

@@ -1,0 +1,35 @@
+"""Hold the pose that the joints have when the operator presses START: a controller of your own in twenty lines.
+
+Run it:  python examples/hold_pose.py                       on an emulated robot, two seconds of robot time
+         python examples/hold_pose.py socketcan vcan0       on a robot or an emulator that is on a CAN bus
+
+Prints why the robot went to HOLD at the end, and the joint angles [degrees].
+"""
+
+import sys
+
+import numpy as np
+
+from atalante_hal.types import Command
+from atalante_tools.options import Target
+from atalante_tools.rig import open_hal
+
+
+class Spring:
+    """A PD controller around the pose at the start."""
+
+    telemetry, telemetry_fields = np.zeros(0), ()
+
+    def reset(self, state):
+        """Store the pose to hold."""
+        self.rest = state.position.copy()
+
+    def update(self, state):
+        """Return the joint torques [Nm] and vibration levels of this cycle."""
+        return Command(torque=2000 * (self.rest - state.position) - 20 * state.velocity, vibration=np.zeros(8))
+
+
+interface, channel = sys.argv[1:] or ("embedded", "")
+with open_hal(Target(interface, channel, lockstep=interface == "embedded")) as rig:
+    rig.run(Spring(), until=lambda state: state.time >= 2.0)
+    print(rig.hal.reason, np.degrees(rig.hal.state.position).round(1))

@@ -1,0 +1,42 @@
+"""Walk inside a virtual guide of your own shape: wide at the ends of the step, 3 degrees at its middle.
+
+Run it:  python examples/own_guide_shape.py
+
+Prints whether the guide is certified at the assistance factor 0.5, then the largest |e| / q_bound of two steps in the air.
+A value below 1 means that hip and knee of the swing leg stayed inside the guide.
+"""
+
+import numpy as np
+
+from atalante_control.controller import HangController
+from atalante_control.gait import HANG_GAIT, load_gait
+from atalante_control.guide_shapes import GuideShape
+from atalante_hal.robot import load_robot
+from atalante_tools.options import Target
+from atalante_tools.rig import open_hal
+
+XI = 0.5  # assistance factor
+
+
+def waist(phase, half_width):
+    """Return the upper and the lower bound as fractions of the half-width, each of shape (n,).
+
+    Args:
+        phase: time since the step change over the step duration, 0 to 1, shape (n,).
+        half_width: of the guide at the assistance factor [rad].
+    """
+    narrowest = min(1.0, np.radians(3.0) / half_width)
+    fraction = 1.0 - (1.0 - narrowest) * np.sin(np.pi * phase) ** 2
+    return fraction, fraction
+
+
+robot = load_robot()
+gait = load_gait(HANG_GAIT, robot)
+controller = HangController(robot, gait, GuideShape("waist", "3 degrees at the middle of the step", waist))
+certificate = controller.certificate(XI)
+print("certified" if certificate.certified else "not certified", "-", certificate.reason)
+
+target = Target("embedded", "", lockstep=True)
+with open_hal(target, assistance_factor=XI, controller_fields=controller.telemetry_fields) as rig:
+    rig.run(controller, until=lambda state: controller.statistics.steps >= 2)
+    print(f"{rig.hal.reason}; largest |e| / q_bound {controller.statistics.max_ratio:.2f}")

@@ -1,0 +1,28 @@
+"""Subscribe to the joint states of a running HAL. Uses Zenoh and protobuf, and no module of this project.
+
+Run it:  atalante hang --steps 100                          in one terminal
+         python examples/subscribe.py                       in another one, from the root of the project
+         python examples/subscribe.py tcp/192.0.2.7:7447    another endpoint
+
+Prints the cycle number and the twelve joint angles [rad], 100 times for each second of robot time. Stop it with Ctrl-C.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import zenoh
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+DESCRIPTORS = Path("atalante_hal/telemetry/messages.binpb")
+endpoint = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447"
+
+pool = descriptor_pool.DescriptorPool()
+for file in descriptor_pb2.FileDescriptorSet.FromString(DESCRIPTORS.read_bytes()).file:
+    pool.Add(file)
+config = zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": {"endpoints": [endpoint]}}))
+with zenoh.open(config) as session, session.declare_subscriber("atalante/*/joint_states") as subscriber:
+    for sample in subscriber:
+        message_type = pool.FindMessageTypeByName(str(sample.encoding).split(";")[1])
+        states = message_factory.GetMessageClass(message_type).FromString(sample.payload.to_bytes())
+        print(states.cycle, dict(zip(states.name, states.position, strict=True)))

@@ -1,0 +1,152 @@
+"""README and documentation are true: their commands run, their Python compiles, their links and paths exist."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import click
+import pytest
+
+from atalante_tools.cli import COMMANDS, cli
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+PAGES = {str(page.relative_to(ROOT)): page.read_text() for page in (ROOT / "README.md", *sorted(DOCS.rglob("*.md")))}
+MAKEFILE = (ROOT / "Makefile").read_text()
+BLOCK = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
+INCLUDE = re.compile(r"--8<-- \"([^\"]+)\"")
+#: Lines of ```sh blocks that are not run here, by the first pattern that is found in them, and why.
+NOT_RUN = {
+    r"-i socketcan|--can-interface": "needs a CAN interface",
+    r"^make ": "builds, installs or runs the whole suite; continuous integration runs it",
+    r"^\. ": "the tests run in this environment",
+    r"^python examples/": "tests/test_examples.py runs the examples",
+    r"^python -m pytest": "runs tests that are part of this suite",
+    r"^atalante hang --steps 100": "runs until the reader stops it; tests/test_examples.py runs it with the subscriber",
+    r"^atalante gait (library|fit|check)": "takes minutes",
+    r"^atalante faults campaign": "takes an hour",
+}
+
+
+def blocks(page: str, language: str) -> list[str]:
+    """Return the fenced blocks of a language in a page."""
+    return [textwrap.dedent(text) for _, found, text in BLOCK.findall(PAGES[page]) if found == language]
+
+
+def commands(page: str) -> list[str]:
+    """Return the lines of the ```sh blocks of a page, without comments."""
+    lines = [line for block in blocks(page, "sh") for line in block.splitlines()]
+    return [line.split("  #")[0].strip() for line in lines if line.strip()]
+
+
+def reason_not_to_run(line: str) -> str | None:
+    """Return why a line is not run; None: it is."""
+    return next((reason for pattern, reason in NOT_RUN.items() if re.search(pattern, line)), None)
+
+
+def runnable(page: str) -> list[str]:
+    """Return the lines of a page that are run, in their order. What the README shares with the quickstart runs there."""
+    shared = commands("docs/quickstart.md") if page == "README.md" else []
+    return [line for line in commands(page) if line not in shared and reason_not_to_run(line) is None]
+
+
+ALL = [(page, line) for page in PAGES for line in commands(page)]
+MAKE = sorted(
+    {match for page in PAGES.values() for match in re.findall(r"`?make ([a-z-]+)`?(?:$|`|  )", page, re.MULTILINE)}
+)
+
+
+def test_there_are_commands_to_check():
+    assert sum(line.startswith("atalante ") for _, line in ALL) >= 20
+    assert {"demo", "test", "docs"} <= set(MAKE)
+
+
+def test_every_reason_not_to_run_a_command_is_needed():
+    for pattern in NOT_RUN:
+        assert any(re.search(pattern, line) for _, line in ALL), f"no command matches {pattern}"
+
+
+@pytest.mark.parametrize("line", sorted({line for _, line in ALL if line.startswith("atalante ")}))
+def test_a_command_is_accepted_by_the_parser(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The program's own parser, down to the subcommand; nothing is run."""
+    (tmp_path / "runs").mkdir()  # as the commands before it leave it
+    (tmp_path / "runs" / "old.dbc").touch()
+    (tmp_path / "dbc").symlink_to(ROOT / "dbc")
+    monkeypatch.chdir(tmp_path)
+    command: click.Command = cli
+    arguments = shlex.split(line)[1:]
+    context = click.Context(command)
+    while isinstance(command, click.Group):
+        name, arguments = arguments[0], arguments[1:]
+        found = command.get_command(context, name)
+        assert found is not None, f"no command {name}"
+        context, command = click.Context(found, parent=context, info_name=name), found
+    command.make_context(command.name, arguments, parent=context.parent)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if runnable(page)])
+def test_the_commands_of_a_page_succeed_in_their_order(page: str, tmp_path: Path):
+    """In a folder that looks like the root of the project and keeps what the commands write."""
+    for name in ("atalante_hal", "dbc", "tests"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    for line in runnable(page):
+        done = subprocess.run(
+            ["bash", "-c", line], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
+        )
+        assert done.returncode == 0, f"{line}\n{done.stderr}"
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_python_blocks_compile_and_includes_exist(page: str):
+    for path in INCLUDE.findall(PAGES[page]):
+        assert (ROOT / path).is_file(), path
+    for block in blocks(page, "python"):
+        text = INCLUDE.sub(lambda include: (ROOT / include[1]).read_text(), block)
+        compile(text, page, "exec")
+
+
+@pytest.mark.parametrize("target", MAKE)
+def test_a_make_target_exists(target: str):
+    assert re.search(rf"^{target}:", MAKEFILE, re.MULTILINE)
+
+
+def test_make_alone_lists_every_target():
+    done = subprocess.run(["make", "--no-print-directory"], cwd=ROOT, capture_output=True, text=True, check=True)
+    (phony,) = re.findall(r"^\.PHONY: (.*)$", MAKEFILE, re.MULTILINE)
+    assert [line.split()[0] for line in done.stdout.splitlines()] == phony.split()
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_paths_in_backticks_exist(page: str):
+    paths = re.findall(r"`((?:[\w.-]+/)+[\w.-]*)`", PAGES[page])
+    made = ("runs/", "site/", "failed/")  # by commands
+    missing = [path for path in paths if not path.startswith(made) and not (ROOT / path).exists()]
+    assert missing == []
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_to_files(page: str):
+    links = re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", PAGES[page])
+    folder = (ROOT / page).parent
+    assert [link for link in links if "://" not in link and not (folder / link).exists()] == []
+
+
+def test_every_page_is_in_the_navigation_once():
+    navigation = re.findall(r"^ +- [^:\n]+: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    assert sorted(navigation) == sorted(str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md"))
+
+
+def test_the_command_line_page_has_every_command():
+    page = PAGES["docs/reference/cli.md"]
+    assert re.findall(r"^\| `atalante (\w+)` \|", page, re.MULTILINE) == list(COMMANDS)
+
+
+def test_the_picture_is_small():
+    assert (DOCS / "img" / "guide_shapes.png").stat().st_size <= 120_000

@@ -1,0 +1,81 @@
+"""The programs in examples/ run to success and print what their docstrings say."""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+
+
+def run(name: str) -> str:
+    """Run an example from the root of the project; return what it prints on stdout."""
+    done = subprocess.run([sys.executable, f"examples/{name}"], capture_output=True, text=True, cwd=ROOT, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
+def test_an_example_is_short_and_explains_itself(path: Path):
+    text = path.read_text()
+    assert len(text.splitlines()) <= 60
+    docstring = ast.get_docstring(ast.parse(text)) or ""
+    assert "Run it:" in docstring
+    assert path.name in docstring
+    assert "Prints" in docstring
+
+
+def test_the_controller_holds_the_pose_until_the_program_ends():
+    assert run("hold_pose.py").startswith("the program is ending [")  # not another reason for HOLD
+    body = (ROOT / "examples" / "hold_pose.py").read_text().split('"""', 2)[2]
+    assert sum(bool(line.strip()) for line in body.splitlines()) <= 20
+
+
+def test_the_own_bus_counts_frames_of_both_directions():
+    (line,) = (line for line in run("own_bus.py").splitlines() if line.startswith("HOLD "))
+    assert "SYNC_LEFT_LEG" in line
+
+
+def test_the_own_guide_shape_is_certified_and_kept():
+    certificate, walk = run("own_guide_shape.py").splitlines()
+    assert certificate.startswith("certified - ")
+    assert walk.startswith("the program is ending")
+    assert float(walk.split()[-1]) < 1.0
+
+
+def test_the_fault_test_passes(tmp_path: Path):
+    test = ["-m", "pytest", "-n", "0", "-p", "no:cacheprovider", "examples/test_lost_frames.py"]
+    done = subprocess.run([sys.executable, *test], capture_output=True, text=True, cwd=ROOT, timeout=300)
+    assert "1 passed" in done.stdout, done.stdout
+
+
+def test_the_subscriber_receives_joint_states_without_our_modules(tmp_path: Path):
+    text = (ROOT / "examples" / "subscribe.py").read_text()
+    assert not re.search(r"^\s*(import|from) atalante", text, re.MULTILINE)
+    walk = [str(Path(sys.executable).with_name("atalante")), "hang", "--steps", "100", "--out", str(tmp_path / "run")]
+    with subprocess.Popen(walk, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as hal:
+        assert hal.stderr is not None
+        try:
+            listening = next(line for line in hal.stderr if "Zenoh at" in line)
+            endpoint = re.search(r"tcp/127\.0\.0\.1:\d+", listening)
+            assert endpoint
+            command = [sys.executable, "-u", "examples/subscribe.py", endpoint[0]]
+            with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT, text=True) as subscriber:
+                assert subscriber.stdout is not None
+                lines = [subscriber.stdout.readline() for _ in range(20)]
+                subscriber.kill()
+        finally:
+            hal.kill()
+            hal.stderr.close()
+    cycles = [int(line.split()[0]) for line in lines]
+    # 100 Hz of robot time: every tenth cycle, in order.
+    assert all(b - a == 10 for a, b in itertools.pairwise(cycles))
+    assert "'left_SH'" in lines[0]
+    assert lines[0].count(":") == 12
