@@ -61,6 +61,7 @@ class Dtc(StrEnum):
     E2E_LOSS_RATE = "E2E_LOSS_RATE", _R.HOLD, _S.ERROR, "more than a fifth of a node's frames is lost"
     NODE_TIMEOUT = "NODE_TIMEOUT", _R.HOLD, _S.ERROR, "a node is silent"
     NODE_LATE = "NODE_LATE", _R.HOLD, _S.ERROR, "a node answers an earlier SYNC than the last"
+    NODE_DUPLICATE = "NODE_DUPLICATE", _R.HOLD, _S.ERROR, "two senders of one message"
     FRAME_LENGTH = "FRAME_LENGTH", _R.HOLD, _S.ERROR, "length or format of a frame is not the DBC's"
     FRAME_UNKNOWN = "FRAME_UNKNOWN", _R.INFO, _S.WARNING, "a frame with an identifier nobody has"
     SIGNAL_RANGE = "SIGNAL_RANGE", _R.HOLD, _S.ERROR, "a signal is outside its DBC range"

@@ -35,13 +35,14 @@ class Check(IntEnum):
     OK = 0
     SOME_LOST = 1  # fresh, but 1 to 4 frames before it are missing
     NO_DATA = 2  # nothing came
-    REPEATED = 3  # counter has not moved
-    WRONG_SEQUENCE = 4  # counter jumped: replayed, or more than 4 lost
-    CRC = 5  # damaged, or another message's data
-    LENGTH = 6  # length or frame format is not the DBC's
-    RANGE = 7  # a signal is outside its range
-    INVALID = 8  # a signal carries its invalid code: the node says that it has no value
-    IMPLAUSIBLE = 9  # the frame is right and what it says cannot be true
+    REPEATED = 3  # counter has not moved, and the frame is the one accepted last
+    CONFLICT = 4  # counter has not moved, and the frame has other bytes than the one accepted last
+    WRONG_SEQUENCE = 5  # counter jumped: replayed, or more than 4 lost
+    CRC = 6  # damaged, or another message's data
+    LENGTH = 7  # length or frame format is not the DBC's
+    RANGE = 8  # a signal is outside its range
+    INVALID = 9  # a signal carries its invalid code: the node says that it has no value
+    IMPLAUSIBLE = 10  # the frame is right and what it says cannot be true
 
     @property
     def fresh(self) -> bool:
@@ -143,8 +144,11 @@ def check_counter(last: int | None, received: int) -> Check:
 
 #: The leaky bucket of a message: a bad cycle fills it, a good one empties it, and full it trips. Steady loss above a fifth trips.
 BAD_CYCLE, GOOD_CYCLE, FULL = 4, 1, 64
-#: Good cycles in a row after which a message is trusted (again): no flapping.
+#: Good cycles in a row after which a message is trusted (again): no flapping. A pendant presses nothing before.
 REQUALIFY = 16
+#: What a cycle with a frame of a second sender adds to the evidence of one; a cycle without takes `GOOD_CYCLE` away. Confirmed
+#: at `FULL`: four cycles in a row. A takeover between two pendants overlaps by two.
+RIVAL_CYCLE = 16
 
 
 class Qualification(NamedTuple):
@@ -164,7 +168,7 @@ def qualify(before: Qualification, *, good: bool, timed_out: bool = False) -> Qu
 
     Args:
         good: new and intact data came.
-        timed_out: the data is as old as its timeout: trust is lost at once.
+        timed_out: the data is as old as its timeout, or its sender is not the only one: trust is lost at once.
     """
     if timed_out:
         return Qualification(before.bucket, 0, False)
@@ -174,3 +178,13 @@ def qualify(before: Qualification, *, good: bool, timed_out: bool = False) -> Qu
     in_row = min(before.good + 1, REQUALIFY)
     now = Qualification(max(before.bucket - GOOD_CYCLE, 0), in_row, before.trusted or in_row == REQUALIFY)
     return SETTLED if now == SETTLED else now
+
+
+def suspect(evidence: int, *, rival: bool) -> int:
+    """Return the evidence of two senders of one message after one more cycle, 0 to `FULL`.
+
+    Args:
+        evidence: of the cycle before.
+        rival: a frame came in this cycle that the sender of the accepted frame cannot have sent.
+    """
+    return min(evidence + RIVAL_CYCLE, FULL) if rival else max(evidence - GOOD_CYCLE, 0)

@@ -15,7 +15,7 @@ import numpy as np
 from atalante_dbc import Network
 from atalante_hal.codec import Vector
 from atalante_hal.diagnostics import Dtc, Reaction, emergency
-from atalante_hal.e2e import Check
+from atalante_hal.e2e import FULL, Check, suspect
 from atalante_hal.fault_memory import FaultMemory
 from atalante_hal.frame import Frames
 from atalante_hal.image import NEVER, ReceiveImage
@@ -77,6 +77,8 @@ class Heartbeats:
         #: Emergencies that only inform, since the last judgement.
         self._notices: list[tuple[str, Dtc, int]] = []
         self._reset: set[str] = set()  # nodes that began anew since the last judgement
+        #: Row -> evidence of two senders, of the rows that have any, one step a frame.
+        self._evidence: dict[int, int] = {}
         #: Every node that has to has sent a status.
         self.known = False
         self.quiet = True
@@ -94,10 +96,13 @@ class Heartbeats:
         self._age(cycle)
         unknown = []
         for place, frame_id in enumerate(frames["can_id"].tolist()):
+            refused = len(image.refused)
             if image.accept_each(frames[place:], 1):
                 unknown.append(place)
                 continue
-            if image.check[image.frame_ids[frame_id]] > _FRESH:
+            row = image.frame_ids[frame_id]
+            self._suspect(row, rival=image.refused[refused:] == [(row, Check.CONFLICT)])
+            if image.check[row] > _FRESH:
                 self.quiet = False
                 continue
             if frame_id in self._status_of:
@@ -112,10 +117,15 @@ class Heartbeats:
     def judge(self, cycle: int, memory: FaultMemory) -> None:
         """Raise what is wrong with any node."""
         self._age(cycle)
+        messages = self.image.codec.messages
         for row, why in self.image.refused:
             dtc = _REFUSED.get(why, Dtc.SIGNAL_RANGE)
-            memory.raise_dtc(cycle, dtc, self.image.codec.messages[row].sender, confirmed=False)
+            memory.raise_dtc(cycle, dtc, messages[row].sender, confirmed=False)
         self.image.refused = []
+        two_senders = [row for row, evidence in self._evidence.items() if evidence == FULL]
+        for row in two_senders:
+            text = f"{messages[row].sender}: {Dtc.NODE_DUPLICATE.meaning}, {messages[row].name}: switch one of them off"
+            memory.raise_dtc(cycle, Dtc.NODE_DUPLICATE, messages[row].sender, value=FULL, text=text)
         for node in self._reset:
             memory.raise_dtc(cycle, Dtc.NODE_RESET, node)
         self._reset.clear()
@@ -125,7 +135,7 @@ class Heartbeats:
         for node, (dtc, code) in self.emergencies.items():
             text = f"{node}: {dtc.meaning} (emergency 0x{code:04X})"
             memory.raise_dtc(cycle, dtc, node, value=code, text=text)
-        self.quiet = not self.emergencies
+        self.quiet = not (self.emergencies or two_senders)
         for status in self._statuses:
             self._judge_status(cycle, memory, status)
 
@@ -152,6 +162,13 @@ class Heartbeats:
             self.image.new_cycle(cycle - self._seen)
             self.image.refused = refused
             self._seen = cycle
+
+    def _suspect(self, row: int, *, rival: bool) -> None:
+        """Weigh one more frame of a row. A sender that begins anew may meet the last counter once, two senders do often."""
+        before = self._evidence.get(row, 0)
+        if rival or before:
+            self.quiet = False
+            self._evidence[row] = suspect(before, rival=rival)
 
     def _take_status(self, status: _Status) -> None:
         values = self.image.values
@@ -194,4 +211,9 @@ class Heartbeats:
 
 
 _SIGNALS = ("NodeState", "DbcHash", "SupplyVoltage")
-_REFUSED = {Check.REPEATED: Dtc.E2E_REPEATED, Check.CRC: Dtc.E2E_CRC, Check.LENGTH: Dtc.FRAME_LENGTH}
+_REFUSED = {
+    Check.REPEATED: Dtc.E2E_REPEATED,
+    Check.CONFLICT: Dtc.NODE_DUPLICATE,
+    Check.CRC: Dtc.E2E_CRC,
+    Check.LENGTH: Dtc.FRAME_LENGTH,
+}

@@ -44,8 +44,10 @@ from atalante_hal.frame import FRAME_BYTES, HEADER_BYTES, WORDS, Frames, as_word
 _NO_TAG = -1
 #: `Check`s as plain integers; up to the first, data is new.
 _FRESH = _SOME_LOST = int(Check.SOME_LOST)
-_REPEATED, _WRONG_SEQUENCE = int(Check.REPEATED), int(Check.WRONG_SEQUENCE)
+_REPEATED, _CONFLICT, _WRONG_SEQUENCE = int(Check.REPEATED), int(Check.CONFLICT), int(Check.WRONG_SEQUENCE)
 _CRC, _LENGTH, _RANGE, _INVALID = int(Check.CRC), int(Check.LENGTH), int(Check.RANGE), int(Check.INVALID)
+#: Checks of frames that say nothing, or nothing that the accepted frame has not said.
+_SAYS_NOTHING_NEW = frozenset({Check.CRC, Check.LENGTH, Check.REPEATED})
 #: In the place of a row: the frame is no message of the image.
 _FOREIGN = -1
 #: Age of a message that never came.
@@ -64,7 +66,8 @@ class ReceiveImage:
     cycle it is in counts age from the SYNC a frame answers, however late it came.
 
     Args:
-        restarts: the senders may begin anew at any counter (status, emergencies): only the last one again is refused.
+        restarts: the senders may begin anew at any counter (status, emergencies): only the last frame again is refused. A
+            frame with the last counter and other bytes is committed, and listed in `refused` as a CONFLICT all the same.
     """
 
     def __init__(self, messages: Sequence[Message], values: Vector | None = None, *, restarts: bool = False) -> None:
@@ -79,8 +82,9 @@ class ReceiveImage:
         #: What was not committed in this cycle: row and why, one entry a frame.
         self.refused: list[tuple[int, Check]] = []
         self._restarts = restarts
+        #: The last frame of each row with the right format, CRC and sequence, shape (rows,).
         self.frames = self.codec.template()
-        self._words = self.frames.view(np.int64)
+        self._kept: Octets = self.frames.view(np.uint8)
         self._headers: Words = as_words(self.frames)[:, 0].astype(np.int64)
         self._expected_headers = self._headers.tobytes()
         self.frame_ids = {message.frame_id: row for row, message in enumerate(self.codec.messages)}
@@ -92,6 +96,8 @@ class ReceiveImage:
         self._age_before: npt.NDArray[np.int64] = self.age.copy()
         #: The last cycle was perfect: every row was committed exactly as expected.
         self.all_fresh = self._was_fresh = False
+        #: The frames of the last `accept_each`, and of each its row and `Check`.
+        self._offered: tuple[Frames, Words] | None = None
         self._ordered = _Received(new_frames(count), count)
         self._received = self._ordered
         self._accept_exact, self._accept_frames = compiled(accept_exact), compiled(accept_frames)
@@ -172,9 +178,10 @@ class ReceiveImage:
             self.codec.codes,
             self.values,
             self.values_before,
-            self._words,
+            self._kept,
         ):
             return False
+        self._offered = None
         if not self.all_fresh:
             self.age.fill(0)
             self.check.fill(Check.OK)
@@ -208,8 +215,9 @@ class ReceiveImage:
             self.values,
             self.age,
             self.check,
-            self._words,
+            self._kept,
         )
+        self._offered = frames, found
         foreign = []
         for place, (row, check) in enumerate(found.tolist()):
             if row == _FOREIGN:
@@ -218,6 +226,33 @@ class ReceiveImage:
                 self.refused.append((row, Check(check)))
                 self.crc_errors += check == _CRC
         return foreign
+
+    def beside(self, row: int) -> list[Vector]:
+        """Decode the other intact frames of a row that came in this cycle beside the one committed last.
+
+        Repetitions of an accepted frame are left out. Call it before the receive buffer is used again.
+
+        Returns:
+            `values` with the row's signals as each of the frames has them, in order of arrival. Shape (codec.size,) each, DBC
+            units; the signals may be outside their range.
+        """
+        if self._offered is None:
+            return []
+        frames, found = self._offered
+        mine = [(place, check) for place, (of, check) in enumerate(found.tolist()) if of == row]
+        committed = max((place for place, check in mine if check <= _FRESH), default=None)
+        return [
+            self._decoded(frames, place, row)
+            for place, check in mine
+            if place != committed and check not in _SAYS_NOTHING_NEW
+        ]
+
+    def _decoded(self, frames: Frames, place: int, row: int) -> Vector:
+        codec, codes, values = self.codec, np.zeros_like(self.codec.codes), self.values.copy()
+        signals = codec.signals_by_row[codec.row_begins[row] : codec.row_begins[row + 1]]
+        read_row(frames.view(np.int64), (place - row) * WORDS, signals, codec.plan, codes)
+        scale_row(codes, signals, codec.scales, values)
+        return values
 
 
 class _Received:
@@ -243,7 +278,7 @@ def accept_exact(
     codes: Words,
     values: Vector,
     values_before: Vector,
-    kept: Words,
+    kept: Octets,
 ) -> bool:
     """Commit rows that are exactly the expected messages, in order, intact, in sequence, in range and of this cycle.
 
@@ -255,7 +290,7 @@ def accept_exact(
         tag: counter all have to carry, or `_NO_TAG`.
         plan, scales, codes: of the codec.
         values, values_before: shape (size,); the new ones, and what they were.
-        kept: the last good frames, shape (rows * 9,); rewritten.
+        kept: the last accepted frames, shape (rows * 72,); rewritten.
 
     Returns:
         Whether they were; if not, nothing was changed.
@@ -267,7 +302,7 @@ def accept_exact(
         return False
     values_before[:] = values
     scale(codes, scales, values)
-    kept[:] = words
+    kept[:] = octets
     for row in range(len(headers)):
         expected[row] = expected[row] + 1 & 0xFF
     return True
@@ -290,7 +325,7 @@ def accept_frames(
     values: Vector,
     age: Words,
     check: Octets,
-    kept: Words,
+    kept: Octets,
 ) -> None:
     """Judge frames one by one in order of arrival and commit the good ones.
 
@@ -306,19 +341,19 @@ def accept_frames(
         if row == _FOREIGN:
             continue
         behind = (place - row) * FRAME_BYTES
-        result = judge_frame(words, octets, row, behind, headers, spans, expected, tag, restarts)
+        result = judge_frame(words, octets, row, behind, headers, spans, expected, tag, restarts, kept)
+        new = result <= _FRESH or (restarts and result == _CONFLICT)
         signals = signals_by_row[row_begins[row] : row_begins[row + 1]]
-        if result <= _FRESH:
+        if new:
             said = read_row(words, first - row * WORDS, signals, plan, codes)
             if said != INSIDE:
-                result = _INVALID if said == SAYS_INVALID else _RANGE
+                new, result = False, _INVALID if said == SAYS_INVALID else _RANGE
         found[place, 1] = result
-        if result <= _FRESH:
+        if new:
             scale_row(codes, signals, scales, values)
             counter = int(octets[spans[row, 0] + behind + COUNTER_BYTE])
             age[row] = 0 if tag == _NO_TAG else tag - counter & 0xFF
-            kept[row * WORDS : (row + 1) * WORDS] = words[first : first + WORDS]
-            check[row] = result
+            check[row] = min(result, _SOME_LOST)
         elif check[row] > _FRESH:
             check[row] = result
 
@@ -341,8 +376,14 @@ def judge_frame(
     expected: Words,
     tag: int,
     restarts: bool,
+    kept: Octets,
 ) -> int:
-    """`Check` of a frame's format, CRC and counter; moves `expected` on. `behind`: bytes it stands behind its row's place."""
+    """`Check` of a frame's format, CRC and counter; moves `expected` on and keeps the frame when its counter moved.
+
+    Args:
+        behind: bytes it stands behind its row's place.
+        kept: the last accepted frames, shape (rows * 72,); the other arguments as for `accept_frames`.
+    """
     begin, end, data_id = spans[row, 0] + behind, spans[row, 1] + behind, spans[row, 2]
     if words[(begin - HEADER_BYTES) // 8] != headers[row]:
         return _LENGTH
@@ -351,12 +392,20 @@ def judge_frame(
         return _CRC
     counter = int(octets[begin + COUNTER_BYTE])
     result = judge_counter(expected[row], counter)
-    if tag != _NO_TAG and result != _REPEATED:
+    if result == _REPEATED:
+        if (octets[begin:end] == kept[spans[row, 0] : spans[row, 1]]).all():
+            return _REPEATED
+        if not restarts:
+            return _CONFLICT
+        result = _CONFLICT
+    elif tag != _NO_TAG:
         # An answer to no SYNC of the last cycles, or older than what is known already, says nothing about what comes next.
         backwards = expected[row] != NOTHING and counter - expected[row] + 1 & 0xFF >= _HALF_TURN
         if tag - counter & 0xFF >= LATEST or backwards:
             return _WRONG_SEQUENCE
     expected[row] = counter + 1 & 0xFF
+    head = row * FRAME_BYTES
+    kept[head : head + FRAME_BYTES] = octets[head + behind : head + behind + FRAME_BYTES]
     return _SOME_LOST if result == _WRONG_SEQUENCE and restarts else result
 
 

@@ -26,6 +26,7 @@ from atalante_hal.e2e import (
     protect,
     protected_spans,
     qualify,
+    suspect,
 )
 from atalante_hal.frame import FRAME_BYTES, new_frames
 from atalante_hal.image import ReceiveImage, TransmitImage
@@ -220,6 +221,28 @@ def test_a_frame_under_another_messages_identifier_is_refused_for_every_pair_of_
         for receiver in NETWORK.messages:
             accepted = crc(payload, data_id_bytes(receiver.data_id)) == value
             assert accepted == (receiver is sender)
+
+
+# -- two senders ---------------------------------------------------------------------------------------------------------
+
+
+def evidence_after(history: str, evidence: int = 0) -> int:
+    """Evidence after cycles: r with a rival frame, c clean."""
+    for cycle in history:
+        evidence = suspect(evidence, rival=cycle == "r")
+    return evidence
+
+
+def test_four_rival_cycles_in_a_row_are_full_evidence_and_clean_ones_take_it_away():
+    assert [evidence_after("r" * n) for n in range(6)] == [0, 16, 32, 48, 64, 64]
+    assert [evidence_after("c" * n, 64) for n in (1, 63, 64, 65)] == [63, 1, 0, 0]
+    assert evidence_after("r" + "c" * 16) == 0
+
+
+def test_a_rival_in_every_other_cycle_is_full_evidence_too_and_one_in_seventeen_never():
+    assert evidence_after("rc" * 4) == 60
+    assert evidence_after("rc" * 4 + "r") == FULL
+    assert evidence_after(("r" + "c" * 16) * 50) == 0
 
 
 # -- how far a sender is trusted ---------------------------------------------------------------------------------------

@@ -262,3 +262,35 @@ def test_frames_of_nobody_are_handed_back(well: Nodes):
     assert well.heartbeats.quiet
     cyclic = TransmitImage([NETWORK.message("LEFT_SK_STATE")]).seal()
     assert well.hear(cyclic) == [0]  # that is the fast image's
+
+
+def test_a_sender_that_begins_anew_under_the_last_counter_is_taken_and_noted(well: Nodes):
+    row = well.tx.codec.rows["LEFT_SK_STATUS"]
+    well.tx.resume(row, int(well.tx.frames["data"][row, 2]) - 1 & 0xFF)
+    well.hear(well.frame("LEFT_SK", Uptime=9.0))
+    assert not well.heartbeats.quiet
+    assert well.heartbeats.image.values[well.heartbeats.image.codec.index("LEFT_SK_STATUS", "Uptime")] == 9.0
+    assert well.judge() == {("NODE_DUPLICATE", "LEFT_SK"): False}
+    assert well.heartbeats.quiet
+
+
+def test_an_emergency_under_the_last_counter_is_not_hidden(well: Nodes):
+    row = well.tx.codec.rows["LEFT_SK_EMCY"]
+    well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0x7305))
+    well.tx.resume(row, int(well.tx.frames["data"][row, 2]) - 1 & 0xFF)
+    well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0x4310))
+    assert well.heartbeats.emergencies == {"LEFT_SK": (Dtc.OVER_TEMP, 0x4310)}
+
+
+def test_two_senders_of_a_slow_message_are_confirmed_at_the_fifth_conflict(well: Nodes):
+    row = well.tx.codec.rows["HAPTICS_STATE"]
+    for pair in range(1, 7):
+        true = well.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.25)
+        well.tx.resume(row, int(true["data"][0, 2]) - 1 & 0xFF)
+        well.hear(true, well.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.5))
+        assert not well.heartbeats.quiet
+        assert well.judge() == {("NODE_DUPLICATE", "HAPTICS"): pair > 4}
+        assert well.heartbeats.quiet is (pair <= 4)
+    well.hear(well.frame("HAPTICS", "STATE"))
+    assert well.judge() == {}
+    assert well.heartbeats.quiet

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from atalante_dbc import load
+from atalante_dbc import Message, load
 from atalante_hal.e2e import Check
 from atalante_hal.frame import new_frames
 from atalante_hal.image import NEVER, ReceiveImage, TransmitImage
@@ -137,7 +137,106 @@ def test_foreign_frames_are_named_wherever_they_stand():
     assert rx.all_fresh
 
 
-CHANGES = ("none", "flip", "drop", "twice", "old", "range", "foreign", "length", "swap")
+CHANGES = ("none", "flip", "drop", "twice", "rival", "rival first", "old", "range", "foreign", "length", "swap")
+
+
+def rival(frame: np.ndarray, message: Message, byte: int = 0) -> np.ndarray:
+    """The frame of a second sender: the same counter, a bit of another byte changed, and the right CRC."""
+    other = frame.copy()
+    place = 3 + byte % (message.length - 3)
+    other["data"][place] ^= 1
+    checksum = protection(other["data"][2 : message.length].tobytes(), message.data_id)
+    other["data"][:2] = list(checksum.to_bytes(2, "little"))
+    return other
+
+
+@pytest.mark.parametrize("row", range(ROWS))
+def test_the_same_counter_with_other_bytes_is_a_conflict_and_is_not_committed(row: int):
+    tx, rx, buffer = pair()
+    deliver(tx, rx, buffer)
+    for byte in range(CYCLIC[row].length - 3):
+        true = tx.seal().copy()
+        other = rival(true[row], CYCLIC[row], byte)
+        buffer[:ROWS], buffer[ROWS] = true, other
+        rx.accept(buffer, ROWS + 1)
+        assert rx.refused == [(row, Check.CONFLICT)]
+        assert rx.check[row] == Check.OK
+        assert rx.frames[row] == true[row]
+        # Late: the cycle of its counter is over, and the true frame of the next one comes with it.
+        following = tx.seal().copy()
+        buffer[0], buffer[1 : ROWS + 1] = rival(true[row], CYCLIC[row], byte), following
+        rx.accept(buffer, ROWS + 1)
+        assert rx.refused == [(row, Check.CONFLICT)]
+        assert (rx.check[row], rx.age[row]) == (Check.OK, 0)
+        # Alone: the counter stands still.
+        deliver_frames(rx, buffer, [rival(following[row], CYCLIC[row], byte)])
+        assert rx.check[row] == Check.CONFLICT
+        assert rx.age[row] == 1
+        deliver_frames(rx, buffer, [following[row]])
+        assert rx.check[row] == Check.REPEATED
+
+
+def deliver_frames(rx: ReceiveImage, buffer: np.ndarray, frames: list[np.ndarray]) -> None:
+    for place, frame in enumerate(frames):
+        buffer[place] = frame
+    rx.accept(buffer, len(frames))
+
+
+def test_what_lies_behind_the_payload_makes_no_conflict():
+    tx, rx, buffer = pair()
+    true = tx.seal()[0].copy()
+    again = true.copy()
+    again["data"][CYCLIC[0].length :] = 0xAA
+    deliver_frames(rx, buffer, [true, again])
+    assert rx.refused == [(0, Check.REPEATED)]
+
+
+def test_after_a_frame_out_of_range_its_repetition_is_one_and_another_under_its_counter_is_a_conflict():
+    tx, rx, buffer = pair()
+    row = rx.codec.rows["IMU_PELVIS_STATE"]
+    deliver(tx, rx, buffer)
+    tx.values[tx.codec.index("IMU_PELVIS_STATE", "GyroX")] = np.nan
+    bad = tx.seal()[row].copy()
+    deliver_frames(rx, buffer, [bad, bad, rival(bad, CYCLIC[row], 20)])
+    assert rx.refused == [(row, Check.INVALID), (row, Check.REPEATED), (row, Check.CONFLICT)]
+
+
+def test_a_sender_that_may_begin_anew_is_taken_under_the_last_counter_and_the_conflict_is_listed():
+    status = [m for m in NETWORK.received_by("HAL") if m.name == "LEFT_FH_STATUS"]
+    tx, rx, buffer = TransmitImage(status), ReceiveImage(status, restarts=True), new_frames(4)
+    uptime = tx.codec.index("LEFT_FH_STATUS", "Uptime")
+    deliver_frames(rx, buffer, [tx.seal(7)[0].copy()])
+    tx.values[uptime] = 5.0
+    deliver_frames(rx, buffer, [tx.seal(7)[0].copy()])
+    assert (rx.check[0], rx.age[0], rx.values[uptime]) == (Check.SOME_LOST, 0, 5.0)
+    assert rx.refused == [(0, Check.CONFLICT)]
+    deliver_frames(rx, buffer, [tx.seal(7)[0].copy()])
+    assert rx.refused == [(0, Check.REPEATED)]
+
+
+def test_the_other_frames_of_a_row_are_decoded_in_order_of_arrival():
+    tx, rx, buffer = pair()
+    row, mine = rx.codec.rows["PENDANT_STATE"], slice(None)
+    dead_man = rx.codec.index("PENDANT_STATE", "DeadMan")
+    deliver(tx, rx, buffer)
+    deliver(tx, rx, buffer)
+    assert rx.beside(row) == []
+    tx.values[dead_man] = 1.0
+    released, true = tx.seal()[row].copy(), tx.frames[row].copy()
+    released["data"][3] ^= 1
+    released["data"][:2] = list(protection(released["data"][2:8].tobytes(), CYCLIC[row].data_id).to_bytes(2, "little"))
+    damaged = true.copy()
+    damaged["data"][5] ^= 1
+    deliver_frames(rx, buffer, [damaged, true, true, released])
+    assert [values[dead_man] for values in rx.beside(row)] == [0.0]
+    assert rx.values[dead_man] == 1.0
+    assert rx.beside(0) == []
+    late, now = tx.seal()[row].copy(), tx.seal()[row].copy()
+    deliver_frames(rx, buffer, [released, late, now])
+    assert [values[dead_man] for values in rx.beside(row)] == [0.0, 1.0]
+    assert rx.values[mine][dead_man] == 1.0
+    deliver(tx, rx, buffer)
+    assert rx.beside(row) == []
 
 
 @given(
@@ -160,6 +259,8 @@ def test_fast_and_slow_path_give_equal_results_for_any_history(history, shuffler
             del frames[row]
         elif change == "twice":
             frames.append(frames[row].copy())
+        elif change.startswith("rival"):
+            frames.insert(row if change == "rival first" else len(frames), rival(frames[row], CYCLIC[row], byte))
         elif change == "old":
             frames[row] = old[row]
         elif change == "foreign":
@@ -178,6 +279,11 @@ def test_fast_and_slow_path_give_equal_results_for_any_history(history, shuffler
         assert np.array_equal(fast.age, slow.age)
         assert np.array_equal(fast.values, slow.values, equal_nan=True)
         assert fast.crc_errors == slow.crc_errors
+        # Of a perfect cycle the fast path lists nothing, and the slow path has nothing to list.
+        assert slow.refused == fast.refused
+        assert fast.frames.tobytes() == slow.frames.tobytes()
+        for each in range(ROWS):
+            assert np.array_equal(fast.beside(each), slow.beside(each), equal_nan=True)
 
 
 @pytest.mark.parametrize("byte", [0, 1, 2, 11])

@@ -379,3 +379,101 @@ class TestSwingLeg:
         bench.cycle(lose(KNEE), times=5)
         assert bench.cycle().active == {("SWING_TIMEOUT", "LEFT_SK"): True, ("E2E_SEQUENCE", "LEFT_SK"): False}
         assert bench.cycle().active == {}
+
+
+class TestTwoSenders:
+    """A second sender of a message, each of whose frames is right."""
+
+    @staticmethod
+    def rival(row: int, *, first: bool = False, ahead: int = 0) -> Change:
+        """A frame more of a row: another bit of its last byte, and a counter that many ahead."""
+
+        def change(frames: Frames) -> Frames:
+            message, other = MESSAGES[row], frames[[row]].copy()
+            data = other["data"][0]
+            data[message.length - 1] ^= 1
+            data[COUNTER_BYTE] = (int(data[COUNTER_BYTE]) + ahead) & 0xFF
+            protected = data[2 : message.length].tobytes()
+            data[:2] = list(crc(protected, data_id_bytes(message.data_id)).to_bytes(2, "little"))
+            return np.concatenate([other, frames] if first else [frames, other])
+
+        return change
+
+    @pytest.mark.parametrize("first", [False, True])
+    @pytest.mark.parametrize("row", range(len(MESSAGES)))
+    def test_they_are_confirmed_in_the_fourth_cycle_for_every_node(self, bench: Bench, row: int, first: bool):
+        node = MESSAGES[row].sender
+        bench.well().cycle(self.rival(row, first=first), times=3)
+        assert bench.active == {("NODE_DUPLICATE", node): False}
+        assert bench.judgement.trusts(row)
+        assert bench.judgement.valid[row]
+        assert not bench.judgement.settled
+        bench.cycle(self.rival(row, first=first))
+        assert bench.active == {("NODE_DUPLICATE", node): True}
+        assert bench.memory.active[Dtc.NODE_DUPLICATE, node].value == 64
+        assert not bench.judgement.trusts(row)
+        text = f"{node}: two senders of one message, {MESSAGES[row].name}: switch one of them off"
+        assert bench.memory.events[-1].text == text
+        bench.cycle(self.rival(row, first=first), times=100)
+        assert bench.active == {("NODE_DUPLICATE", node): True}
+        assert not bench.judgement.trusts(row)
+        told = [event for event in bench.memory.events if event.code == "NODE_DUPLICATE"]
+        assert [event.severity for event in told] == ["warning", "error"]
+
+    def test_trust_comes_back_after_sixteen_clean_cycles_and_one_more_rival_takes_it_again(self, bench: Bench):
+        bench.well().cycle(self.rival(KNEE), times=4).cycle(times=15)
+        assert bench.active == {}
+        assert not bench.judgement.nodes_well
+        bench.cycle()
+        assert bench.judgement.nodes_well
+        assert not bench.judgement.settled
+        bench.cycle(self.rival(KNEE))
+        assert bench.active == {("NODE_DUPLICATE", "LEFT_SK"): True}
+        bench.cycle(times=63)
+        assert not bench.judgement.settled
+        bench.cycle()
+        assert bench.judgement.settled
+
+    def test_a_node_of_two_senders_is_never_trusted_and_the_reason_is_raised(self, bench: Bench):
+        bench.cycle()
+        for _ in range(10):
+            bench.cycle(self.rival(IMU)).cycle(times=5)
+        assert bench.judgement.missing() == {"IMU_PELVIS"}
+        assert any(e.code == "NODE_DUPLICATE" and e.severity == "error" for e in bench.memory.events)
+
+    @pytest.mark.parametrize("ahead", [-2, 2, 30])
+    def test_a_counter_that_does_not_follow_is_a_second_senders_too(self, bench: Bench, ahead: int):
+        bench.well().cycle(self.rival(KNEE, ahead=ahead), times=3)
+        assert bench.active == {("E2E_SEQUENCE", "LEFT_SK"): False}
+        bench.cycle(self.rival(KNEE, ahead=ahead))
+        assert bench.active == {("E2E_SEQUENCE", "LEFT_SK"): False, ("NODE_DUPLICATE", "LEFT_SK"): True}
+
+    def test_a_second_sender_beside_a_frame_out_of_range_is_noticed(self, bench: Bench):
+        bench.well()
+        bench.tx.values[bench.tx.codec.index("LEFT_SK_STATE", "Torque")] = np.nan
+        bench.cycle(self.rival(KNEE), times=4)
+        assert bench.active["NODE_DUPLICATE", "LEFT_SK"]
+
+    def test_a_counter_that_stands_still_under_other_data_is_one_sender(self, bench: Bench):
+        bench.well()
+        last = bench.tx.frames[[KNEE]].copy()
+        changed = self.rival(0)
+
+        def stuck(frames: Frames) -> Frames:
+            frames[[KNEE]] = changed(last)[1:]
+            return frames
+
+        bench.cycle(stuck, times=4)
+        assert bench.image.check[KNEE] == Check.CONFLICT
+        assert bench.active == {("E2E_REPEATED", "LEFT_SK"): False}
+        bench.cycle(stuck)
+        assert bench.active == {("E2E_REPEATED", "LEFT_SK"): False, ("E2E_FROZEN", "LEFT_SK"): True}
+
+    def test_what_is_heard_is_younger_than_its_timeout(self, bench: Bench):
+        assert not bench.judgement.hears(PENDANT)
+        bench.cycle()
+        assert bench.judgement.hears(PENDANT)
+        bench.cycle(lose(PENDANT), times=4)
+        assert bench.judgement.hears(PENDANT)
+        bench.cycle(lose(PENDANT))
+        assert not bench.judgement.hears(PENDANT)
