@@ -54,7 +54,8 @@ _FOREIGN = -1
 NEVER = 1 << 30
 #: Oldest answer [cycles] that is taken for a late one; what is older was replayed.
 LATEST = 16
-_HALF_TURN = 128  # of the counter: what seems further ahead than this is behind
+#: Half a turn of the counter: what seems further ahead is behind, unless the row was silent for as long.
+_HALF_TURN = 128
 
 
 class ReceiveImage:
@@ -91,6 +92,8 @@ class ReceiveImage:
         self._spans = protected_spans(self.codec.messages)
         #: Counter the next frame of each row should carry.
         self._expected: Words = np.full(count, NOTHING)
+        #: Cycles since that counter moved, shape (rows,).
+        self._silent: Words = np.zeros(count, np.int64)
         #: The values before the last `accept`.
         self.values_before = self.values.copy()
         self._age_before: npt.NDArray[np.int64] = self.age.copy()
@@ -109,6 +112,7 @@ class ReceiveImage:
         """`elapsed` cycles have begun: until something arrives, every row is that much older and has no data."""
         self.all_fresh = False
         self.age += elapsed
+        self._silent += elapsed
         self.check.fill(Check.NO_DATA)
         self.refused = []
 
@@ -184,6 +188,7 @@ class ReceiveImage:
         self._offered = None
         if not self.all_fresh:
             self.age.fill(0)
+            self._silent.fill(0)
             self.check.fill(Check.OK)
             self.refused = []
             self.all_fresh = True
@@ -205,6 +210,7 @@ class ReceiveImage:
             self._headers,
             self._spans,
             self._expected,
+            self._silent,
             _NO_TAG if tag is None else tag,
             self._restarts,
             codec.plan,
@@ -315,6 +321,7 @@ def accept_frames(
     headers: Words,
     spans: Words,
     expected: Words,
+    silent: Words,
     tag: int,
     restarts: bool,
     plan: Words,
@@ -332,6 +339,7 @@ def accept_frames(
     Args:
         words, octets: flat views of the frames received.
         found: row of each frame, or `_FOREIGN`, and its `Check`; rewritten, shape (count, 2).
+        silent: cycles since `expected` of each row moved, shape (rows,).
         tag: counter all should carry, or `_NO_TAG`; the other arguments as for `accept_exact`, and of `ReceiveImage`.
     """
     for place in range(len(found)):
@@ -341,7 +349,7 @@ def accept_frames(
         if row == _FOREIGN:
             continue
         behind = (place - row) * FRAME_BYTES
-        result = judge_frame(words, octets, row, behind, headers, spans, expected, tag, restarts, kept)
+        result = judge_frame(words, octets, row, behind, headers, spans, expected, silent, tag, restarts, kept)
         new = result <= _FRESH or (restarts and result == _CONFLICT)
         signals = signals_by_row[row_begins[row] : row_begins[row + 1]]
         if new:
@@ -374,6 +382,7 @@ def judge_frame(
     headers: Words,
     spans: Words,
     expected: Words,
+    silent: Words,
     tag: int,
     restarts: bool,
     kept: Octets,
@@ -391,19 +400,24 @@ def judge_frame(
     if octets[begin] != crc & 0xFF or octets[begin + 1] != crc >> 8:
         return _CRC
     counter = int(octets[begin + COUNTER_BYTE])
+    in_time = tag == _NO_TAG or tag - counter & 0xFF < LATEST
+    # After half a turn of silence a counter says nothing about the order; an answer to a SYNC of the last cycles is a new one.
+    back = tag != _NO_TAG and in_time and expected[row] != NOTHING and silent[row] >= _HALF_TURN
     result = judge_counter(expected[row], counter)
+    if back and result == _REPEATED:
+        result = _WRONG_SEQUENCE
     if result == _REPEATED:
         if (octets[begin:end] == kept[spans[row, 0] : spans[row, 1]]).all():
             return _REPEATED
         if not restarts:
             return _CONFLICT
         result = _CONFLICT
-    elif tag != _NO_TAG:
+    elif tag != _NO_TAG and not back:
         # An answer to no SYNC of the last cycles, or older than what is known already, says nothing about what comes next.
         backwards = expected[row] != NOTHING and counter - expected[row] + 1 & 0xFF >= _HALF_TURN
-        if tag - counter & 0xFF >= LATEST or backwards:
+        if not in_time or backwards:
             return _WRONG_SEQUENCE
-    expected[row] = counter + 1 & 0xFF
+    expected[row], silent[row] = counter + 1 & 0xFF, 0
     head = row * FRAME_BYTES
     kept[head : head + FRAME_BYTES] = octets[head + behind : head + behind + FRAME_BYTES]
     return _SOME_LOST if result == _WRONG_SEQUENCE and restarts else result

@@ -368,6 +368,39 @@ class TestCycleTag:
             answer(tx, rx, buffer, 301, {7: 0})
             assert rx.check[7] == (Check.OK if check is not Check.OK else Check.WRONG_SEQUENCE)
 
+    @pytest.mark.parametrize("cycles", [5, 100, 127, 128, 160, 200, 254, 255, 256, 260, 300, 400, 512])
+    def test_a_sender_that_was_silent_for_however_long_is_used_from_its_second_frame_on(self, cycles: int):
+        tx, rx, buffer = pair()
+        answer(tx, rx, buffer, 10, {})
+        for cycle in range(11, 11 + cycles):
+            answer(tx, rx, buffer, cycle, {7: -1})
+        back = 11 + cycles
+        # The first frame is refused, unless the counter happens to be one to five ahead.
+        first = {0: Check.OK, 4: Check.SOME_LOST}.get(cycles & 0xFF, Check.WRONG_SEQUENCE)
+        for cycle, check in ((back, first), (back + 1, Check.OK)):
+            answer(tx, rx, buffer, cycle, {})
+            assert rx.check[7] == check
+        assert rx.all_fresh
+        # All of them at once, through the fast path before and after.
+        for cycle in range(back + 2, back + 2 + cycles):
+            answer(tx, rx, buffer, cycle, dict.fromkeys(range(ROWS), -1))
+        back += 2 + cycles
+        for cycle, check in ((back, first), (back + 1, Check.OK)):
+            answer(tx, rx, buffer, cycle, {})
+            assert (rx.check == check).all()
+
+    def test_a_counter_that_stands_still_is_never_new_however_long_it_does(self):
+        tx, rx, buffer = pair()
+        answer(tx, rx, buffer, 10, {})
+        stuck = tx.frames[7].copy()
+        for cycle in range(11, 600):
+            frames = tx.seal(cycle & 0xFF).copy()
+            frames[7] = stuck
+            buffer[:ROWS] = frames
+            rx.accept(buffer, ROWS, cycle & 0xFF)
+            assert rx.check[7] in (Check.REPEATED, Check.WRONG_SEQUENCE)
+            assert rx.age[7] == cycle - 10
+
     def test_half_a_turn_ahead_is_behind(self):
         for ahead, check in ((127, Check.WRONG_SEQUENCE), (128, Check.WRONG_SEQUENCE)):
             tx, rx, buffer = pair()
