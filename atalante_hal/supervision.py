@@ -39,6 +39,8 @@ DRIVE_NODES = tuple(joint.upper() for joint in JOINTS)
 _ENABLED = np.full(len(JOINTS), float(DriveState.OPERATION_ENABLED)).tobytes()
 _FAULTY = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 _S = SupervisorState
+#: States that START leads out of; in the others a press acknowledges and is over.
+_STARTABLE = (_S.READY, _S.FULL_ASSIST, _S.HOLD, _S.LOWER, _S.FAULT)
 
 
 class Supervision:
@@ -48,7 +50,7 @@ class Supervision:
         reason: why the robot is in the state it is in, one sentence.
         moving: the controller's torques are used.
         step: of the controller, by its own count; None: it takes no steps.
-        start_wanted: cycles left to reach ACTIVE; 0: nobody asked.
+        start_wanted: cycles left for a START to change the state; 0: none was pressed since the last change.
         enabling: drives are being enabled, and torque is sent to those that are.
         lowered: drives that cannot hold.
     """
@@ -160,10 +162,11 @@ class Supervision:
         self._judge_drives(nodes_well)
         if self._barred:
             memory.raise_dtc(cycle, Dtc.HAL_DUPLICATE, "HAL", text="another HAL was there first: end one, start again")
-        pendant.hear(judgement.trusts(pendant.row))
+        row = pendant.row
+        pendant.hear(judgement.trusts(row), qualifying=judgement.hears(row), beside=self._image.beside(row))
         memory.close_cycle(cycle)
         self._barred |= Dtc.HAL_DUPLICATE in memory.confirmed and state.supervisor in (_S.OFF, _S.READY)
-        self._judge_start()
+        self._judge_start(nodes_well)
         self.conditions = Conditions(
             diagnostics=memory.confirmed,
             nodes_well=nodes_well,
@@ -222,8 +225,8 @@ class Supervision:
                     self._state.cycle, Dtc.DERATED, node, value=limit[place], confirmed=confirmed, text=text
                 )
 
-    def _judge_start(self) -> None:
-        """From START until the drives are enabled, or the operator or a diagnostic ends the attempt."""
+    def _judge_start(self, nodes_well: bool) -> None:
+        """From START until the supervisor moves, the drives take too long, or the start is refused."""
         state, pendant = self._state, self._pendant
         if pendant.started and state.supervisor is not _S.ACTIVE:
             faulty = {
@@ -231,20 +234,37 @@ class Supervision:
             }
             self._heartbeats.acknowledge(faulty)
             self._transceiver.acknowledge()
-            self.start_wanted = ENABLE_CYCLES
+            self.start_wanted = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
         elif self.start_wanted:
             self.start_wanted -= 1
-            hindered = state.supervisor in (_S.READY, _S.HOLD) and worst(self.memory.confirmed) is not Reaction.INFO
-            if hindered or not pendant.dead_man or pendant.stop_requested:
+            if hindrance := self._hindrance(nodes_well):
                 self.start_wanted = 0
+                self._end_start("START_REFUSED", f"START is refused: {hindrance}", "warning")
             elif not self.start_wanted:
-                text = f"the drives were not enabled within {ENABLE_CYCLES} cycles"
-                self.memory.events.append(Event(state.cycle, "START_FAILED", text, "error"))
-                self.reason = text
+                self._end_start("START_FAILED", f"the drives were not enabled within {ENABLE_CYCLES} cycles", "error")
+
+    def _hindrance(self, nodes_well: bool) -> str:
+        """Return why a start that was asked for cannot go on, one sentence; empty: it can."""
+        memory, pendant = self.memory, self._pendant
+        if pendant.stop_requested or not pendant.dead_man:
+            return _WORDS[pendant.stop_requested]
+        if self._state.supervisor in (_S.LOWER, _S.FAULT):
+            return ""  # START acknowledges the cause, which may take some cycles to go
+        reaction = worst(memory.confirmed)
+        if reaction is not Reaction.INFO:
+            return memory.text_of(frozenset(dtc for dtc in memory.confirmed if dtc.reaction is reaction))
+        return "" if nodes_well else f"not heard or not trusted yet: {', '.join(sorted(self.missing()))}"
+
+    def _end_start(self, code: str, text: str, severity: str) -> None:
+        self.memory.events.append(Event(self._state.cycle, code, text, severity))
+        self.reason = text
 
     def _enter(self, before: SupervisorState, after: SupervisorState, reasons: frozenset[Dtc]) -> None:
         state, memory = self._state, self.memory
         state.supervisor = after
+        # One press, one move.
+        self.start_wanted = 0
+        self._pendant.forget_press()
         self.moving = after in MOVING
         self._commands.announce(after)
         self._parts.header[2] = after
@@ -253,10 +273,8 @@ class Supervision:
             memory.raise_dtc(state.cycle, Dtc.OPERATOR_STOP, "PENDANT", text=text)
         if reasons:
             self.reason = memory.text_of(reasons) or self.reason
-        if after is _S.ACTIVE:
-            self.start_wanted = 0
-            if before not in MOVING and not self.enabling:
-                self._limiter.restart(state.torque)
+        if after is _S.ACTIVE and before not in MOVING and not self.enabling:
+            self._limiter.restart(state.torque)
         if after is _S.FINISH_STEP:
             self._finish = self.step, state.cycle + FINISH_STEP_CYCLES
         self._leading = self.moving and before in MOVING

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from atalante_dbc import load
 from atalante_hal.image import ReceiveImage
-from atalante_hal.pendant import Pendant
+from atalante_hal.pendant import Demand, Pendant, demand_of, safest
 
 NETWORK = load()
 START, STOP, HOLD = 1, 2, 3
@@ -88,3 +91,126 @@ def test_the_dial_rules_when_it_is_set(pendant: Pendant):
     assert pendant.assistance_factor == 0.25
     say(pendant, factor=0.25, factor_set=0)
     assert pendant.assistance_factor is None
+
+
+def others(pendant: Pendant, *frames: tuple[int, int, int]) -> list[np.ndarray]:
+    """What further frames of a cycle say: dead-man, request and its counter each, as the image hands it over."""
+    image = np.zeros(pendant._places.stop + 3)
+    said = []
+    for frame in frames:
+        image[pendant._places] = *frame, 0.0, 0.0
+        said.append(image.copy())
+    return said
+
+
+@given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=4))
+def test_the_safest_demand_is_as_safe_as_each(demands: list[tuple[bool, bool]]):
+    found = safest([Demand(*demand) for demand in demands])
+    assert found.dead_man is all(dead_man for dead_man, _ in demands)
+    assert found.stop is any(stop for _, stop in demands)
+
+
+@pytest.mark.parametrize(
+    ("request_", "stop"), [(0, False), (START, False), (STOP, True), (HOLD, True), (4, True), (7, True)]
+)
+def test_a_request_that_is_neither_none_nor_start_is_a_stop(request_: int, stop: bool):
+    assert demand_of([1.0, request_, 0.0, 0.0, 0.0]) == (True, stop)
+    assert demand_of([0.0, request_, 0.0, 0.0, 0.0]) == (False, stop)
+
+
+def test_the_safest_frame_of_a_cycle_counts_in_that_cycle(pendant: Pendant):
+    pendant.signals[:] = 1, 0, 0, 0.5, 1
+    pendant.hear(True, beside=others(pendant, (1, STOP, 0)))
+    assert (pendant.dead_man, pendant.stop_requested) == (True, True)
+    pendant.hear(True, beside=others(pendant, (1, 0, 0), (0, 0, 0)))
+    assert (pendant.dead_man, pendant.stop_requested) == (False, False)
+    pendant.hear(True)
+    assert (pendant.dead_man, pendant.stop_requested, pendant.assistance_factor) == (True, False, 0.5)
+    pendant.signals[:2] = 0, STOP
+    pendant.hear(True, beside=others(pendant, (1, 0, 0)))
+    assert (pendant.dead_man, pendant.stop_requested) == (False, True)
+
+
+def test_a_press_among_frames_that_differ_counts_when_they_agree_again(pendant: Pendant):
+    say(pendant, press=3)
+    pendant.signals[:3] = 1, START, 4
+    pendant.hear(True, beside=others(pendant, (1, 0, 3)))
+    assert not pendant.started
+    pendant.hear(True)
+    assert pendant.started
+    pendant.hear(True)
+    assert not pendant.started
+
+
+def test_a_press_of_a_second_sender_does_not_count_whichever_frame_is_taken(pendant: Pendant):
+    say(pendant, request=START, press=3)
+    pendant.signals[:3] = 1, START, 9
+    pendant.hear(True, beside=others(pendant, (1, START, 3)))
+    assert not pendant.started
+    say(pendant, request=START, press=3)
+    assert not pendant.started
+
+
+def qualify(pendant: Pendant, dead_man: int = 1, request: int = 0, press: int = 0):
+    pendant.signals[:] = dead_man, request, press, 0.5, 1
+    pendant.hear(False, qualifying=True)
+    assert (pendant.dead_man, pendant.stop_requested, pendant.started, pendant.assistance_factor) == (False,) * 3 + (
+        None,
+    )
+    assert pendant.heard == pendant.signals.tobytes()
+
+
+def test_a_press_while_the_pendant_is_not_trusted_yet_counts_once_when_it_is(pendant: Pendant):
+    qualify(pendant, press=6)
+    for _ in range(10):
+        qualify(pendant, request=START, press=7)
+    say(pendant, request=START, press=7)
+    assert pendant.started
+    say(pendant, request=START, press=7)
+    assert not pendant.started
+
+
+def test_what_stands_in_the_first_frame_is_no_press(pendant: Pendant):
+    for _ in range(20):
+        qualify(pendant, request=START, press=7)
+    say(pendant, request=START, press=7)
+    assert not pendant.started
+
+
+@pytest.mark.parametrize("taken_back", [(0, START, 7), (1, STOP, 8), (1, 0, 8)])
+def test_a_press_that_is_taken_back_meanwhile_does_not_count(pendant: Pendant, taken_back: tuple[int, int, int]):
+    qualify(pendant, press=6)
+    qualify(pendant, request=START, press=7)
+    qualify(pendant, *taken_back)
+    qualify(pendant, request=START, press=taken_back[2])
+    say(pendant, request=START, press=taken_back[2])
+    assert not pendant.started
+
+
+def test_a_press_without_the_dead_man_is_not_kept(pendant: Pendant):
+    qualify(pendant, dead_man=0, press=6)
+    qualify(pendant, dead_man=0, request=START, press=7)
+    qualify(pendant, request=START, press=7)
+    say(pendant, request=START, press=7)
+    assert not pendant.started
+
+
+@pytest.mark.parametrize("beside", [(0, 0, 0), (1, STOP, 0)])
+def test_a_second_sender_that_stops_takes_a_kept_press_back(pendant: Pendant, beside: tuple[int, int, int]):
+    qualify(pendant, press=6)
+    qualify(pendant, request=START, press=7)
+    pendant.hear(False, qualifying=True, beside=others(pendant, beside))
+    qualify(pendant, request=START, press=7)
+    say(pendant, request=START, press=7)
+    assert not pendant.started
+
+
+def test_a_kept_press_is_dropped_when_the_supervisor_moves_or_the_pendant_is_lost(pendant: Pendant):
+    for drop in (pendant.forget_press, lambda: pendant.hear(False)):
+        qualify(pendant, press=6)
+        qualify(pendant, request=START, press=7)
+        drop()
+        qualify(pendant, request=START, press=7)
+        pendant.hear(True)
+        assert not pendant.started
+        pendant.assistance_factor = None

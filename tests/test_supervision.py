@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from atalante_dbc import Message, load
 from atalante_hal.cia402 import Controlword, DriveState
 from atalante_hal.diagnostics import Dtc
+from atalante_hal.e2e import crc, data_id_bytes
+from atalante_hal.frame import Frames
 from atalante_hal.hal import PERIOD, SATURATED_CYCLES
 from atalante_hal.limiter import Limited
 from atalante_hal.supervision import ENABLE_CYCLES, FINISH_STEP_CYCLES
@@ -85,6 +89,9 @@ def test_a_drive_fault_is_latched_until_the_operator_starts_again(rig):
     assert rig.run(100).supervisor is S.FAULT
     assert drives.state[7] is DriveState.FAULT
     assert set(drives.state) == {DriveState.FAULT, DriveState.QUICK_STOP_ACTIVE}
+    rig.operator.start()
+    rig.until(S.HOLD, 30)
+    assert rig.run(300).supervisor is S.HOLD  # one press, one move
     rig.operator.start()
     assert rig.until(S.ACTIVE, 30).supervisor is S.ACTIVE
     assert [c for c in rig.codes() if c in S.__members__] == ["READY", "ACTIVE", "FAULT", "HOLD", "ACTIVE"]
@@ -201,6 +208,9 @@ def test_a_joint_that_cannot_hold_is_let_down_and_the_others_hold(rig):
     assert state.drive_state[3] == DriveState.SWITCH_ON_DISABLED
     assert (np.delete(state.drive_state, 3) == DriveState.QUICK_STOP_ACTIVE).all()
     rig.operator.start()
+    rig.until(S.HOLD, 5)
+    assert rig.run(300).supervisor is S.HOLD  # one press, one move
+    rig.operator.start()
     assert rig.until(S.ACTIVE, 50).supervisor is S.ACTIVE
     assert [c for c in rig.codes() if c in S.__members__][-3:] == ["LOWER", "HOLD", "ACTIVE"]
 
@@ -298,3 +308,289 @@ def test_a_heartbeat_that_fails_to_come_is_noticed_while_all_else_is_well(rig):
     rig.bus.to_hal = rig.drop(0x704)
     assert rig.run(360).supervisor is S.ACTIVE
     assert rig.seen("HEARTBEAT_LOST") == [("HEARTBEAT_LOST", "warning")]
+
+
+# -- one press, one move -----------------------------------------------------------------------------------------------
+
+
+HEAD_STARTS = (1, 5, 10, 15, 16, 17, 50, 100)
+PENDANT_STATE = 0x194
+
+
+def without_pendant(rig, cycles: int):
+    """Lose the pendant's frames for a while; the emulated operator keeps its dead-man and its last request."""
+    rig.bus.to_hal = rig.drop(PENDANT_STATE)
+    state = rig.run(cycles)
+    rig.bus.to_hal = lambda frames: frames
+    return state
+
+
+def into(rig, state: S) -> None:
+    """Bring a robot whose operator presses nothing by itself into READY, HOLD or FAULT."""
+    rig.until(S.READY)
+    if state is S.READY:
+        return
+    rig.operator.start()
+    rig.until(S.ACTIVE, 20)
+    if state is S.HOLD:
+        rig.operator.hold()
+    else:
+        rig.emulator.drives.state[7] = DriveState.FAULT
+        rig.emulator.drives._states_changed()
+    rig.until(state, 5)
+
+
+@pytest.mark.parametrize("cycles", HEAD_STARTS)
+def test_a_press_in_off_starts_nothing_later(make_rig, cycles: int):
+    ready = make_rig(starts=False)
+    ready.until(S.READY)
+    rig = make_rig(starts=False)
+    rig.run(max(2, ready.hal.state.cycle - cycles))
+    assert rig.hal.state.supervisor is S.OFF
+    rig.operator.start()
+    rig.until(S.READY)
+    assert rig.run(ENABLE_CYCLES + 50).supervisor is S.READY
+    rig.operator.start()
+    assert rig.until(S.ACTIVE, 20).supervisor is S.ACTIVE
+
+
+@pytest.mark.parametrize("frames", HEAD_STARTS)
+@pytest.mark.parametrize("state", [S.READY, S.HOLD])
+def test_the_first_press_of_a_late_pendant_counts_from_its_second_frame_on(make_rig, state: S, frames: int):
+    rig = make_rig(starts=False)
+    into(rig, state)
+    assert without_pendant(rig, 50).supervisor is state
+    rig.run(1 + frames)  # the first frame after a loss is refused
+    rig.operator.start()
+    rig.until(S.ACTIVE, 30)
+    moves = [code for code in rig.codes() if code in S.__members__]
+    rig.walk(ENABLE_CYCLES + 50)
+    assert [code for code in rig.codes() if code in S.__members__] == moves
+
+
+@pytest.mark.parametrize("late", HEAD_STARTS)
+@pytest.mark.parametrize("state", [S.READY, S.HOLD, S.FAULT])
+def test_a_start_that_was_pressed_before_the_pendant_is_heard_moves_nothing(make_rig, state: S, late: int):
+    rig = make_rig(starts=False)
+    into(rig, state)
+    without_pendant(rig, 10)
+    rig.bus.to_hal = rig.drop(PENDANT_STATE)
+    rig.operator.start()
+    rig.run(late)
+    rig.bus.to_hal = lambda frames: frames
+    assert rig.run(ENABLE_CYCLES + 50).supervisor is state
+
+
+@pytest.mark.parametrize("word", ["release", "stop", "hold"])
+def test_a_press_that_is_taken_back_before_the_pendant_is_trusted_moves_nothing(make_rig, word: str):
+    rig = make_rig(starts=False)
+    into(rig, S.HOLD)
+    without_pendant(rig, 10)
+    rig.run(3)
+    rig.operator.start()
+    rig.run(3)
+    getattr(rig.operator, word)()
+    rig.run(3)
+    rig.operator.squeeze()
+    assert rig.run(ENABLE_CYCLES + 50).supervisor is S.HOLD
+
+
+def test_a_press_before_ready_of_a_pendant_that_is_trusted_after_it_moves_nothing(make_rig):
+    ready = make_rig(starts=False)
+    ready.until(S.READY)
+    rig = make_rig(starts=False)
+    without_pendant(rig, ready.hal.state.cycle - 6)
+    rig.run(3)
+    rig.operator.start()
+    rig.until(S.READY, 5)
+    assert rig.run(ENABLE_CYCLES + 50).supervisor is S.READY
+
+
+def test_one_press_in_fault_ends_in_hold_whatever_the_pendant_goes_through(make_rig):
+    rig = make_rig(starts=False)
+    into(rig, S.FAULT)
+    rig.operator.start()
+    rig.until(S.HOLD, 20)
+    without_pendant(rig, 10)
+    assert rig.run(ENABLE_CYCLES + 50).supervisor is S.HOLD
+    rig.operator.start()
+    assert rig.until(S.ACTIVE, 20).supervisor is S.ACTIVE
+
+
+def test_a_press_during_the_last_step_starts_nothing_after_it(rig):
+    rig.operator._starts = False
+    rig.until(S.READY)
+    rig.operator.start()
+    assert finishing(rig, 7).supervisor is S.FINISH_STEP
+    rig.operator.start()
+    rig.walk(3, step=7)
+    rig.walk(2, step=8)
+    assert rig.hal.state.supervisor is S.HOLD
+    assert rig.run(ENABLE_CYCLES + 50).supervisor is S.HOLD
+
+
+def test_a_start_in_hold_is_refused_with_the_reason_while_a_node_is_missing(make_rig):
+    rig = make_rig(starts=False)
+    into(rig, S.HOLD)
+    rig.bus.to_hal = rig.drop(0x184)
+    rig.run(10)
+    rig.operator.start()
+    rig.run(2)
+    assert "START_REFUSED" in rig.codes()
+    assert rig.hal.reason.startswith("START is refused: LEFT_SK: a node is silent")
+    rig.bus.to_hal = lambda frames: frames
+    rig.run(2)
+    rig.operator.start()
+    rig.run(2)
+    assert rig.hal.reason == "START is refused: not heard or not trusted yet: LEFT_SK"
+    assert rig.run(ENABLE_CYCLES + 50).supervisor is S.HOLD
+    rig.operator.start()
+    assert rig.until(S.ACTIVE, 20).supervisor is S.ACTIVE
+
+
+# -- two senders of one message ----------------------------------------------------------------------------------------
+
+
+def resealed(frame: Frames, message: Message, signal: str, change: Callable[[int], int]) -> Frames:
+    """The frame with another raw code of a signal and the right CRC. Shape (1,)."""
+    other, where = frame.copy(), message.signal(signal)
+    payload = int.from_bytes(other["data"][0].tobytes(), "little")
+    mask = (1 << where.length) - 1
+    code = change(payload >> where.start & mask) & mask
+    payload = payload & ~(mask << where.start) | code << where.start
+    data = bytearray(payload.to_bytes(64, "little"))
+    data[:2] = crc(bytes(data[2 : message.length]), data_id_bytes(message.data_id)).to_bytes(2, "little")
+    other["data"][0] = np.frombuffer(bytes(data), np.uint8)
+    return other
+
+
+class Ghost:
+    """A second sender of a message: each frame is the true one of the cycle with another raw code and the right CRC."""
+
+    def __init__(self, message: Message, order: str, signal: str, change: Callable[[int], int]) -> None:
+        self._message, self._order, self._signal, self._change = message, order, signal, change
+        self._late: Frames | None = None
+        self._cycle = 0
+
+    def __call__(self, frames: Frames) -> Frames:
+        mine = np.flatnonzero(frames["can_id"] == self._message.frame_id)
+        if not len(mine):
+            return frames
+        self._cycle += 1
+        ghost = resealed(frames[mine[:1]], self._message, self._signal, self._change)
+        order = self._order if self._order != "alternately" else ("first", "after")[self._cycle % 2]
+        if order == "first":
+            return np.concatenate([ghost, frames])
+        if order == "after":
+            return np.concatenate([frames, ghost])
+        late, self._late = self._late, ghost  # the HAL has finished its cycle when it comes
+        return frames if late is None else np.concatenate([late, frames])
+
+
+ORDERS = ("first", "after", "alternately", "late")
+#: A signal of each kind of node whose other value is inside its range, and nothing a plausibility check minds.
+OTHER_SIGNAL = {"drive": "Temperature", "imu": "Temperature", "foot": "Temperature", "pendant": "AssistanceFactor"}
+CYCLIC = [m for m in load().received_by("HAL") if m.cycle_ms == 1]
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("message", CYCLIC, ids=lambda message: message.name)
+def test_f58_a_second_sender_of_any_node_ends_in_hold_within_five_cycles(make_rig, message: Message, order: str):
+    rig = make_rig()
+    rig.until(S.ACTIVE)
+    rig.bus.to_hal = Ghost(message, order, OTHER_SIGNAL[load().node(message.sender).kind], lambda code: code ^ 1)
+    assert rig.run(5).supervisor is S.HOLD
+    assert rig.seen("NODE_DUPLICATE") == [("NODE_DUPLICATE", "warning"), ("NODE_DUPLICATE", "error")]
+    assert rig.hal.reason.startswith(f"{message.sender}: two senders of one message, {message.name}")
+    rig.run(30)
+    rig.operator.start()
+    assert rig.run(300).supervisor is S.HOLD
+    rig.bus.to_hal = lambda frames: frames
+    rig.run(20)
+    rig.operator.start()
+    assert rig.until(S.ACTIVE, 20).supervisor is S.ACTIVE
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("radians", [0.3, 3e-3])
+def test_f58_a_ghost_drive_is_noticed_in_five_cycles_and_at_boot_keeps_the_robot_out_of_ready(
+    make_rig, order: str, radians: float
+):
+    message = load().message("LEFT_SK_STATE")
+    off = round(radians * 100.0 / message.signal("Position").factor)  # at the motor, behind the gear
+    rig = make_rig()
+    rig.until(S.ACTIVE)
+    rig.bus.to_hal = Ghost(message, order, "Position", lambda code: code + off)
+    assert rig.run(5).supervisor is S.HOLD
+    assert ("NODE_DUPLICATE", "error") in rig.seen("NODE_DUPLICATE")
+    new = make_rig()
+    new.bus.to_hal = Ghost(message, order, "Position", lambda code: code + off)
+    assert {new.cycle().supervisor for _ in range(500)} == {S.OFF}
+    assert new.hal.missing() == ["LEFT_SK"]
+    assert ("NODE_DUPLICATE", "error") in new.seen("NODE_DUPLICATE")
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize(
+    ("signal", "code"), [("DeadMan", 0), ("Request", 2), ("Request", 3)], ids=["dead-man", "STOP", "HOLD"]
+)
+def test_f58_the_safest_pendant_frame_of_a_cycle_wins_in_that_cycle(make_rig, order: str, signal: str, code: int):
+    rig = make_rig()
+    rig.until(S.ACTIVE)
+    rig.bus.to_hal = Ghost(load().message("PENDANT_STATE"), order, signal, lambda _: code)
+    assert rig.run(2 if order == "late" else 1).supervisor is S.HOLD
+    assert rig.seen("OPERATOR_STOP") == [("OPERATOR_STOP", "info")]
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_f58_the_true_pendants_stop_is_not_hidden_by_a_second_one(make_rig, order: str):
+    rig = make_rig()
+    rig.until(S.ACTIVE)
+    rig.operator.stop()
+    rig.bus.to_hal = Ghost(load().message("PENDANT_STATE"), order, "Request", lambda _: 0)
+    assert rig.cycle().supervisor is S.HOLD
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_f58_a_start_that_one_of_two_pendants_presses_does_not_count(make_rig, order: str):
+    rig = make_rig(starts=False)
+    into(rig, S.READY)
+    pendant = load().message("PENDANT_STATE")
+
+    def pressed(code: int) -> int:
+        return code + 1
+
+    presses = Ghost(pendant, order, "Request", lambda _: 1)
+    counts = Ghost(pendant, order, "RequestCounter", pressed)
+
+    def both(frames: Frames) -> Frames:
+        """START and its counter, in one frame of the ghost."""
+        mine = frames[frames["can_id"] == PENDANT_STATE]
+        if not len(mine):
+            return frames
+        ghost = resealed(resealed(mine, pendant, "Request", lambda _: 1), pendant, "RequestCounter", pressed)
+        return np.concatenate([ghost, frames] if order == "first" else [frames, ghost])
+
+    rig.bus.to_hal = both if order in ("first", "after") else (presses if order == "late" else counts)
+    rig.run(2)
+    rig.bus.to_hal = lambda frames: frames
+    assert rig.run(ENABLE_CYCLES + 50).supervisor is S.READY
+
+
+@pytest.mark.parametrize("ahead", [-3, -1, 1, 3, 20])
+def test_f58_a_second_sender_with_a_counter_of_its_own_ends_in_hold_within_five_cycles(make_rig, ahead: int):
+    message = load().message("LEFT_SK_STATE")
+    rig = make_rig()
+    rig.until(S.ACTIVE)
+    rig.bus.to_hal = Ghost(message, "after", "Counter", lambda code: code + ahead)
+    assert rig.run(5).supervisor is S.HOLD
+    assert ("NODE_DUPLICATE", "error") in rig.seen("NODE_DUPLICATE")
+
+
+def test_a_frame_that_comes_twice_is_a_repetition_as_ever(make_rig):
+    rig = make_rig()
+    rig.until(S.ACTIVE)
+    rig.bus.to_hal = lambda frames: np.concatenate([frames, frames[np.isin(frames["can_id"], (0x184, PENDANT_STATE))]])
+    assert rig.run(100).supervisor is S.ACTIVE
+    assert rig.seen("NODE_DUPLICATE") == []
+    assert ("E2E_REPEATED", "info") in rig.seen("E2E_REPEATED")

@@ -13,7 +13,7 @@ from atalante_tools.faults.checks import (
     guide_kept,
     left_leg_holds_by_itself,
 )
-from atalante_tools.faults.scenario import Case, Scenario
+from atalante_tools.faults.scenario import Case, Press, Scenario
 
 _HOLD: Final = SupervisorState.HOLD
 _ACTIVE: Final = SupervisorState.ACTIVE
@@ -23,6 +23,7 @@ _BUSES: Final = ("left_leg", "right_leg", "left_sense", "right_sense")
 _KNEE: Final = "LEFT_SK"
 _STATE: Final = "LEFT_SK_STATE"
 _COMMAND: Final = "COMMAND_LEFT_LEG"
+_PENDANT: Final = "PENDANT"
 _DRIVES: Final = tuple(joint.upper() for joint in JOINTS)
 
 
@@ -236,5 +237,51 @@ SCENARIOS: Final = (
             Case("one frame", (Fault("inject", _COMMAND, 0, 1, SK_TargetTorque=200.0),)),
         ),
         lasting=Case("for good", (Fault("inject", _COMMAND, SK_TargetTorque=200.0),)),
+    ),
+    # `ahead` 1: ahead of the true frame of the cycle, under its counter; 0: behind the true frame of the cycle before.
+    Scenario(
+        "F58",
+        (
+            *(
+                Case(f"{node}, {order}", (Fault("inject", f"{node}_STATE", 0, 50, ahead=ahead, **signals),), node=node)
+                for node, signals in (
+                    (_KNEE, {"Temperature": 31.0}),
+                    ("IMU_PELVIS", {"Temperature": 31.0}),
+                    ("FOOT_RIGHT", {"Temperature": 31.0}),
+                    (_PENDANT, {"AssistanceFactor": 0.25}),
+                )
+                for order, ahead in (("first", 1), ("late", 0))
+            ),
+            Case("another position", (Fault("inject", _STATE, 0, 50, Position=0.0),), node=_KNEE),
+            Case("a counter of its own", (Fault("inject", _STATE, 0, 50, ahead=7),), node=_KNEE),
+            *(
+                Case(
+                    f"{name}, {order}",
+                    (*presses, Fault("inject", "PENDANT_STATE", 0, 3, ahead=ahead, **signals)),
+                    node=_PENDANT,
+                    dtc="OPERATOR_STOP",
+                    noticed=1,
+                    reacted=1,
+                )
+                for name, presses, signals in (
+                    ("a second pendant releases the dead-man", (), {"DeadMan": 0}),
+                    ("a second pendant says STOP", (), {"Request": 2}),
+                    ("a second pendant hides STOP", (Press("stop"),), {"Request": 0}),
+                )
+                for order, ahead in (("first", 1), ("late", 0))
+            ),
+            Case(
+                "there before it starts",
+                (Fault("inject", _STATE, 2, Temperature=31.0),),
+                None,
+                noticed=10,
+                reacted=1,
+                node=_KNEE,
+                state=_OFF,
+                recovers=False,
+                watched=300,
+            ),
+        ),
+        lasting=Case("for good", (Fault("inject", _STATE, Temperature=31.0),)),
     ),
 )
