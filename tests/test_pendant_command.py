@@ -15,6 +15,7 @@ from atalante_emulator.body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus import BusDown
+from atalante_hal.cia402 import DriveState
 from atalante_hal.frame import FRAME, FRAME_BYTES, Frames
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
@@ -299,6 +300,128 @@ def test_start_presses_once_the_hal_is_ready_and_says_so(world: World, capsys: p
     ]
 
 
+HEAD_STARTS = (1, 5, 10, 15, 16, 17, 50, 100)
+
+
+def started_once(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    """`pendant start` ends in ACTIVE with one press, within 250 cycles of the pendant and the HAL being there."""
+    operator = world.session()
+    operator.take()
+    operator.start_wanted = True
+    operator.stay(0.35)
+    assert ACTIVE in world.states[-250:]
+    assert world.hal.state.supervisor is HOLD
+    said = capsys.readouterr().err.splitlines()
+    assert said[-3:] == ["START pressed", "the HAL is ACTIVE", "STOP: the HAL is HOLD"]
+    assert said.count("START pressed") == 1
+
+
+@pytest.mark.parametrize("cycles", HEAD_STARTS)
+def test_start_is_followed_by_a_hal_that_comes_later(
+    world: World, cycles: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    world.running = False
+    cycle = world.cycle
+
+    def late() -> None:
+        world.running |= world.now >= cycles * 1e-3
+        cycle()
+
+    monkeypatch.setattr(world, "cycle", late)
+    started_once(world, capsys)
+
+
+@pytest.mark.parametrize("cycles", HEAD_STARTS)
+def test_start_is_followed_by_a_hal_that_was_there_before(
+    world: World, cycles: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    world.run(cycles)
+    started_once(world, capsys)
+
+
+@pytest.mark.parametrize("cycles", HEAD_STARTS)
+@pytest.mark.parametrize("state", [READY, HOLD])
+def test_start_of_a_late_pendant_is_followed(
+    world: World, state: SupervisorState, cycles: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if state is HOLD:
+        world.active()
+        world.nodes.clear()
+        assert world.run(10) is HOLD
+    else:
+        assert world.run(200) is READY
+    assert world.run(cycles) is state
+    started_once(world, capsys)
+
+
+@pytest.mark.parametrize("frames", HEAD_STARTS)
+@pytest.mark.parametrize("state", [READY, HOLD])
+def test_a_late_pendant_may_press_from_its_second_frame_on(world: World, state: SupervisorState, frames: int) -> None:
+    assert world.run(200) is READY
+    if state is HOLD:
+        world.active()
+        world.nodes.clear()
+        assert world.run(10) is HOLD
+        frames += 1  # the first one after a loss is refused
+    node = world.speaking()
+    assert world.run(frames) is state
+    node.press(Request.START)
+    assert world.run(40) is ACTIVE
+    node.press(Request.HOLD)
+    assert world.run(300) is HOLD
+
+
+def test_one_start_in_fault_is_one_move_and_the_operator_is_told(
+    world: World, capsys: pytest.CaptureFixture[str]
+) -> None:
+    operator = world.session()
+    operator.take()
+    operator.start_wanted = True
+    operator.stay(0.5)
+    operator.node.dead_man = True
+    world.emulator.drives.state[7] = DriveState.FAULT
+    world.emulator.drives._states_changed()
+    operator.speak_for(10)
+    assert world.hal.state.supervisor is SupervisorState.FAULT
+
+    class TypesStart(Keyboard):
+        def lines(self) -> list[str]:
+            return ["start"] if operator.node.spoken in presses else []
+
+    capsys.readouterr()
+    begun = operator.node.spoken
+    presses = {begun + 10, begun + 400}
+    operator._keyboard = TypesStart(None)
+    operator.stay(begun * 1e-3 + 0.6)
+    assert capsys.readouterr().err.splitlines() == [
+        "the HAL is FAULT",
+        "START pressed",
+        "the HAL is HOLD",
+        "one START is one change of state; type start to press START again",
+        "START pressed",
+        "the HAL is ACTIVE",
+        "STOP: the HAL is HOLD",
+    ]
+
+
+def test_a_start_that_is_refused_is_said_and_the_hal_has_the_reason(
+    world: World, capsys: pytest.CaptureFixture[str]
+) -> None:
+    world.active()
+    world.nodes.clear()
+    world.run(10)
+    temperature = world.emulator.signals.slice("Temperature").start
+    world.emulator.before_send.append(lambda cycle, values: values.__setitem__(temperature, 115.0))
+    operator = world.session()
+    operator.take()
+    operator.start_wanted = True
+    operator.stay(0.6)
+    said = capsys.readouterr().err
+    assert "the HAL did not become ACTIVE, its events say why; type start to press START again" in said
+    assert [event.text for event in world.hal.events if event.code == "START_REFUSED"] == [world.hal.reason]
+    assert world.hal.reason.startswith("START is refused: LEFT_FH: its torque limit is")
+
+
 def test_typed_lines_are_obeyed(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     operator = world.session()
     operator.take()
@@ -378,7 +501,9 @@ def test_a_start_that_leads_nowhere_is_said(world: World, capsys: pytest.Capture
     )
     operator.start_wanted = True
     operator.stay(1.0)
-    assert "the HAL did not become ACTIVE; type start to press START again" in capsys.readouterr().err
+    assert (
+        "the HAL did not become ACTIVE, its events say why; type start to press START again" in capsys.readouterr().err
+    )
 
 
 def test_the_keyboard_gives_whole_lines_and_ends_with_the_file() -> None:

@@ -2,7 +2,8 @@
 
 One pendant speaks at a time. A new one listens first and goes on where the other is: number of presses, dead-man, assistance
 factor. The older one hears its own identifier from somebody else and falls silent. In between, both answer the same SYNC for a
-cycle or two, with the same counter, the low byte of its Cycle; the HAL takes the first and notes that the second is a repetition.
+cycle or two, with the same counter, the low byte of its Cycle; the HAL takes the first and notes that the second is a repetition,
+or that there are two senders if their frames differ. It holds the robot when that lasts for four cycles.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ SILENT: Final = 10
 OPERATIONAL: Final = 5
 FIRMWARE_VERSION: Final = 0x0100
 #: The frame is whole, whatever its counter says: somebody sent it.
-_SPOKEN: Final = (Check.OK, Check.SOME_LOST, Check.REPEATED, Check.WRONG_SEQUENCE)
+_SPOKEN: Final = (Check.OK, Check.SOME_LOST, Check.REPEATED, Check.CONFLICT, Check.WRONG_SEQUENCE)
 
 
 class Request(IntEnum):

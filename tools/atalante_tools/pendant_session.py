@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
+from atalante_hal.e2e import REQUALIFY
 from atalante_hal.hal import PERIOD
 from atalante_hal.types import SupervisorState
 from atalante_tools.options import Target
@@ -27,8 +28,6 @@ LOOK_UP: Final = 0.02
 SAY: Final = 500
 SAY_STOP: Final = 20
 SAY_RELEASED: Final = 5
-#: Cycles of speaking before the first press, so that the HAL sees the number of presses change.
-BEFORE_PRESS: Final = 10
 #: Cycles after START in which a well robot becomes ACTIVE.
 STARTED_BY: Final = 400
 
@@ -138,17 +137,19 @@ class Session:
         if node.hal is not self._hal and node.hal is not None:
             self._hal = node.hal
             say(f"the HAL is {node.hal.name}")
-            if node.hal is SupervisorState.ACTIVE:
-                self._pressed_at = None
+            if self._pressed_at is not None and node.hal is not SupervisorState.ACTIVE:
+                say("one START is one change of state; type start to press START again")
+            self._pressed_at = None
         startable = node.hal in (SupervisorState.READY, SupervisorState.HOLD)
-        if self.start_wanted and startable and node.spoken > BEFORE_PRESS:
+        # The HAL trusts the pendant from its frame number `REQUALIFY` on.
+        if self.start_wanted and startable and node.spoken > REQUALIFY:
             self.start_wanted = False
             self._pressed_at = node.cycles
             node.press(Request.START)
             say("START pressed")
         elif self._pressed_at is not None and node.cycles - self._pressed_at > STARTED_BY:
             self._pressed_at = None
-            say("the HAL did not become ACTIVE; type start to press START again")
+            say("the HAL did not become ACTIVE, its events say why; type start to press START again")
 
 
 class Keyboard:
