@@ -208,9 +208,13 @@ class Hal:
         if dtc is Dtc.CYCLE_GAP and confirmed:
             self._transceiver.discard()
 
+    def end(self) -> None:
+        """HOLD from the next cycle on, and no START any more. A signal handler may call it at any time."""
+        self._supervision.end()
+
     def stop(self, cycles: int = 10) -> None:
         """HOLD, and stay long enough for every drive to have followed. Call at the end, before closing the bus."""
-        self._supervision.end()
+        self.end()
         patience, deadline = self.patience, time.monotonic() + STOP_PATIENCE
         for _ in range(cycles):
             self.patience = max(0.0, min(patience, deadline - time.monotonic()))

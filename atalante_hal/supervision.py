@@ -228,7 +228,7 @@ class Supervision:
     def _judge_start(self, nodes_well: bool) -> None:
         """From START until the supervisor moves, the drives take too long, or the start is refused."""
         state, pendant = self._state, self._pendant
-        if pendant.started and state.supervisor is not _S.ACTIVE:
+        if pendant.started and state.supervisor is not _S.ACTIVE and not self._ending:
             faulty = {
                 node for node, drive in zip(DRIVE_NODES, state.drive_state.tolist(), strict=True) if drive in _FAULTY
             }
@@ -246,6 +246,8 @@ class Supervision:
     def _hindrance(self, nodes_well: bool) -> str:
         """Return why a start that was asked for cannot go on, one sentence; empty: it can."""
         memory, pendant = self.memory, self._pendant
+        if self._ending:
+            return "the program is ending"
         if pendant.stop_requested or not pendant.dead_man:
             return _WORDS[pendant.stop_requested]
         if self._state.supervisor in (_S.LOWER, _S.FAULT):

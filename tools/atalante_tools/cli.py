@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import importlib
-import signal
-import sys
-from types import FrameType
-from typing import Any, NoReturn
+from typing import Any
 
 import click
 
-from atalante_tools.outcome import INTERRUPTED, TERMINATED, Misused, failure_of
-from atalante_tools.terminal import Patience
+from atalante_tools.entry import main as main
+from atalante_tools.outcome import INTERRUPTED, Misused, failure_of
 
 #: Command -> its line in the list. Each is the attribute `command` of the module of that name.
 COMMANDS = {
@@ -91,19 +88,3 @@ def cli() -> None:
 
     Exit codes: 0 ok, 1 failed, 2 usage, 3 no device, 4 fault latched, 130 Ctrl-C, 143 SIGTERM.
     """
-
-
-def main() -> NoReturn:
-    """Entry point."""
-    # A command that moves the robot replaces this by ending in HOLD first; Python alone would skip every `finally`.
-    signal.signal(signal.SIGTERM, _terminate)
-    Patience.begin()
-    try:
-        cli(prog_name="atalante")
-    except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
-    raise AssertionError("click ends the process")
-
-
-def _terminate(_number: int, _frame: FrameType | None) -> NoReturn:
-    raise SystemExit(TERMINATED)

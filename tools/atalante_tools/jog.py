@@ -67,7 +67,7 @@ def command(joint: str, degrees: float, speed: float, seed: int, target: Target,
         return f"{name} {math.degrees(state.position[index]):7.2f} deg, going to {degrees:.2f} deg"
 
     fields = controller.telemetry_fields
-    with stop_requested() as stop, open_hal(target, robot=robot, seed=seed, controller_fields=fields) as rig:
+    with open_hal(target, robot=robot, seed=seed, controller_fields=fields) as rig, stop_requested() as stop:
         watch = Watch(rig, stop, done, describe)
         rig.run(controller, until=watch)
         watch.conclude()

@@ -16,7 +16,6 @@ USAGE: Final = 2
 NO_DEVICE: Final = 3
 FAULT_LATCHED: Final = 4
 INTERRUPTED: Final = 130
-TERMINATED: Final = 143
 
 
 class Failed(click.ClickException):

@@ -26,7 +26,7 @@ from atalante_tools.body import describe, open_body
 from atalante_tools.embedded import EmbeddedRobot, Order
 from atalante_tools.options import Target
 from atalante_tools.outcome import Failed, FaultLatched
-from atalante_tools.signals import StopRequest
+from atalante_tools.signals import StopRequest, ended_by
 from atalante_tools.terminal import Progress, say
 
 if TYPE_CHECKING:
@@ -52,12 +52,21 @@ class Rig:
     def run(
         self, controller: Controller, *, until: Callable[[State], bool], record: Callable[[], None] = lambda: None
     ) -> Statistics:
-        """`loop.run` on the clock of the target; ends in HOLD. On the wall clock the process asks for real-time rights."""
-        if self.target.lockstep:
-            return run(self.hal, controller, LockStep(), until=until, record=record)
-        for refused in realtime():
-            say(refused)
-        return run(self.hal, controller, WallClock(), until=until, record=record)
+        """`loop.run` on the clock of the target; ends in HOLD. On the wall clock the process asks for real-time rights.
+
+        A signal makes the HAL refuse every START and go to HOLD; no further signal cuts that short. `until` has to look at the
+        stop request.
+
+        Raises:
+            Stopped: a signal arrived before; the robot was not driven.
+        """
+        with ended_by(self.hal.end) as stop:
+            stop.check()
+            if self.target.lockstep:
+                return run(self.hal, controller, LockStep(), until=until, record=record)
+            for refused in realtime():
+                say(refused)
+            return run(self.hal, controller, WallClock(), until=until, record=record)
 
 
 @contextmanager

@@ -174,7 +174,6 @@ def _walk_all(
         apart = _start_robot(target, stack)  # it loads what it needs while the controllers are made
         network, robot = atalante_dbc.load(), load_robot()
         exoskeleton, gait, controllers = _controllers(options.subject, robot, shapes)
-        stop = stack.enter_context(stop_requested())
         promised: dict[str, Certificate] = {}
         telemetry: TelemetryProcess | None = None
         last = [*controllers][-1]
@@ -191,7 +190,8 @@ def _walk_all(
                     report_endpoint = _EndpointReport(telemetry)
                 telemetry.begin_run(name, {"shape": name, "xi": options.xi, **_promise(promised[name])})
                 walk = _Walk(rig, controller, telemetry, report_endpoint, name, options.steps)
-                statistics = walk.run(stop)
+                with stop_requested() as stop:
+                    statistics = walk.run(stop)
                 factors = controller.statistics.factors or {options.xi}
                 walked.results.append(_result(_weakest(controller, factors), controller, rig.hal, statistics))
                 if as_json:

@@ -61,7 +61,7 @@ def command(motor: str, level: float, seconds: float, target: Target, as_json: b
         return f"{MOTORS[index]} at {state.vibration[index]:.2f}, {seconds - controller.elapsed:.0f} s left"
 
     fields = controller.telemetry_fields
-    with stop_requested() as stop, open_hal(target, robot=robot, controller_fields=fields) as rig:
+    with open_hal(target, robot=robot, controller_fields=fields) as rig, stop_requested() as stop:
         watch = Watch(rig, stop, done, describe)
         rig.run(controller, until=watch)
         watch.conclude()

@@ -12,6 +12,7 @@ import click
 from atalante_tools.names import find
 from atalante_tools.options import json_option
 from atalante_tools.outcome import Failed
+from atalante_tools.signals import check_stop
 from atalante_tools.terminal import Progress, say, show_json, table
 
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ def command(names: tuple[str, ...], quick: bool, as_json: bool) -> None:
     progress = Progress()
     rows: list[tuple[str, ...]] = [("benchmark", "value", "baseline", "unit", "ratio", "target", "", "baseline is")]
     for place, benchmark in enumerate(chosen, start=1):
+        check_stop()
         where = f"{benchmark.name} ({place} of {len(chosen)})"
 
         def show(done: int, of: int, where: str = where) -> None:

@@ -10,6 +10,7 @@ import click
 
 from atalante_tools.options import Between, Target, json_option, target_options
 from atalante_tools.outcome import FAILED
+from atalante_tools.signals import check_stop, ended_by
 from atalante_tools.terminal import say, show_json
 
 if TYPE_CHECKING:
@@ -64,6 +65,7 @@ def command(
     from atalante_tools.conform.requirement import Verdict, examine
 
     with _bench(node, target, torque, patience) as bench:
+        check_stop()
         wanted = _chosen(requirements_of(bench), only, without)
         if not as_json:
             click.echo(heading(bench, str(target), f"{datetime.now():%Y-%m-%d %H:%M}"))
@@ -76,7 +78,8 @@ def command(
                 else:
                     click.echo(entry(result))
         finally:
-            make_safe(bench)
+            with ended_by(lambda: None):  # the node is made safe, whatever number of signals comes
+                make_safe(bench)
     for left_out in without:
         say(f"left out on request: {left_out.upper()}")
     say(conclusion(bench, results))

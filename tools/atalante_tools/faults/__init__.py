@@ -16,6 +16,7 @@ import click
 from atalante_tools.names import find
 from atalante_tools.options import json_option
 from atalante_tools.outcome import Failed, Misused
+from atalante_tools.signals import check_stop
 from atalante_tools.terminal import Progress, say, show_json, table
 
 if TYPE_CHECKING:
@@ -153,6 +154,7 @@ def _done(tasks: Sequence[Task], *, jobs: int = 1, dask: str = "") -> Iterator[R
     try:
         for count, result in enumerate(results(tasks, jobs=jobs, dask=dask), 1):
             yield result
+            check_stop()
             if progress.due():
                 full = _BAR * count // len(tasks)
                 left = (time.monotonic() - begun) / count * (len(tasks) - count)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,8 +10,8 @@ from typing import TYPE_CHECKING
 import click
 
 from atalante_tools.options import Between, Written, json_option
-from atalante_tools.outcome import FAILED, Failed
-from atalante_tools.signals import SIGNALLED, stop_requested
+from atalante_tools.outcome import FAILED, INTERRUPTED, Failed
+from atalante_tools.signals import stop_requested
 from atalante_tools.terminal import Progress, say, show_json
 
 if TYPE_CHECKING:
@@ -173,7 +172,9 @@ def _listen(
         for bus in buses.values():
             bus.close()
     progress.clear()
-    return [result], 0 if stop.exit_code == SIGNALLED + signal.SIGINT else stop.exit_code
+    if stop.exit_code == INTERRUPTED:
+        stop.settle()
+    return [result], stop.exit_code
 
 
 def _show(result: Report, as_json: bool) -> None:
