@@ -275,16 +275,81 @@ def test_a_signal_ends_a_running_command_in_hold(number: signal.Signals, code: i
     assert rest.endswith("stopped, the robot is in HOLD\n")
 
 
-def test_sigterm_outside_a_run_is_143_too() -> None:
+def main_with(command: str) -> subprocess.CompletedProcess[str]:
+    """`atalante` with Python code for its command, which may call `send(number)`."""
+    program = f"""
+import atexit, ctypes, os, signal, sys
+from atalante_tools import cli, entry
+def send(number):
+    os.kill(os.getpid(), number)
+def command(**_):
+    {command}
+cli.cli = command
+entry.main()
+"""
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "send({0}); print('not ended')",
+        "ctypes.CFUNCTYPE(None)(lambda: send({0}))()",  # where the exception is lost
+        "ctypes.CFUNCTYPE(None)(lambda: send({0}))(); sys.exit(1)",
+        "ctypes.CFUNCTYPE(None)(lambda: send({0}))(); send(signal.SIGTERM)",  # the first one counts
+    ],
+)
+def test_a_signal_outside_a_run_decides_the_exit_code(number: signal.Signals, code: int, command: str) -> None:
+    done = main_with(command.format(int(number)))
+    assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
+
+
+def test_an_error_that_a_library_makes_of_a_signal_is_not_reported() -> None:
+    lines = ("try: send(2)", "except BaseException as error: raise ImportError('half imported') from error")
+    done = main_with("\n    ".join(lines))
+    assert (done.returncode, done.stderr) == (130, "")
+
+
+def test_an_error_after_a_signal_is_one_sentence() -> None:
+    done = main_with("ctypes.CFUNCTYPE(None)(lambda: send(2))(); 1 / 0")
+    assert done.returncode == 130
+    assert done.stderr == "atalante: stopped by a signal, then ZeroDivisionError: division by zero\n"
+
+
+def test_a_defect_without_a_signal_keeps_its_traceback_and_others_stay_reported() -> None:
+    done = main_with("ctypes.CFUNCTYPE(None)(lambda: [][1])(); 1 / 0")
+    assert done.returncode == 1
+    assert "IndexError" in done.stderr
+    assert done.stderr.endswith("ZeroDivisionError: division by zero\n")
+
+
+def test_a_signal_after_the_command_ends_the_process_without_a_traceback() -> None:
+    done = main_with("atexit.register(send, signal.SIGINT)")
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
+
+
+def test_signals_are_handled_before_anything_is_imported() -> None:
     program = """
-import os, signal
-from atalante_tools import cli
-cli.cli = lambda **_: os.kill(os.getpid(), signal.SIGTERM)
-cli.main()
+import signal, sys
+there = set(sys.modules)
+from atalante_tools.entry import main
+print(*sorted(name for name in set(sys.modules) - there if not name.startswith("_")))
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        print(name, signal.getsignal(signal.SIGINT) is not signal.default_int_handler,
+              signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL)
+        sys.stdout.flush()
+        import os
+        os._exit(0)
+sys.meta_path.insert(0, Finder())
+main()
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 143
-    assert "Traceback" not in done.stderr
+    imported, first = done.stdout.splitlines()
+    assert {"atalante_tools", "atalante_tools.entry", "atalante_tools.signals"} <= set(imported.split())
+    assert not set(imported.split()) & {"click", "typing", "threading", "numpy"}
+    assert first == "atalante_tools.cli True True"
 
 
 def test_a_reader_that_goes_away_is_no_traceback() -> None:

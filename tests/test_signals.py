@@ -9,7 +9,7 @@ import threading
 
 import pytest
 
-from atalante_tools.signals import stop_requested
+from atalante_tools.signals import Stopped, check_stop, ended_by, stop_requested
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -59,3 +59,34 @@ def test_another_thread_has_no_signals_and_no_error() -> None:
     thread.start()
     thread.join()
     assert seen == [False]
+
+
+def test_a_block_inside_has_the_request_of_the_block_around_it() -> None:
+    with stop_requested() as outer:
+        with stop_requested() as inner:
+            assert inner is outer
+            signal.raise_signal(signal.SIGTERM)
+        assert outer.exit_code == 143
+        with pytest.raises(Stopped) as end, stop_requested():
+            raise AssertionError("begun")
+        assert end.value.code == 143
+        with pytest.raises(Stopped):
+            check_stop()
+        outer.settle()
+        check_stop()
+        with stop_requested() as again:
+            assert not again.wanted
+    with stop_requested() as later:
+        assert later is not outer
+
+
+def test_a_block_that_ends_by_itself_is_cut_short_by_no_signal() -> None:
+    ends: list[bool] = []
+    with stop_requested() as stop:
+        with ended_by(lambda: ends.append(stop.wanted)) as request:
+            assert request is stop
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGINT):
+                signal.raise_signal(number)
+        assert stop.exit_code == 130
+    assert ends == [True, True, True]
+    check_stop()  # nothing is left of it

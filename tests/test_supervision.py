@@ -65,6 +65,24 @@ def test_recovery_from_hold_takes_the_operator(rig):
     assert rig.until(S.ACTIVE, 20).supervisor is S.ACTIVE
 
 
+@pytest.mark.parametrize("cycles", [0, 1, 2])
+def test_a_program_that_ends_during_a_start_enables_no_drive(rig, cycles):
+    while not rig.hal.conditions.start_wanted:
+        rig.cycle()
+    for _ in range(cycles):
+        rig.cycle()
+    rig.hal.end()
+    rig.cycle()
+    assert not rig.hal.conditions.start_wanted
+    enabled = set()
+    for _ in range(20):
+        rig.operator.start()
+        rig.cycle()
+        enabled.update(rig.emulator.drives.state)
+    assert rig.hal.state.supervisor is S.READY
+    assert DriveState.OPERATION_ENABLED not in enabled
+
+
 def test_losing_the_pendant_is_a_stop_after_exactly_its_timeout(rig):
     rig.until(S.ACTIVE)
     rig.bus.to_hal = rig.drop(0x194)

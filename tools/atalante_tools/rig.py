@@ -26,7 +26,7 @@ from atalante_tools.body import describe, open_body
 from atalante_tools.embedded import EmbeddedRobot, Order
 from atalante_tools.options import Target
 from atalante_tools.outcome import Failed, FaultLatched
-from atalante_tools.signals import StopRequest, ended_by
+from atalante_tools.signals import StopRequest, check_stop, ended_by
 from atalante_tools.terminal import Progress, say
 
 if TYPE_CHECKING:
@@ -104,6 +104,7 @@ def open_hal(
         FaultError: the network has no such target or signal.
         BusError, ChannelMapError: the buses cannot be opened, or another HAL is at work on them.
         Failed: the embedded robot needs PyBullet and it is not installed.
+        Stopped: a signal arrived meanwhile.
     """
     network = network or atalante_dbc.load()
     robot = robot or load_robot()
@@ -140,6 +141,7 @@ def open_hal(
         )
         if apart is None and not target.embedded:
             hal.listen()
+        check_stop()  # one that compiled code lost while all this was made
         yield Rig(target, hal, emulator, operator if emulator else None)
 
 
