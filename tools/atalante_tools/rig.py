@@ -104,8 +104,9 @@ def open_hal(
         FaultError: the network has no such target or signal.
         BusError, ChannelMapError: the buses cannot be opened, or another HAL is at work on them.
         Failed: the embedded robot needs PyBullet and it is not installed.
-        Stopped: a signal arrived meanwhile.
+        Stopped: a signal arrived before or meanwhile.
     """
+    check_stop()  # an import may have lost its exception, as may what is made here
     network = network or atalante_dbc.load()
     robot = robot or load_robot()
     with ExitStack() as stack:
@@ -141,7 +142,7 @@ def open_hal(
         )
         if apart is None and not target.embedded:
             hal.listen()
-        check_stop()  # one that compiled code lost while all this was made
+        check_stop()
         yield Rig(target, hal, emulator, operator if emulator else None)
 
 
