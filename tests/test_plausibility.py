@@ -19,14 +19,15 @@ from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.codec import Codec
 from atalante_hal.diagnostics import Dtc
 from atalante_hal.e2e import Check
-from atalante_hal.image import ReceiveImage
+from atalante_hal.image import NEVER, ReceiveImage
 from atalante_hal.plausibility import Finding, Plausibility
 from atalante_hal.plausibility.encoders import Encoders
 from atalante_hal.plausibility.feet import Feet
-from atalante_hal.plausibility.finding import Signals, measured, signals_of
+from atalante_hal.plausibility.finding import Ages, Signals, measured, signals_of
 from atalante_hal.plausibility.imus import Imus
 from atalante_hal.plausibility.legs import Legs, _Contradiction, _forgotten, hip_angles
 from atalante_hal.plausibility.stillness import Stillness
+from atalante_hal.plausibility.unchecked import Unchecked
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, load_robot
 
 NETWORK = atalante_dbc.load()
@@ -325,11 +326,17 @@ class TestVelocity:
         jitter = [rng.choice([-0.9, 0.9]) for _ in range(1000)]
         assert machine.run(400, lambda now: now.velocity.__iadd__(jitter[machine.cycles // 16] * GEAR)) == ()
 
-    def test_a_cycle_with_a_loss_starts_the_comparison_anew(self):
+    @pytest.mark.parametrize("lost", ["left_HA", "right_HA", "IMU_torso", "FOOT_left", "pendant"])
+    def test_frames_lost_when_samples_are_taken_hide_no_wrong_velocity(self, lost: str):
         machine = Machine()
-        for cycle in range(200):
-            machine.missing = {row("right_HA")} if cycle % 16 < 4 else set()
-            assert machine.cycle(lambda now: now.velocity.__setitem__(5, 1000.0)) == ()
+        machine.run(40)
+
+        def wrong(now: Signals) -> None:
+            machine.missing = {row(lost)} if machine.cycles % 16 < 4 else set()
+            now.velocity[5] = 1000.0
+
+        machine.until_found(Dtc.ENC_VELOCITY, 64, wrong)
+        assert only(machine.checks.findings).node == "LEFT_HA"
 
     def test_three_wrong_comparisons_on_end_are_needed(self):
         """A sample is compared with the one before and with the one after it."""
@@ -388,25 +395,46 @@ class TestEncodersAlone:
             encoders, now = self.encoders()
             now.velocity[joint] = -np.nextafter(allowed, np.inf) if found else -allowed
             # One sample, and three that are compared with the one before.
-            assert [encoders.judge_velocity(True) for _ in range(5)] == [False] * 3 + [found] * 2
+            assert [encoders.judge_velocity(None) for _ in range(5)] == [False] * 3 + [found] * 2
             assert [f.value for f in encoders.findings()] == pytest.approx([-ROBOT.sensors.velocity_error] * found)
 
-    def test_a_sample_that_was_not_whole_is_compared_with_none(self):
-        encoders, now = self.encoders()
-        now.velocity[4] = 100.0
-        assert [encoders.judge_velocity(whole) for whole in (True, False) * 6] == [False] * 12
-        encoders, now = self.encoders()
-        now.velocity[4] = 100.0
-        whole = (True, True, True, False, True, True)
-        assert [encoders.judge_velocity(w) for w in whole] == [False] * 5 + [True]
-        assert encoders.judge_velocity(False)
+    def test_a_joint_too_old_is_compared_with_no_sample_of_its_own_and_hides_no_other(self):
+        for joint in range(12):
+            old = np.zeros(12, np.int64)
+            old[joint] = NEVER
+            encoders, now = self.encoders()
+            now.velocity[joint] = 100.0
+            assert [encoders.judge_velocity(age) for age in (None, old) * 6] == [False] * 12
+            encoders, now = self.encoders()
+            now.velocity[joint] = 100.0
+            ages = (None, None, None, old, None, None)
+            assert [encoders.judge_velocity(age) for age in ages] == [False] * 5 + [True]
+            finding = only(encoders.findings())
+            assert encoders.judge_velocity(old)
+            assert only(encoders.findings()) is finding
+            encoders, now = self.encoders()
+            now.velocity[(joint + 1) % 12] = 100.0
+            assert [encoders.judge_velocity(age) for age in (old,) * 5] == [False] * 3 + [True] * 2
+
+    @pytest.mark.parametrize("ages", list(itertools.product((0, 1, 4), repeat=2)))
+    def test_samples_count_from_the_cycles_they_were_measured_in(self, ages: tuple[int, int]):
+        """A joint at its highest velocity, whose samples are of ages that change: right is right, and wrong is wrong."""
+        speed = ROBOT.velocity_max * ROBOT.gear
+        for error, found in ((0.99, False), (1.01, True)):
+            encoders, now = self.encoders()
+            for turn in range(5):
+                age = ages[turn % 2]
+                now.position[:] = speed * PERIOD * (16 * turn - age)
+                now.velocity[:] = speed - error * ROBOT.sensors.velocity_error * ROBOT.gear
+                last = encoders.judge_velocity(np.full(12, age))
+            assert last is found
 
     def test_each_joint_is_counted_for_itself(self):
         encoders, now = self.encoders()
         now.velocity[4] = now.velocity[9] = 100.0
-        assert [encoders.judge_velocity(True) for _ in range(3)] == [False] * 3
+        assert [encoders.judge_velocity(None) for _ in range(3)] == [False] * 3
         now.velocity[9] = -100.0  # right on average
-        assert encoders.judge_velocity(True)
+        assert encoders.judge_velocity(None)
         assert [f.node for f in encoders.findings()] == [JOINTS[4].upper()]
 
 
@@ -620,17 +648,54 @@ class TestDrift:
     def test_an_angle_and_the_same_a_turn_on_agree(self, leg: int):
         now = signals_of(CODEC, np.zeros(CODEC.size))
         now.quaternion[:, 0] = 1.0
-        legs = Legs(ROBOT, now, np.zeros(12, np.int64))
+        legs = Legs(ROBOT, now, np.zeros(12, np.int64), PERIOD)
         for turn in (0.0, 2.0 * math.pi, -2.0 * math.pi):
             now.position[:] = (turn + np.array([0.05, -0.04, 0.03, 0.0] * 3)) * GEAR
             hip = 6 * leg
             now.position[hip : hip + 4] = (turn + np.array([0.05, -0.04, 0.03, -turn])) * GEAR[hip : hip + 4]
-            assert legs._compare(leg).errors == pytest.approx((0.05, -0.04, 0.03), abs=1e-9)
+            assert legs._compare(leg, None).errors == pytest.approx((0.05, -0.04, 0.03), abs=1e-9)
+
+    @pytest.mark.parametrize("leg", [0, 1])
+    @pytest.mark.parametrize("late", ["none", "joints", "pelvis", "tibia", "all"])
+    def test_values_of_several_cycles_are_compared_at_one_moment(self, leg: int, late: str):
+        """All joints at their highest velocity, and a pelvis that turns; values up to four cycles old."""
+        velocity, turning = ROBOT.velocity_max, np.array([0.5, -0.7, 0.9])
+        tibia = IMUS.index(("left_tibia", "right_tibia")[leg])
+        ages = Ages(np.zeros(12, np.int64), np.zeros(4, np.int64), np.zeros(2, np.int64))
+        ages.joint[:] = 4 * (late in ("joints", "all"))
+        ages.imu[IMUS.index("pelvis")] = 4 * (late in ("pelvis", "all"))
+        ages.imu[tibia] = 4 * (late in ("tibia", "all"))
+
+        def attitudes_at(time: float) -> np.ndarray:
+            whole = pinocchio.Quaternion(pinocchio.exp3(turning * time))
+            placed = [whole * pinocchio.Quaternion(w, x, y, z) for w, x, y, z in attitudes(MIDDLE + velocity * time)]
+            return np.array([q.coeffs()[[3, 0, 1, 2]] for q in placed])
+
+        now = signals()
+        now.position[:] = (MIDDLE - velocity * PERIOD * ages.joint) * GEAR
+        now.velocity[:] = velocity * GEAR
+        for imu, age in enumerate(ages.imu.tolist()):
+            w, x, y, z = now.quaternion[imu] = attitudes_at(-age * PERIOD)[imu]
+            later = pinocchio.Quaternion(*attitudes_at(1e-6 - age * PERIOD)[imu])
+            now.gyro[imu] = (
+                pinocchio.log3((pinocchio.Quaternion(w, x, y, z).inverse() * later).toRotationMatrix()) / 1e-6
+            )
+        legs = Legs(ROBOT, now, np.zeros(12, np.int64), PERIOD)
+        said = legs._compare(leg, ages)
+        assert said is not None
+        cycles = sum(ages.joint[:4]) + sum(ages.imu)
+        assert said.doubt == pytest.approx(ROBOT.sensors.velocity_error * PERIOD * cycles)
+        assert np.abs(said.errors).max() <= 1e-9 + 0.25 * said.doubt  # without being carried up to 32 mrad
+        for values, needed in ((ages.joint, range(6 * leg, 6 * leg + 4)), (ages.imu, (IMUS.index("pelvis"), tibia))):
+            for place in range(len(values)):
+                kept, values[place] = values[place], NEVER
+                assert (legs._compare(leg, ages) is None) is (place in needed)
+                values[place] = kept
 
     @pytest.mark.parametrize("leg", [0, 1])
     @pytest.mark.parametrize("axis", range(3))
     def test_four_samples_beyond_the_threshold_itself_are_a_drift(self, leg: int, axis: int):
-        legs = Legs(ROBOT, signals_of(CODEC, np.zeros(CODEC.size)), np.zeros(12, np.int64))
+        legs = Legs(ROBOT, signals_of(CODEC, np.zeros(CODEC.size)), np.zeros(12, np.int64), PERIOD)
         allowed = ROBOT.sensors.attitude_error
         for size, found in ((allowed, False), (np.nextafter(allowed, 1.0), True)):
             errors = [0.0] * 3
@@ -801,8 +866,8 @@ class TestStandingEncoder:
         assert finding.text == (
             f"the encoder of {JOINTS[joint]} stands still while its leg turned by {math.degrees(finding.value):+.2f} degrees"
         )
-        machine.missing = {row("pendant")}
-        assert only(machine.run(40, stick)) is finding
+        machine.missing = {row(f"IMU_{JOINTS[joint].split('_')[0]}_tibia")}
+        assert machine.run(9, stick)[0] is finding
 
     @joints
     @signs
@@ -827,7 +892,7 @@ class TestStandingEncoder:
     @pytest.mark.parametrize(("place", "axis"), [(0, 0), (1, 1), (2, 2), (3, 2)])
     def test_two_samples_in_which_the_leg_turned_and_the_encoder_did_not(self, leg: int, place: int, axis: int):
         standing = np.zeros(12, np.int64)
-        legs, joint = Legs(ROBOT, signals_of(CODEC, np.zeros(CODEC.size)), standing), 6 * leg + place
+        legs, joint = Legs(ROBOT, signals_of(CODEC, np.zeros(CODEC.size)), standing, PERIOD), 6 * leg + place
 
         def say(turned: float, change: float) -> list[float]:
             angles, errors = [0.1, -0.2, 0.3], [0.05, 0.06, -0.07]
@@ -855,7 +920,7 @@ class TestStandingEncoder:
         for turned in (0.0, 0.125, 0.5):
             allowed = sensors.attitude_change + sensors.misalignment * turned
             for change, found in ((allowed, False), (np.nextafter(allowed, 1.0), turned > 0.0)):
-                legs = Legs(ROBOT, signals_of(CODEC, np.zeros(CODEC.size)), standing)
+                legs = Legs(ROBOT, signals_of(CODEC, np.zeros(CODEC.size)), standing, PERIOD)
                 standing[0] = 0
                 legs._judge_standstill(0, _Contradiction((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
                 standing[0] = 1
@@ -877,17 +942,21 @@ class TestStandingEncoder:
 
     def test_a_leg_is_looked_at_out_of_turn_while_it_stands_still(self):
         standing, looked_at = np.zeros(12, np.int64), []
-        legs = Legs(ROBOT, signals(), standing)
+        legs = Legs(ROBOT, signals(), standing, PERIOD)
 
-        def compare(leg: int) -> _Contradiction:
+        too_old: set[int] = set()
+
+        def compare(leg: int, _: object) -> _Contradiction | None:
+            if leg in too_old:
+                return None
             looked_at.append(leg)
             return _Contradiction((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
         legs._compare = compare  # type: ignore[method-assign]
 
-        def look(judge: Callable[[bool], bool], whole: bool = True) -> list[int]:
+        def look(judge: Callable[[None], bool]) -> list[int]:
             looked_at.clear()
-            assert not judge(whole)
+            assert not judge(None)
             return looked_at.copy()
 
         left, right = legs.judge_left, legs.judge_right
@@ -906,7 +975,9 @@ class TestStandingEncoder:
             legs._stuck[leg] = (Finding(Dtc.ENC_STUCK, "", 0.0, True, ""),)
             assert look(judge) == [1 - leg, leg]
         standing[:] = 1
-        assert look(left, whole=False) == []
+        for leg in (0, 1):
+            too_old = {leg}
+            assert look(left) == look(right) == [1 - leg]
 
     def test_one_sample_is_a_stray(self):
         machine, turn = self.standing(JOINTS.index("left_TH"))
@@ -1034,8 +1105,10 @@ class TestStillnessAlone:
         def sample(value: float, check: Check) -> bool:
             self.move(now)
             now.gyro[0] = value
-            image.check.fill(heard)
-            image.check[torso] = check
+            image.age += 16
+            image.age[np.arange(len(MESSAGES)) != torso] = 0
+            if check <= Check.SOME_LOST:
+                image.age[torso] = 0
             return stillness.sample(False)
 
         assert not sample(1.0, heard)
@@ -1287,14 +1360,16 @@ def test_which_check_is_made_in_which_cycle(monkeypatch: pytest.MonkeyPatch):
         (Legs, "judge_left"),
         (Legs, "judge_right"),
         (Feet, "judge"),
+        (Unchecked, "judge"),
     ):
-        monkeypatch.setattr(owner, name, lambda *_, name=name: bool(made.append(name)))
+        monkeypatch.setattr(owner, name, lambda *_, name=f"{owner.__name__}.{name}": bool(made.append(name)))
     image = ReceiveImage(MESSAGES, np.zeros(CODEC.size))
     checks = Plausibility(ROBOT, image, PERIOD)
     assert checks.findings == ()
-    expected = {0: "sample", 2: "judge_velocity", 16: "sample", 18: "judge_velocity"}
-    expected |= {8: "judge_left", 24: "judge_right"}
-    expected |= dict.fromkeys(range(1, 32, 4), "judge")
+    expected = {0: "Stillness.sample", 2: "Encoders.judge_velocity", 4: "Unchecked.judge"}
+    expected |= {cycle + 16: name for cycle, name in expected.items()}
+    expected |= {8: "Legs.judge_left", 24: "Legs.judge_right"}
+    expected |= dict.fromkeys(range(1, 32, 4), "Feet.judge")
     for cycle in range(64):
         assert checks.check() == ()
         assert made == ([expected[cycle % 32]] if cycle % 32 in expected else [])

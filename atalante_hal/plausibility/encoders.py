@@ -2,7 +2,8 @@
 
 *Jump.* Between two good values, n cycles apart, a joint moves at most n * velocity_max * period, give or take 3 sigma of the
 encoder. What moved further is not used. *Velocity.* The mean of the reported velocity between two samples, by the
-trapezoidal rule, is the way the encoder made; the drive's low-pass puts them apart for a few cycles, not for fifty.
+trapezoidal rule, is the way the encoder made; the drive's low-pass puts them apart for a few cycles, not for fifty. A sample
+of a joint counts from the cycle it was measured in, so that a late or lost frame changes the interval and not the verdict.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import numpy as np
 
 from atalante_hal.compiled import compiled
 from atalante_hal.diagnostics import Dtc
-from atalante_hal.plausibility.finding import JOINT_NODES, Finding, Signals
+from atalante_hal.image import NEVER
+from atalante_hal.plausibility.finding import JOINT_NODES, Cycles, Finding, Signals
 from atalante_hal.robot import JOINTS, Robot, Vector
 
 #: Jumps on end, without a good value between them, that are no stray any more.
@@ -38,10 +40,13 @@ class Encoders:
         self._reach = self._way + self._noise
         self.jumps = [0] * len(JOINTS)
         self._jump_of: dict[int, float] = {}  # size of the last one
+        self._period, self._every = period, every
         # Twice the mean velocity of two samples less twice the way between them: the share of the later and of the earlier one.
         time = every * period
         self._of_later, self._of_earlier = np.array([[-2.0 / time, 1.0], [2.0 / time, 1.0]])
-        self._earlier: Vector | None = None  # share of the last sample, if every joint was heard in it
+        self._earlier = np.zeros((2, len(JOINTS)))  # position and velocity of the last sample
+        self._no_age = np.zeros(len(JOINTS), np.int64)
+        self._earlier_age: Cycles = np.full(len(JOINTS), NEVER)  # of the last sample when it was taken
         self._twice_allowed = 2.0 * robot.sensors.velocity_error * robot.gear
         self._wrong = [0] * len(JOINTS)
         self._wrong_findings: tuple[Finding, ...] = ()
@@ -67,28 +72,49 @@ class Encoders:
         self._jump_of[joint] = moved / self._gear[joint]
         return False
 
-    def judge_velocity(self, whole: bool) -> bool:
+    def judge_velocity(self, age: Cycles | None) -> bool:
         """Compare velocity and encoder over the last `every` cycles.
 
         Args:
-            whole: every joint was heard in this cycle; otherwise the comparison starts anew.
+            age: of each joint's values [cycles], shape (12,); from `NEVER` on: too old, and this joint is not compared. None:
+                all are of this cycle.
 
         Returns:
             Whether a velocity is wrong.
         """
-        motion, earlier = self._now.motion, self._earlier
-        self._earlier = self._of_earlier.dot(motion) if whole else None
-        if whole and earlier is not None:
-            error = self._of_later.dot(motion) + earlier
-            right = np.abs(error) <= self._twice_allowed
-            if right.tobytes() != _ALL or any(self._wrong):
-                self._count_wrong(error.tolist(), right.tolist())
+        motion, earlier, earlier_age = self._now.motion, self._earlier, self._earlier_age
+        if age is None and earlier_age is self._no_age:
+            error = self._of_later.dot(motion) + self._of_earlier.dot(earlier)
+            compared = None
+        else:
+            error, compared = self._error_between(self._no_age if age is None else age)
+        right = np.abs(error) <= self._twice_allowed
+        if right.tobytes() != _ALL or any(self._wrong):
+            self._count_wrong(error.tolist(), right.tolist(), compared)
+        earlier[:] = motion
+        self._earlier_age = self._no_age if age is None else age
         return bool(self._wrong_findings)
 
-    def _count_wrong(self, error: list[float], right: list[bool]) -> None:
-        self._wrong = [0 if right[joint] else wrong + 1 for joint, wrong in enumerate(self._wrong)]
+    def _error_between(self, age: Cycles) -> tuple[Vector, list[bool]]:
+        """Return twice the error of each velocity, 0 of joints not compared, and which joints are compared. Shape (12,)."""
+        motion, earlier = self._now.motion, self._earlier
+        cycles = self._every + self._earlier_age - age
+        compared = (age < NEVER) & (self._earlier_age < NEVER) & (cycles > 0)
+        time = np.where(compared, cycles, 1) * self._period
+        error = motion[1] + earlier[1] - 2.0 * (motion[0] - earlier[0]) / time
+        return np.where(compared, error, 0.0), compared.tolist()
+
+    def _count_wrong(self, error: list[float], right: list[bool], compared: list[bool] | None) -> None:
+        """Count the comparisons on end in which a velocity was wrong; a joint that was not `compared` keeps its count."""
+        self._wrong = [
+            wrong if compared is not None and not compared[joint] else 0 if right[joint] else wrong + 1
+            for joint, wrong in enumerate(self._wrong)
+        ]
+        found = {finding.node: finding for finding in self._wrong_findings}
         self._wrong_findings = tuple(
             self._wrong_velocity(joint, 0.5 * error[joint])
+            if compared is None or compared[joint]
+            else found[JOINT_NODES[joint]]
             for joint, wrong in enumerate(self._wrong)
             if wrong >= VELOCITY_SAMPLES
         )

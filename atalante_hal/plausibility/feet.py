@@ -43,7 +43,7 @@ class Feet:
         """Look at the vertical forces.
 
         Args:
-            heard: in this cycle, left and right foot; one that was not is as it was.
+            heard: since the last call, left and right foot; one that was not is as it was.
 
         Returns:
             Whether something is implausible.

@@ -5,9 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+import numpy.typing as npt
+
 from atalante_hal.codec import Codec
 from atalante_hal.diagnostics import Dtc
+from atalante_hal.image import NEVER
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, Vector
+
+Cycles = npt.NDArray[np.int64]
 
 #: Messages of the sensors, in the order of JOINTS, IMUS and FEET.
 JOINT_MESSAGES = tuple(f"{joint.upper()}_STATE" for joint in JOINTS)
@@ -43,6 +49,39 @@ class Signals(NamedTuple):
     force: Vector  # (2, 4, 3) N
     motion: Vector  # (2, 12) position and velocity
     forces: Vector  # (24,) force
+
+
+class Ages(NamedTuple):
+    """Ages of the sensors' values in cycles; from `NEVER` on: too old to be compared with anything."""
+
+    joint: Cycles  # (12,)
+    imu: Cycles  # (4,)
+    foot: Cycles  # (2,)
+
+
+class Rows:
+    """Rows of the sensors' messages in the image.
+
+    Args:
+        codec: of the image; the timeouts of its messages bound the age at which values are still compared.
+    """
+
+    def __init__(self, codec: Codec) -> None:
+        #: Shapes (12,), (4,), (2,).
+        self.joint, self.imu, self.foot = (
+            np.array(rows_of(codec, messages)) for messages in (JOINT_MESSAGES, IMU_MESSAGES, FOOT_MESSAGES)
+        )
+        #: Timeout of each row of the image [cycles].
+        self.timeout = np.array([message.timeout_ms for message in codec.messages])
+
+    def ages(self, age: Cycles) -> Ages:
+        """Return the ages of the sensors' values.
+
+        Args:
+            age: of each row of the image [cycles], shape (rows,).
+        """
+        usable = np.where(age < self.timeout, age, np.maximum(age, NEVER))
+        return Ages(usable[self.joint], usable[self.imu], usable[self.foot])
 
 
 def measured(codec: Codec) -> slice:

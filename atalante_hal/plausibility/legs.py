@@ -12,6 +12,9 @@ about the vertical does, and that is TH.
 the joint's motion if it does not. A change counts, so that it is found long before `attitude_error`; what a turn of the leg about
 another axis makes of an IMU that is not mounted straight (`misalignment`) is allowed for. If SH and SK both stand still, both are
 suspected. It needs no torque, which `stillness` looks at: a joint that is moved by its neighbours is found, too.
+
+*Age.* Values that are some cycles old are carried to this cycle at the velocity reported with them, and `velocity_error` for
+that time is allowed for.
 """
 
 from __future__ import annotations
@@ -23,7 +26,8 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.diagnostics import Dtc
-from atalante_hal.plausibility.finding import JOINT_NODES, Finding, Signals
+from atalante_hal.image import NEVER
+from atalante_hal.plausibility.finding import JOINT_NODES, Ages, Finding, Signals
 from atalante_hal.robot import IMUS, JOINTS, SIDES, Robot, Vector
 
 #: Samples of a leg on end whose attitude contradicts its encoders, or one that stands still.
@@ -44,6 +48,7 @@ class _Contradiction(NamedTuple):
 
     angles: tuple[float, float, float]
     errors: tuple[float, float, float]
+    doubt: float = 0.0  # rad, by which the errors may be off because values were not of one cycle
 
 
 class Legs:
@@ -52,10 +57,12 @@ class Legs:
     Args:
         now: what was decoded in this cycle.
         standing: samples on end in which each encoder stood still, shape (12,), as `Stillness` counts them.
+        period: of the cycle [s].
     """
 
-    def __init__(self, robot: Robot, now: Signals, standing: npt.NDArray[np.int64]) -> None:
-        self._now = now
+    def __init__(self, robot: Robot, now: Signals, standing: npt.NDArray[np.int64], period: float) -> None:
+        self._now, self._period = now, period
+        self._velocity_error = robot.sensors.velocity_error
         self._to_joint: Vector = robot.polarity / robot.gear
         self._attitude_error = robot.sensors.attitude_error
         self._attitude_change, self._misalignment = robot.sensors.attitude_change, robot.sensors.misalignment
@@ -68,45 +75,57 @@ class Legs:
         self._drifts: list[tuple[Finding, ...]] = [() for _ in SIDES]
         self._stuck: list[tuple[Finding, ...]] = [() for _ in SIDES]
 
-    def judge_left(self, whole: bool) -> bool:
+    def judge_left(self, ages: Ages | None) -> bool:
         """Look at the left leg, and at the right one if an encoder of it stands still.
 
         Args:
-            whole: every node was heard in this cycle; otherwise nothing is compared.
+            ages: of the values; a leg with values that are too old is not compared. None: all are of this cycle.
 
         Returns:
             Whether something stands.
         """
-        return self._judge(0, whole)
+        return self._judge(0, ages)
 
-    def judge_right(self, whole: bool) -> bool:
+    def judge_right(self, ages: Ages | None) -> bool:
         """As `judge_left`, the other way round."""
-        return self._judge(1, whole)
+        return self._judge(1, ages)
 
-    def _judge(self, leg: int, whole: bool) -> bool:
-        if whole:
-            said = self._compare(leg)
+    def _judge(self, leg: int, ages: Ages | None) -> bool:
+        said = self._compare(leg, ages)
+        if said is not None:
             self._judge_drift(leg, said)
             self._judge_standstill(leg, said)
-            other = 1 - leg
-            if self._stuck[other] or self._standing[other].any():
-                self._judge_standstill(other, self._compare(other))
+        other = 1 - leg
+        if self._stuck[other] or self._standing[other].any():
+            said = self._compare(other, ages)
+            if said is not None:
+                self._judge_standstill(other, said)
         return any(self._drifts) or any(self._stuck)
 
-    def _compare(self, leg: int) -> _Contradiction:
-        hip = _HIPS[leg]
-        fh, th, sh, sk = (self._now.position[hip : hip + 4] * self._to_joint[hip : hip + 4]).tolist()
-        x, z, y = hip_angles(self._now.quaternion[_PELVIS].tolist(), self._now.quaternion[_TIBIAE[leg]].tolist())
+    def _compare(self, leg: int, ages: Ages | None) -> _Contradiction | None:
+        """Return what IMUs and encoders of a leg say of this cycle, None if a value is too old."""
+        now, four, doubt = self._now, slice(_HIPS[leg], _HIPS[leg] + len(_AXIS_OF)), 0.0
+        angles = now.position[four] * self._to_joint[four]
+        pelvis, tibia = now.quaternion[_PELVIS].tolist(), now.quaternion[_TIBIAE[leg]].tolist()
+        if ages is not None:
+            cycles = [*ages.joint[four].tolist(), *ages.imu[[_PELVIS, _TIBIAE[leg]]].tolist()]
+            if max(cycles) >= NEVER:
+                return None
+            doubt = self._velocity_error * self._period * sum(cycles)
+            angles += now.velocity[four] * self._to_joint[four] * (self._period * ages.joint[four])
+            pelvis = turned_on(pelvis, now.gyro[_PELVIS].tolist(), self._period * cycles[-2])
+            tibia = turned_on(tibia, now.gyro[_TIBIAE[leg]].tolist(), self._period * cycles[-1])
+        fh, th, sh, sk = angles.tolist()
+        x, z, y = hip_angles(pelvis, tibia)
         turn = 2.0 * math.pi
-        return _Contradiction(
-            (x, z, y), (math.remainder(fh - x, turn), math.remainder(th - z, turn), math.remainder(sh + sk - y, turn))
-        )
+        errors = math.remainder(fh - x, turn), math.remainder(th - z, turn), math.remainder(sh + sk - y, turn)
+        return _Contradiction((x, z, y), errors, doubt)
 
     def _judge_drift(self, leg: int, said: _Contradiction) -> None:
         drifts = []
         counts = self._contradicts[leg]
         for axis, error in enumerate(said.errors):
-            counts[axis] = counts[axis] + 1 if abs(error) > self._attitude_error else 0
+            counts[axis] = counts[axis] + 1 if abs(error) > self._attitude_error + said.doubt else 0
             if counts[axis] >= DRIFT_SAMPLES:
                 drifts.append(_drift(SIDES[leg], _AXES[axis], error))
         self._drifts[leg] = tuple(drifts)
@@ -122,7 +141,8 @@ class Legs:
             change = said.errors[axis] - moved.errors[axis]
             turned = max(abs(angle - moved.angles[i]) for i, angle in enumerate(said.angles))
             # Who changed while the leg did not turn is no encoder that stands still, but one that jumped or drifted before.
-            if min(abs(change), turned) <= self._attitude_change + self._misalignment * turned:
+            allowed = self._attitude_change + self._misalignment * turned + said.doubt + moved.doubt
+            if min(abs(change), turned) <= allowed:
                 self._turned[joint] = 0
                 self._moved[joint] = _forgotten(moved, axis, change)
                 continue
@@ -154,6 +174,24 @@ def hip_angles(pelvis: list[float], tibia: list[float]) -> tuple[float, float, f
     sagittal = math.atan2(2.0 * (x * z + w * y), 1.0 - 2.0 * (y * y + z * z))
     fh = math.atan2(2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + z * z))
     return fh, th, sagittal
+
+
+def turned_on(quaternion: list[float], gyro: list[float], time: float) -> list[float]:
+    """Return an attitude some time later, to the first order in the turn.
+
+    Args:
+        quaternion: wxyz, sensor to world.
+        gyro: in the sensor's frame [rad/s].
+        time: [s].
+    """
+    w, x, y, z = quaternion
+    p, q, r = (0.5 * time * rate for rate in gyro)
+    return [
+        w - x * p - y * q - z * r,
+        x + w * p + y * r - z * q,
+        y + w * q + z * p - x * r,
+        z + w * r + x * q - y * p,
+    ]
 
 
 def _forgotten(moved: _Contradiction, axis: int, change: float) -> _Contradiction:

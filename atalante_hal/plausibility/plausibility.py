@@ -3,7 +3,8 @@
     process image -> [what stands still | velocity, norms | feet | legs, in turn] -> jump and range -> state
 
 A cycle in which everything is plausible costs one look at the encoders and one at the IMUs; the slow checks take turns. What
-fails is refused: its message keeps the values it had, and ages.
+fails is refused: its message keeps the values it had, and ages. Each check runs on the messages it needs, with the ages of
+their values: what is wrong with one message switches off no check of another.
 """
 
 from __future__ import annotations
@@ -14,20 +15,15 @@ from atalante_hal.e2e import Check
 from atalante_hal.image import NEVER, ReceiveImage
 from atalante_hal.plausibility.encoders import Encoders
 from atalante_hal.plausibility.feet import Feet
-from atalante_hal.plausibility.finding import (
-    FOOT_MESSAGES,
-    IMU_MESSAGES,
-    JOINT_MESSAGES,
-    Finding,
-    rows_of,
-    signals_of,
-)
+from atalante_hal.plausibility.finding import Ages, Finding, Rows, signals_of
 from atalante_hal.plausibility.imus import Imus
 from atalante_hal.plausibility.legs import Legs
 from atalante_hal.plausibility.stillness import Stillness
-from atalante_hal.robot import Robot
+from atalante_hal.plausibility.unchecked import Unchecked
+from atalante_hal.robot import Robot, Vector
 
-#: Cycles between two turns of what looks for standstill and wrong velocities, and of the look at the feet.
+#: Cycles between two turns of what looks for standstill, wrong velocities and checks that cannot run, and of the look at the
+#: feet.
 SLOW, FEET = 16, 4
 #: Cycles after which the turns repeat; each leg gets one.
 _ROUND = 32
@@ -54,13 +50,16 @@ class Plausibility:
         self._encoders = Encoders(robot, now, signals_of(codec, image.values_before), period, SLOW)
         self._imus = Imus(robot, codec, now)
         self._stillness = Stillness(robot, image, now, SLOW)
-        self._legs = Legs(robot, now, self._stillness.standing)
+        self._legs = Legs(robot, now, self._stillness.standing, period)
         self._feet = Feet(robot, now, FEET)
-        self._joint_rows, self._imu_rows, self._foot_rows = (
-            rows_of(codec, messages) for messages in (JOINT_MESSAGES, IMU_MESSAGES, FOOT_MESSAGES)
-        )
+        self._rows = Rows(codec)
+        self._unchecked = Unchecked(self._rows, image.check, SLOW)
+        self._joint_rows, self._imu_rows = self._rows.joint.tolist(), self._rows.imu.tolist()
+        self._foot_ages = [NEVER] * len(self._rows.foot)  # of the values the feet were judged by, when they were
         #: Row -> cycle in which its last good values were measured; up to date while not settled.
         self._measured = dict.fromkeys((*self._joint_rows, *self._imu_rows), -NEVER)
+        #: Silenced cells, (foot, cell) -> what was measured [N], shape (3,).
+        self._silenced: dict[tuple[int, int], Vector] = {}
         self._settled = False  # the last values of all rows were good, and of the cycle they came in
         self._turns = self._build_turns()
         self._cycle = 0
@@ -69,11 +68,15 @@ class Plausibility:
         self._judged: tuple[Finding, ...]
         self.findings = self._judged = ()
 
-    def _build_turns(self) -> list[Callable[[bool], bool] | None]:
-        """Which slow check is made in which cycle: called with `fresh`, returns whether it has something to tell."""
-        turns: list[Callable[[bool], bool] | None] = [None] * _ROUND
-        turns[0::SLOW] = [self._stillness.sample] * (_ROUND // SLOW)
-        turns[2::SLOW] = [self._encoders.judge_velocity] * (_ROUND // SLOW)
+    def _build_turns(self) -> list[Callable[[Ages | None], bool] | None]:
+        """Return which slow check is made in which cycle.
+
+        Each is called with the ages of the values, None if all are of this cycle, and returns whether something stands.
+        """
+        turns: list[Callable[[Ages | None], bool] | None] = [None] * _ROUND
+        turns[0::SLOW] = [self._sample] * (_ROUND // SLOW)
+        turns[2::SLOW] = [self._judge_velocity] * (_ROUND // SLOW)
+        turns[4::SLOW] = [self._judge_unchecked] * (_ROUND // SLOW)
         turns[1::FEET] = [self._judge_feet] * (_ROUND // FEET)
         turns[8], turns[24] = self._legs.judge_left, self._legs.judge_right
         return turns
@@ -85,8 +88,10 @@ class Plausibility:
             `findings`.
         """
         fresh = self._image.all_fresh
+        if self._silenced:
+            self._restore_cells()
         turn = self._turns[self._cycle % _ROUND]
-        if turn is not None and (turn(fresh) or self.findings):
+        if turn is not None and (turn(None if fresh else self._rows.ages(self._image.age)) or self.findings):
             self._collect()
         settled = fresh and self._settled and self.findings is self._judged
         if not (settled and self._encoders.within_reach() and self._imus.usable()):
@@ -103,10 +108,20 @@ class Plausibility:
         """Leg that swings while the other one stands, by its place in FEET; None: none does."""
         return self._feet.swing
 
-    def _judge_feet(self, fresh: bool) -> bool:
-        if fresh:
-            return self._feet.judge((True, True))
-        left, right = (bool(self._image.check[row] <= _FRESH) for row in self._foot_rows)
+    def _sample(self, ages: Ages | None) -> bool:
+        return self._stillness.sample(ages is None)
+
+    def _judge_velocity(self, ages: Ages | None) -> bool:
+        return self._encoders.judge_velocity(None if ages is None else ages.joint)
+
+    def _judge_unchecked(self, ages: Ages | None) -> bool:
+        return self._unchecked.judge(None if ages is None else self._image.age)
+
+    def _judge_feet(self, ages: Ages | None) -> bool:
+        now = [0] * len(self._foot_ages) if ages is None else ages.foot.tolist()
+        # A foot whose values are those it was judged by before is not judged by them again.
+        left, right = (age < before + FEET for age, before in zip(now, self._foot_ages, strict=True))
+        self._foot_ages = now
         return self._feet.judge((left, right))
 
     def _judge_rows(self) -> None:
@@ -139,11 +154,20 @@ class Plausibility:
             *self._legs.findings(),
             *self._stillness.findings(),
             *self._feet.findings(),
+            *self._unchecked.findings(),
         )
         if findings != self.findings:
             self.findings = findings
 
     def _silence_cells(self) -> None:
         """A cell that is stuck carries nothing: what is left of its foot are the others."""
-        for cell in (*self._stillness.cells, *self._feet.cells):
+        for cell in {*self._stillness.cells, *self._feet.cells}:
+            self._silenced[cell] = self._force[cell].copy()
             self._force[cell] = 0.0
+
+    def _restore_cells(self) -> None:
+        """Undo `_silence_cells` where no new values came: the checks judge what was measured."""
+        for (foot, cell), force in self._silenced.items():
+            if self._image.check[self._rows.foot[foot]] > _FRESH:
+                self._force[foot, cell] = force
+        self._silenced.clear()

@@ -1,7 +1,7 @@
 """What stands still although it cannot: an encoder whose joint is pushed, a gyro or a force cell without its noise.
 
-Every signal is sampled every few cycles; one that repeats itself exactly is counted. A sample in which its node was not heard
-does not count, neither way.
+Every signal is sampled every few cycles; one that repeats itself exactly is counted. A sample measured no later than the last
+one does not count, neither way.
 
 An encoder may stand still: it is stuck only if the drive's torque has swung by `breakaway` since it moved last, which is over
 twice the dry friction of its joint, and if the joint is not at its end stop, which holds it against any torque. A stuck encoder
@@ -14,9 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.diagnostics import Dtc
-from atalante_hal.e2e import Check
-from atalante_hal.image import ReceiveImage
-from atalante_hal.plausibility.finding import FOOT_NODES, IMU_NODES, JOINT_NODES, Finding, Signals, measured
+from atalante_hal.image import NEVER, ReceiveImage
+from atalante_hal.plausibility.finding import FOOT_NODES, IMU_NODES, JOINT_NODES, Cycles, Finding, Signals, measured
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, Robot, Vector
 
 #: Cycles after which a standstill is found at the latest, counted from the first repeated sample.
@@ -39,7 +38,10 @@ class Stillness:
     def __init__(self, robot: Robot, image: ReceiveImage, now: Signals, every: int) -> None:
         codec = image.codec
         where = measured(codec)
-        self._values, self._now, self._check = image.values[where], now, image.check
+        self._values, self._now, self._age = image.values[where], now, image.age
+        self._every = every
+        #: Age of each row's last sample when it was taken, plus the cycles since [cycles].
+        self._sampled_age: Cycles = np.full(len(image.age), 2 * NEVER)
         self._row_of = codec.row_of[where]
         size = len(self._values)
         self._sampled = np.full(size, np.nan)
@@ -72,29 +74,37 @@ class Stillness:
         """Compare with the last sample.
 
         Args:
-            whole: every node was heard in this cycle.
+            whole: the values of all rows are of this cycle; otherwise the image's ages are looked up.
 
         Returns:
             Whether anything stands still that cannot.
         """
         same, repeats = self._same, self._repeats
         np.equal(self._values, self._sampled, same)
-        heard = None if whole else self._check[self._row_of] <= Check.SOME_LOST
-        if heard is None:
+        newer = None if whole else self._newer()
+        if newer is None:
             repeats += 1
             repeats *= same
+            self._sampled_age.fill(0)
         else:
-            np.copyto(repeats, (repeats + 1) * same, where=heard)
+            np.copyto(repeats, (repeats + 1) * same, where=newer)
         if self._encoders_same.tobytes() != self._no_encoder:
             self._follow_torque()
-        if heard is None:
+        if newer is None:
             self._sampled[:] = self._values
         else:
-            np.copyto(self._sampled, self._values, where=heard)
+            np.copyto(self._sampled, self._values, where=newer)
         over: bool = (repeats >= self._limit).tobytes() != self._none_over
         if over or self.encoders or self.imus or self.cells:
             self._judge()
         return over
+
+    def _newer(self) -> npt.NDArray[np.bool_]:
+        """Return which values were measured after their last sample."""
+        self._sampled_age += self._every
+        newer = self._age < self._sampled_age
+        np.copyto(self._sampled_age, self._age, where=newer)
+        return newer[self._row_of]
 
     def _follow_torque(self) -> None:
         """Range of the torque since an encoder moved last."""

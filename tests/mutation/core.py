@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-_PLAUSIBILITY = ("finding", "encoders", "imus", "legs", "feet", "stillness", "plausibility")
+_PLAUSIBILITY = ("finding", "encoders", "imus", "legs", "feet", "stillness", "unchecked", "plausibility")
 #: The safety core: files that are judged together, and the tests that have to notice a change of them.
 CORE = {
     "e2e": (("atalante_hal/e2e.py",), ("test_e2e.py", "test_image.py")),
@@ -13,7 +13,7 @@ CORE = {
     ),
     "plausibility": (
         tuple(f"atalante_hal/plausibility/{name}.py" for name in _PLAUSIBILITY),
-        ("test_plausibility.py",),
+        ("test_plausibility.py", "test_ridden_through.py"),
     ),
     "heartbeats": (("atalante_hal/heartbeats.py",), ("test_heartbeats.py",)),
     "transceiver": (("atalante_hal/transceiver.py",), ("test_transceiver.py",)),

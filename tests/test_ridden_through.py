@@ -1,0 +1,288 @@
+"""A disturbance of one message that is ridden through, beside every fault the plausibility checks find.
+
+    signals -> frames -> disturbance -> process image -> plausibility
+
+Whatever is wrong with one message for good, each check finds its fault within the bound of FAULTS.md, and the disturbance alone
+raises nothing.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio
+import pytest
+
+import atalante_dbc
+from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
+from atalante_hal.diagnostics import Dtc
+from atalante_hal.e2e import COUNTER_BYTE
+from atalante_hal.frame import Frames, new_frames
+from atalante_hal.image import ReceiveImage, TransmitImage
+from atalante_hal.plausibility import Finding, Plausibility
+from atalante_hal.plausibility.finding import Signals, signals_of
+from atalante_hal.plausibility.unchecked import UNCHECKED_CYCLES
+from atalante_hal.robot import IMUS, JOINTS, load_robot
+
+NETWORK, ROBOT = atalante_dbc.load(), load_robot()
+_RECEIVED = [m for m in NETWORK.received_by("HAL") if m.cycle_ms == 1]
+MESSAGES = [m for bus in NETWORK.buses for m in _RECEIVED if m.bus == bus]
+NAMES = [m.name for m in MESSAGES]
+PERIOD = 1e-3
+GEAR = ROBOT.gear * ROBOT.polarity
+MIDDLE = (ROBOT.position_min + ROBOT.position_max) / 2.0
+#: The joints swing by 0.15 rad at up to 0.9 rad/s.
+AMPLITUDE, RATE = 0.15, 6.0
+SWING_PERIOD = round(2.0 * math.pi / RATE / PERIOD)
+JOINT, LEG_IMU = JOINTS.index("right_FH"), IMUS.index("right_tibia")
+
+Change = Callable[[Signals, int], object]
+#: What arrives of a cycle's frames, given those of this cycle and of the last one.
+Disturbance = Callable[[Frames, Frames], Frames]
+
+
+def undisturbed(frames: Frames, before: Frames) -> Frames:
+    return frames
+
+
+def doubled(row: int) -> Disturbance:
+    return lambda frames, before: np.concatenate([frames, frames[row : row + 1]])
+
+
+def late(row: int) -> Disturbance:
+    return lambda frames, before: np.concatenate([before[row : row + 1], np.delete(frames, row)])
+
+
+def lost_when_sampled(row: int) -> Disturbance:
+    """Three frames of 16 are lost, those of the cycles in which the slow checks look; the leaky bucket bears one in five."""
+
+    def disturb(frames: Frames, before: Frames) -> Frames:
+        lost = int(frames["data"][0, COUNTER_BYTE]) % 16 in (0, 2, 8)
+        return np.delete(frames, row) if lost else frames
+
+    return disturb
+
+
+def surplus(frames: Frames, before: Frames) -> Frames:
+    unknown = new_frames(1)
+    unknown["can_id"], unknown["len"] = 0x7FF, 8
+    return np.concatenate([unknown, frames])
+
+
+DISTURBANCES: dict[str, Disturbance] = {
+    "none": undisturbed,
+    "surplus unknown frame": surplus,
+    **{f"{name} doubled": doubled(row) for row, name in enumerate(NAMES)},
+    **{f"{name} one cycle late": late(row) for row, name in enumerate(NAMES)},
+    **{f"{name} lost when sampled": lost_when_sampled(row) for row, name in enumerate(NAMES)},
+}
+
+
+@functools.cache
+def motion() -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """Position, velocity, quaternions (4, 4) and gyros (4, 3) of every cycle of a swing, which closes."""
+    model = pinocchio_model(urdf(ExoskeletonParameters(), ROBOT))
+    data = model.model.createData()
+    frames = [model.model.getFrameId(f"imu_{imu}") for imu in IMUS]
+    phase = 2.0 * math.pi / SWING_PERIOD * np.arange(SWING_PERIOD)
+    found = []
+    for angle in phase.tolist():
+        q, v = pinocchio.neutral(model.model), np.zeros(model.model.nv)
+        q[model.q] = MIDDLE + AMPLITUDE * math.sin(angle)
+        v[model.v] = AMPLITUDE * (2.0 * math.pi / SWING_PERIOD / PERIOD) * math.cos(angle)
+        pinocchio.forwardKinematics(model.model, data, q, v)
+        pinocchio.updateFramePlacements(model.model, data)
+        coefficients = [pinocchio.Quaternion(data.oMf[frame].rotation).coeffs() for frame in frames]
+        gyros = [
+            pinocchio.getFrameVelocity(model.model, data, frame, pinocchio.ReferenceFrame.LOCAL).angular.copy()
+            for frame in frames
+        ]
+        found.append((q[model.q].copy(), v[model.v].copy(), np.array(coefficients)[:, [3, 0, 1, 2]], np.array(gyros)))
+    return found
+
+
+@functools.cache
+def noise() -> np.ndarray:
+    return np.random.default_rng(1).standard_normal((1021, 64))
+
+
+class Line:
+    """A healthy robot at the other end of a disturbed line."""
+
+    def __init__(self, disturb: Disturbance) -> None:
+        self.disturb = undisturbed
+        self.transmit, self.receive = TransmitImage(MESSAGES), ReceiveImage(MESSAGES)
+        self.said = signals_of(self.transmit.codec, self.transmit.values)
+        self.checks = Plausibility(ROBOT, self.receive, PERIOD)
+        self.cycles = 0
+        self.before = self.transmit.frames.copy()
+        self.standing = False
+        self.run(1)
+        self.disturb = disturb
+        self.run(40)
+
+    def cycle(self, change: Change) -> tuple[Finding, ...]:
+        said, at, more = self.said, self.cycles % SWING_PERIOD, noise()[self.cycles % len(noise())]
+        position, velocity, said.quaternion[:], gyro = motion()[at]
+        said.position[:], said.velocity[:] = position * GEAR, velocity * GEAR
+        said.torque[:] = 20.0 * math.sin(0.05 * self.cycles) + 0.05 * more[:12]
+        said.gyro[:] = gyro + 4e-3 * more[12:24].reshape(4, 3)
+        said.accel[:] = [0.0, 0.0, 9.81] + 0.05 * more[24:36].reshape(4, 3)
+        said.force[:] = 3.0 * more[36:60].reshape(2, 4, 3) + [0.0, 0.0, 150.0 * self.standing]
+        change(said, self.cycles)
+        self.transmit.seal(self.cycles & 0xFF)
+        frames = self.transmit.frames.copy()
+        arrived = self.disturb(frames, self.before)
+        self.receive.accept(arrived, len(arrived), self.cycles & 0xFF)
+        self.before = frames
+        self.cycles += 1
+        return self.checks.check()
+
+    def run(self, cycles: int, change: Change = lambda said, cycle: None) -> tuple[Finding, ...]:
+        found: tuple[Finding, ...] = ()
+        for _ in range(cycles):
+            found = self.cycle(change)
+        return found
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What a check finds, and its bound in FAULTS.md; that of the swinging feet is exact, so a late foot adds its cycle."""
+
+    dtc: Dtc
+    node: str
+    bound: int  # cycles
+    change: Callable[[int], Change]  # given the first faulty cycle
+    stands: bool = False  # the robot stands before
+
+
+def _velocity_off(first: int) -> Change:
+    return lambda said, cycle: said.velocity.__setitem__(JOINT, said.velocity[JOINT] + 1.0 * GEAR[JOINT])
+
+
+def _velocity_zero(first: int) -> Change:
+    # Of a joint at rest nothing is wrong with it: this one goes at up to 1.9 rad/s.
+    def change(said: Signals, cycle: int) -> None:
+        said.position[5] += 1.0 * PERIOD * (cycle - first) * GEAR[5]
+        said.velocity[5] = 0.0
+
+    return change
+
+
+def _drift(first: int) -> Change:
+    def change(said: Signals, cycle: int) -> None:
+        said.position[JOINT] += 0.1 * PERIOD * (cycle - first) * GEAR[JOINT]
+        said.velocity[JOINT] += 0.1 * GEAR[JOINT]
+
+    return change
+
+
+def _stuck(first: int) -> Change:
+    def change(said: Signals, cycle: int) -> None:
+        said.position[JOINT] = motion()[first % SWING_PERIOD][0][JOINT] * GEAR[JOINT]
+        said.velocity[JOINT] = 0.0
+
+    return change
+
+
+def _frozen(first: int) -> Change:
+    return lambda said, cycle: said.gyro.__setitem__(LEG_IMU, [0.1, 0.2, 0.3])
+
+
+def _dead_cell(first: int) -> Change:
+    return lambda said, cycle: said.force.__setitem__((1, 2), 0.0)
+
+
+def _lone_cell(first: int) -> Change:
+    return lambda said, cycle: said.force.__setitem__((1, 2, 2), 200.0 + said.force[1, 2, 0])
+
+
+FAULTS = {
+    "velocity 1 rad/s off": Fault(Dtc.ENC_VELOCITY, "RIGHT_FH", 64, _velocity_off),
+    "velocity stands at 0": Fault(Dtc.ENC_VELOCITY, "LEFT_HA", 64, _velocity_zero),
+    "encoder drifts by 0.1 rad/s": Fault(Dtc.ENC_DRIFT, "RIGHT_FH", 1000, _drift),
+    "encoder stands still": Fault(Dtc.ENC_STUCK, "RIGHT_FH", 50, _stuck),
+    "gyro repeats itself": Fault(Dtc.IMU_STUCK, "IMU_RIGHT_TIBIA", 100, _frozen),
+    "cell repeats itself": Fault(Dtc.FOOT_CELL, "FOOT_RIGHT", 260, _dead_cell),
+    "cell contradicts the others": Fault(Dtc.FOOT_CELL, "FOOT_RIGHT", 260, _lone_cell),
+    "both feet swing": Fault(Dtc.CONTACT_IMPLAUSIBLE, "FOOT_LEFT", 21, lambda first: lambda said, cycle: None, True),
+}
+
+
+def cycles_until_found(line: Line, fault: Fault) -> int:
+    """Cycles until it is found and confirmed, the first faulty one being 1."""
+    line.standing = fault.stands
+    line.run(20)
+    line.standing = False
+    change = fault.change(line.cycles)
+    for cycle in range(1, fault.bound + 1):
+        if any((f.dtc, f.node, f.confirmed) == (fault.dtc, fault.node, True) for f in line.cycle(change)):
+            return cycle
+    raise AssertionError(f"no {fault.dtc} in {fault.bound} cycles, but {line.checks.findings}")
+
+
+@pytest.mark.parametrize("name", DISTURBANCES)
+def test_a_disturbance_alone_raises_nothing(name: str):
+    line = Line(DISTURBANCES[name])
+    for _ in range(SWING_PERIOD):
+        assert line.cycle(lambda said, cycle: None) == ()
+
+
+@pytest.mark.parametrize("name", DISTURBANCES)
+def test_a_disturbance_hides_no_fault(name: str):
+    for what, fault in FAULTS.items():
+        line = Line(DISTURBANCES[name])
+        assert cycles_until_found(line, fault) <= fault.bound, what
+
+
+class TestUnchecked:
+    """A check whose messages come without values says so at once, and counts as failed after `UNCHECKED_CYCLES`."""
+
+    @pytest.mark.parametrize(
+        ("quantity", "index", "unchecked"),
+        [
+            ("position", JOINTS.index("left_SA"), {(Dtc.ENC_VELOCITY, "LEFT_SA")}),
+            ("position", JOINTS.index("left_SK"), {(Dtc.ENC_VELOCITY, "LEFT_SK"), (Dtc.ENC_DRIFT, "LEFT_FH")}),
+            ("position", JOINTS.index("right_FH"), {(Dtc.ENC_VELOCITY, "RIGHT_FH"), (Dtc.ENC_DRIFT, "RIGHT_FH")}),
+            ("quaternion", IMUS.index("pelvis"), {(Dtc.ENC_DRIFT, "LEFT_FH"), (Dtc.ENC_DRIFT, "RIGHT_FH")}),
+            ("quaternion", IMUS.index("left_tibia"), {(Dtc.ENC_DRIFT, "LEFT_FH")}),
+            ("quaternion", IMUS.index("torso"), set()),
+            ("force", 1, {(Dtc.FOOT_CELL, "FOOT_RIGHT")}),
+        ],
+    )
+    def test_each_check_needs_its_own_messages(self, quantity: str, index: int, unchecked: set[tuple[Dtc, str]]):
+        line = Line(undisturbed)
+
+        def empty(said: Signals, cycle: int) -> None:
+            getattr(said, quantity)[index] = np.nan
+
+        found = line.run(32, empty)
+        assert {(f.dtc, f.node) for f in found} == unchecked
+        assert not any(f.confirmed for f in found)
+        found = line.run(UNCHECKED_CYCLES, empty)
+        assert {(f.dtc, f.node) for f in found if f.confirmed} == unchecked
+        assert all(f"could not be checked for {f.value:.0f} cycles" in f.text for f in found)
+        line.disturb = lambda frames, before: frames[:0]
+        assert line.run(48) == found
+        line.disturb = undisturbed
+        assert line.run(17) == ()
+
+    @pytest.mark.parametrize("name", NAMES)
+    def test_a_silent_node_is_the_message_monitors(self, name: str):
+        line = Line(lambda frames, before: np.delete(frames, NAMES.index(name)))
+        assert line.run(2 * UNCHECKED_CYCLES) == ()
+
+    def test_what_never_had_values_is_not_counted(self):
+        line = Line(undisturbed)
+        line.receive = ReceiveImage(MESSAGES)
+        line.checks = Plausibility(ROBOT, line.receive, PERIOD)
+
+        def empty(said: Signals, cycle: int) -> None:
+            said.position[3] = said.quaternion[1] = said.force[0] = np.nan
+
+        for _ in range(2 * UNCHECKED_CYCLES):
+            assert line.cycle(empty) == ()
