@@ -90,6 +90,7 @@ class Dtc(StrEnum):
     ENC_JUMP = "ENC_JUMP", _R.HOLD, _S.ERROR, "an encoder moved further than its joint can"
     ENC_DRIFT = "ENC_DRIFT", _R.FULL_ASSIST, _S.WARNING, "an encoder has gone away from the model"
     ENC_VELOCITY = "ENC_VELOCITY", _R.HOLD, _S.ERROR, "a drive's velocity is not what its encoder does"
+    POSITION_RANGE = "POSITION_RANGE", _R.HOLD, _S.ERROR, "a joint is outside its range"
     IMU_INVALID = "IMU_INVALID", _R.FULL_ASSIST, _S.WARNING, "an IMU says that it has no value"
     IMU_SATURATED = "IMU_SATURATED", _R.FULL_ASSIST, _S.WARNING, "an IMU is at the end of its range"
     IMU_STUCK = "IMU_STUCK", _R.FULL_ASSIST, _S.WARNING, "an IMU repeats one value"

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 
-from atalante_hal.diagnostics import Dtc, Severity, event_code
+from atalante_hal.diagnostics import Dtc, Reaction, Severity, event_code, worst
 from atalante_hal.telemetry.events import Event
 
 #: A diagnostic that ends and begins again is told anew after so many cycles, pending or confirmed: a bad line does not fill
@@ -123,6 +123,11 @@ class FaultMemory:
             bits |= dtc.bit
         self.bits = bits
         self.confirmed = frozenset(dtc for (dtc, _), entry in self.active.items() if entry.confirmed)
+
+    def worst(self) -> frozenset[Dtc]:
+        """Return the confirmed codes that demand the worst reaction; empty when none demands any."""
+        reaction = worst(self.confirmed)
+        return frozenset(dtc for dtc in self.confirmed if dtc.reaction is reaction is not Reaction.INFO)
 
     def nodes_of(self, dtcs: frozenset[Dtc]) -> list[str]:
         """Nodes one of these codes is confirmed for."""

@@ -23,6 +23,7 @@ from atalante_hal.limiter import Limiter
 from atalante_hal.plausibility import Plausibility
 from atalante_hal.record import Record
 from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.start import powered
 from atalante_hal.supervision import DRIVE_NODES, Supervision
 from atalante_hal.supervisor import Conditions
 from atalante_hal.transceiver import FrameTap, Transceiver
@@ -180,7 +181,7 @@ class Hal:
         if supervision.start_wanted and state.supervisor in (_S.LOWER, _S.FAULT):
             # The operator acknowledged: clear the drives that have a fault, the others go on holding.
             control[state.drive_state == DriveState.FAULT] = Controlword.FAULT_RESET
-        elif supervision.start_wanted and state.supervisor in (_S.READY, _S.HOLD):
+        elif supervision.start_wanted and state.supervisor in (_S.READY, _S.HOLD) and not supervision.hindered:
             control[:] = [controlword_towards_operation(int(s)) for s in state.drive_state.tolist()]
             # What the drive holds with now, so that nothing sags between its hold and the controller's first torque.
             self._follow_drives()
@@ -190,11 +191,12 @@ class Hal:
         return self._send_command()
 
     def _follow_drives(self) -> None:
-        """Command what the drives exert by themselves, within all limits from the second cycle on."""
+        """Command what the drives hold with, within all limits from the second cycle on; a drive that is off makes no torque."""
+        torque = np.where(powered(self.state.drive_state), self.state.torque, 0.0)
         if self._supervision.enabling:
-            self._limiter.apply(self.state.torque, self._parts.motion)
+            self._limiter.apply(torque, self._parts.motion)
         else:
-            self._limiter.restart(self.state.torque)
+            self._limiter.restart(torque)
             self._supervision.enabling = True
 
     def fail(self, error: Exception) -> Vector:

@@ -21,8 +21,8 @@ from atalante_hal.frame import Frames
 from atalante_hal.image import NEVER, ReceiveImage
 from atalante_hal.robot import Thresholds
 
-#: NMT state of a node that works.
-OPERATIONAL = 5
+#: NMT states of a node that has just begun, and of one that works.
+BOOT_UP, OPERATIONAL = 0, 5
 #: Largest `Check` whose data is new, as a plain integer: numpy compares it ten times faster.
 _FRESH = int(Check.SOME_LOST)
 
@@ -79,6 +79,8 @@ class Heartbeats:
         self._reset: set[str] = set()  # nodes that began anew since the last judgement
         #: Row -> evidence of two senders, of the rows that have any, one step a frame.
         self._evidence: dict[int, int] = {}
+        #: Nodes that sent a boot-up message since the last judgement was used: its reader clears it.
+        self.booted: set[str] = set()
         #: Every node that has to has sent a status.
         self.known = False
         self.quiet = True
@@ -175,6 +177,8 @@ class Heartbeats:
         low = status.drive and values[status.supply] < self._low
         if low or values[status.dbc_hash] != self._hash or values[status.state] != OPERATIONAL:
             self.quiet = False
+        if values[status.state] == BOOT_UP:
+            self.booted.add(status.node)
         if status.node not in self._heard:
             self._heard.add(status.node)
             self.known = self._heard.issuperset(self._needed)

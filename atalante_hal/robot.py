@@ -80,6 +80,8 @@ class Thresholds:
     supply_under: float  # V, below it drives cannot hold much longer
     derated_imbalance: float  # share of its twin's torque on the other leg below which a hot drive no longer walks
     full_assist_ramp: float  # s, in which FULL_ASSIST leads the assistance factor from 0 to 1
+    position_tolerance: float  # rad past a position limit from where on a joint is out of its range
+    idle_torque: float  # Nm a drive may report when it is off, and beyond its limit when it is on
     surplus_frames: float  # beyond one of each cyclic message that a cycle may bring
 
 
@@ -163,6 +165,8 @@ _TABLES = {
         "supply_under": _Key(1, 5.0, 100.0, "V"),
         "derated_imbalance": _Key(1, 0.01, 1.0, "share of the other leg's"),
         "full_assist_ramp": _Key(1, 0.01, 60.0, "s"),
+        "position_tolerance": _Key(1, 1e-3, 0.5, "rad"),
+        "idle_torque": _Key(1, 0.1, 50.0, "Nm"),
         "surplus_frames": _Key(1, 1, 100, "frames"),
     },
 }

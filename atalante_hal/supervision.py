@@ -24,6 +24,7 @@ from atalante_hal.pendant import Pendant
 from atalante_hal.plausibility import Plausibility
 from atalante_hal.record import Record
 from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.start import refusal
 from atalante_hal.supervisor import MOVING, Conditions, next_state
 from atalante_hal.telemetry.events import Event
 from atalante_hal.transceiver import Transceiver
@@ -33,6 +34,9 @@ from atalante_hal.types import State, SupervisorState
 ENABLE_CYCLES = 200
 #: Longest time FINISH_STEP goes on [cycles]: more than a step.
 FINISH_STEP_CYCLES = 2000
+
+#: How `Supervision.reason` begins after a START that was refused, until the state changes.
+REFUSED = "START refused: "
 
 #: DBC names of the drives, in joint order.
 DRIVE_NODES = tuple(joint.upper() for joint in JOINTS)
@@ -152,6 +156,9 @@ class Supervision:
         judgement.judge(cycle, memory, self._plausibility.swing)
         state.joints_valid = judgement.joints_valid
         self._heartbeats.judge(cycle, memory)
+        for node in self._heartbeats.booted:
+            self._plausibility.reference(node)
+        self._heartbeats.booted.clear()
         self._transceiver.judge(cycle, memory)
         for f in self._plausibility.findings:
             memory.raise_dtc(cycle, f.dtc, f.node, value=f.value, confirmed=f.confirmed, text=f.text)
@@ -180,6 +187,8 @@ class Supervision:
         after, reasons = next_state(before, self.conditions)
         if after is not before:
             self._enter(before, after, reasons)
+        elif after is _S.OFF and reasons:
+            self.reason = memory.text_of(reasons)
         self._lead_assistance()
         self._let_down()
         header = self._parts.header
@@ -238,24 +247,35 @@ class Supervision:
         elif self.start_wanted:
             self.start_wanted -= 1
             if hindrance := self._hindrance(nodes_well):
-                self.start_wanted = 0
-                self._end_start("START_REFUSED", f"START is refused: {hindrance}", "warning")
+                self._refuse_start(hindrance)
             elif not self.start_wanted:
                 self._end_start("START_FAILED", f"the drives were not enabled within {ENABLE_CYCLES} cycles", "error")
+        if self.start_wanted and state.supervisor in (_S.READY, _S.HOLD):
+            implausible = refusal(self._robot, state.drive_state, state.torque)
+            if implausible is not None:
+                self._refuse_start(implausible)
+
+    @property
+    def hindered(self) -> bool:
+        """A confirmed diagnostic keeps the drives from being enabled."""
+        return worst(self.memory.confirmed) is not Reaction.INFO
 
     def _hindrance(self, nodes_well: bool) -> str:
         """Return why a start that was asked for cannot go on, one sentence; empty: it can."""
-        memory, pendant = self.memory, self._pendant
+        pendant = self._pendant
         if self._ending:
             return "the program is ending"
         if pendant.stop_requested or not pendant.dead_man:
             return _WORDS[pendant.stop_requested]
         if self._state.supervisor in (_S.LOWER, _S.FAULT):
             return ""  # START acknowledges the cause, which may take some cycles to go
-        reaction = worst(memory.confirmed)
-        if reaction is not Reaction.INFO:
-            return memory.text_of(frozenset(dtc for dtc in memory.confirmed if dtc.reaction is reaction))
+        if self.hindered:
+            return self.memory.text_of(self.memory.worst())
         return "" if nodes_well else f"not heard or not trusted yet: {', '.join(sorted(self.missing()))}"
+
+    def _refuse_start(self, why: str) -> None:
+        self.start_wanted = 0
+        self._end_start("START_REFUSED", REFUSED + why, "warning")
 
     def _end_start(self, code: str, text: str, severity: str) -> None:
         self.memory.events.append(Event(self._state.cycle, code, text, severity))

@@ -269,13 +269,76 @@ class TestEncoderJump:
         assert machine.cycle() == ()
         assert not only(machine.cycle(away)).confirmed
 
-    def test_a_value_that_stays_away_is_taken_once_the_joint_can_have_got_there(self):
+    def test_a_small_offset_is_taken_once_the_joint_can_have_got_there(self):
         machine = Machine(amplitude=0.0)
-        cycles = math.ceil(0.1 / (ROBOT.velocity_max[3] * PERIOD))
-        away = MIDDLE[3] + 0.1
-        for cycle in range(1, cycles + 3):
-            machine.cycle(lambda now: now.position.__setitem__(3, away * GEAR[3]))
-            assert bool(machine.refused) == (cycle * ROBOT.velocity_max[3] * PERIOD + 3e-5 < 0.1)
+        for cycle in range(1, 7):
+            machine.cycle(lambda now: now.position.__setitem__(3, (MIDDLE[3] + 0.018) * GEAR[3]))
+            assert bool(machine.refused) == (cycle * ROBOT.velocity_max[3] * PERIOD + 3e-5 < 0.018)
+
+    @joints
+    @signs
+    def test_a_value_that_stays_away_is_never_taken(self, joint: int, sign: float):
+        """Longer than the joint would need to get there, at rest and in motion, which ends where the jump began."""
+        size = 12.0 * REACH[joint]
+        for speed in (0.0, 0.5 * ROBOT.velocity_max[joint]):
+            machine = Machine(amplitude=0.0)
+            for cycle in range(200):
+                at = (MIDDLE[joint] + sign * max(size - speed * PERIOD * cycle, 0.0)) * GEAR[joint]
+                found = machine.cycle(lambda now, at=at: now.position.__setitem__(joint, at))
+                assert machine.refused == {row(JOINTS[joint]): cycle + 1}
+            finding = next(f for f in found if f.dtc is Dtc.ENC_JUMP)
+            assert finding.confirmed
+            assert "not used until it jumps back or its drive restarts" in finding.text
+
+    @joints
+    @signs
+    def test_an_encoder_that_jumps_back_is_used_wherever_its_joint_has_gone_meanwhile(self, joint: int, sign: float):
+        way = ROBOT.velocity_max[joint] * PERIOD
+        for left, used in ((0.0, True), (4.9 * way, True), (6.1 * way, False)):
+            machine = Machine(amplitude=0.0)
+
+            def show(gone: float, offset: float, machine: Machine = machine) -> tuple[Finding, ...]:
+                at = (MIDDLE[joint] + sign * (offset - gone)) * GEAR[joint]
+                return machine.cycle(lambda now: now.position.__setitem__(joint, at))
+
+            for cycle in range(40):
+                assert any(f.dtc is Dtc.ENC_JUMP for f in show(0.5 * way * cycle, 30.0 * way))
+            found = show(0.5 * way * 40, left)
+            assert any(f.dtc is Dtc.ENC_JUMP for f in found) is not used
+            assert bool(machine.refused) is not used
+
+    @joints
+    def test_a_drive_that_restarted_has_its_encoder_referenced(self, joint: int):
+        machine = Machine(amplitude=0.0)
+        away = MIDDLE[joint] + 6.0 * REACH[joint]
+
+        def jump(now: Signals) -> None:
+            now.position[joint] = away * GEAR[joint]
+
+        for _ in range(2):
+            assert any(f.dtc is Dtc.ENC_JUMP and f.confirmed for f in machine.run(20, jump))
+            for node in ("IMU_PELVIS", "PENDANT", JOINTS[(joint + 1) % 12].upper()):
+                machine.checks.reference(node)
+            assert machine.refused
+            machine.cycle(jump)
+            assert machine.refused
+            machine.checks.reference(JOINTS[joint].upper())
+            assert Dtc.ENC_JUMP not in {f.dtc for f in machine.cycle(jump)}
+            assert not machine.refused
+            away = 2.0 * MIDDLE[joint] - away
+
+    def test_a_restart_forgives_one_value_and_no_other(self):
+        machine = Machine(amplitude=0.0)
+        machine.run(5)
+        machine.checks.reference("LEFT_SK")
+        machine.missing = {row("left_FH")}
+        assert machine.cycle(lambda now: now.position.__setitem__(3, (MIDDLE[3] + 0.2) * GEAR[3])) == ()
+        machine.missing = set()
+        assert only(machine.cycle()).node == "LEFT_SK"
+        machine = Machine(amplitude=0.0)
+        machine.run(5)
+        machine.checks.reference("LEFT_SK")
+        assert only(machine.cycle(lambda now: now.position.__setitem__(4, 0.0))).node == "LEFT_SA"
 
     def test_two_joints_at_once(self):
         machine = Machine()
@@ -297,6 +360,53 @@ class TestEncoderJump:
         machine.cycle(lambda now: now.position.__iadd__(0.9 * REACH * GEAR))
         assert machine.checks.findings == ()
         assert not machine.refused
+
+
+class TestRange:
+    tolerance = ROBOT.thresholds.position_tolerance
+
+    @joints
+    @pytest.mark.parametrize("end", ["position_min", "position_max"])
+    def test_the_threshold_is_tight_and_found_in_its_cycle(self, joint: int, end: str):
+        limit, outwards = getattr(ROBOT, end)[joint], 1.0 if end == "position_max" else -1.0
+        for size, found in ((1.0 - 1e-9, False), (1.0 + 1e-9, True)):
+            angle = limit + outwards * size * self.tolerance
+            machine = Machine(amplitude=0.0)
+            machine.checks.reference(JOINTS[joint].upper())
+            findings = machine.cycle(lambda now, angle=angle: now.position.__setitem__(joint, angle * GEAR[joint]))
+            assert bool(findings) is found
+            assert not machine.refused
+            if not found:
+                continue
+            finding = only(findings)
+            assert (finding.dtc, finding.node, finding.confirmed) == (Dtc.POSITION_RANGE, JOINTS[joint].upper(), True)
+            assert finding.value == pytest.approx(angle)
+            low, high = (math.degrees(getattr(ROBOT, name)[joint]) for name in ("position_min", "position_max"))
+            said = (
+                f"{JOINTS[joint]} is at {math.degrees(angle):.1f} degrees, outside its range of {low:.1f} to {high:.1f}"
+            )
+            assert said in finding.text
+            inside = (angle - outwards * 2e-9 * self.tolerance) * GEAR[joint]
+            machine.missing = {row(JOINTS[joint])}
+            assert only(machine.cycle()) is finding
+            machine.missing = set()
+            for lost in (False, True):
+                machine.cycle(lambda now, angle=angle: now.position.__setitem__(joint, angle * GEAR[joint]))
+                machine.missing = {row(JOINTS[joint])} if lost else set()
+                assert len(machine.run(lost)) == lost
+                machine.missing = set()
+                assert machine.cycle(lambda now, inside=inside: now.position.__setitem__(joint, inside)) == ()
+
+    def test_a_first_value_outside_is_found(self):
+        image = ReceiveImage(MESSAGES)  # of NaN
+        checks = Plausibility(ROBOT, image, PERIOD)
+        image.values[:100] = Machine().image.values[:100]
+        signals_of(CODEC, image.values).position[4] = 1.0 * GEAR[4]
+        image.check.fill(Check.OK)
+        image.age.fill(0)
+        assert only(checks.check()).text.startswith(
+            "left_SA is at 57.3 degrees, outside its range of -16.0 to 9.0 degrees"
+        )
 
 
 class TestVelocity:
@@ -641,7 +751,8 @@ class TestDrift:
         machine.missing = {row("pendant")}
         assert only(machine.run(40, off)) is finding
         machine.missing = set()
-        offset = 0.0
+        for offset in np.linspace(sign * allowed, 0.0, 20):  # noqa: B007 - read by `off`
+            machine.cycle(off)
         assert machine.run(33, off) == ()
 
     @pytest.mark.parametrize("leg", [0, 1])

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from atalante_dbc import Network
+from atalante_emulator.faults import Fault
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus import BusAbsent, BusDown
 from atalante_hal.bus.joined import JoinedBus
@@ -225,6 +226,27 @@ def test_what_a_run_waits_for_is_said_with_what_to_type(network: Network, robot:
         assert waiting_for(rig) == (
             "READY: waiting for the operator, who is `atalante pendant start -i virtual -c rig-alone`"
         )
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        (
+            Fault("encoder_jump", "LEFT_SA", by=1.0),
+            "OFF: left_SA is at 57.3 degrees, outside its range of -16.0 to 9.0",
+        ),
+        (
+            Fault("value", "RIGHT_FH_STATE", Torque=-400.0),
+            "READY: START refused: the drive of right_FH reports -400 Nm in SWITCH_ON_DISABLED",
+        ),
+    ],
+)
+def test_why_a_start_is_refused_is_said(network: Network, robot: Robot, fault: Fault, said: str) -> None:
+    with embedded(network, robot, operator=Operator(), faults=[fault]) as rig:
+        for _ in range(400):
+            rig.hal.read()
+            rig.hal.hold()
+        assert waiting_for(rig).startswith(said)
 
 
 def test_the_wall_clock_asks_for_real_time_rights_and_runs(

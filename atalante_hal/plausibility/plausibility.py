@@ -15,7 +15,7 @@ from atalante_hal.e2e import Check
 from atalante_hal.image import NEVER, ReceiveImage
 from atalante_hal.plausibility.encoders import Encoders
 from atalante_hal.plausibility.feet import Feet
-from atalante_hal.plausibility.finding import Ages, Finding, Rows, signals_of
+from atalante_hal.plausibility.finding import JOINT_NODES, Ages, Finding, Rows, signals_of
 from atalante_hal.plausibility.imus import Imus
 from atalante_hal.plausibility.legs import Legs
 from atalante_hal.plausibility.stillness import Stillness
@@ -102,6 +102,21 @@ class Plausibility:
             self._silence_cells()
         self._cycle += 1
         return self.findings
+
+    def reference(self, node: str) -> None:
+        """Take the next position of a joint as its first one: its drive has restarted and referenced its encoder.
+
+        Args:
+            node: DBC name; of a node that is no drive nothing changes.
+        """
+        if node not in JOINT_NODES:
+            return
+        if self._settled:
+            self._measured.update(dict.fromkeys(self._measured, self._cycle - 1))
+            self._settled = False
+        joint = JOINT_NODES.index(node)
+        self._encoders.reference(joint)
+        self._measured[self._joint_rows[joint]] = -NEVER
 
     @property
     def swing(self) -> int | None:

@@ -20,6 +20,7 @@ from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.hal import Hal
 from atalante_hal.loop import LockStep, Statistics, WallClock, realtime, run
 from atalante_hal.robot import Robot, load_robot
+from atalante_hal.supervision import REFUSED
 from atalante_hal.transceiver import FrameTap
 from atalante_hal.types import Controller, State, SupervisorState
 from atalante_tools.body import describe, open_body
@@ -216,7 +217,9 @@ def waiting_for(rig: Rig) -> str:
         missing = hal.missing()
         if hal.silent:
             return f"no node answers on {target}; an emulated robot is `atalante emulator {target.arguments}`"
-        return f"waiting for {', '.join(missing)}" if missing else "the nodes are there"
+        return f"waiting for {', '.join(missing)}" if missing else f"OFF: {hal.reason}"
+    if hal.reason.startswith(REFUSED):
+        return f"{hal.state.supervisor.name}: {hal.reason}"
     waits = f"{hal.state.supervisor.name}: waiting for the operator"
     return (
         f"{waits} of the embedded robot"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from atalante_hal.cia402 import DriveState
+from atalante_hal.cia402 import Controlword, DriveState
 from atalante_hal.diagnostics import Dtc
 from atalante_hal.robot import JOINTS, LEG_JOINTS
 from atalante_hal.types import SupervisorState
@@ -61,6 +61,17 @@ def left_leg_holds_by_itself(seen: Observation) -> str | None:
     fifth = seen.first + _WATCHDOG - 1
     held = (seen.drive_state[fifth - 1 : seen.quiet, _LEFT_LEG] == DriveState.QUICK_STOP_ACTIVE).all(axis=1)
     return None if held.all() else f"a drive of the left leg did not hold in cycle {fifth + int(held.argmin())}"
+
+
+def start_is_refused(seen: Observation) -> str | None:
+    """START is refused with a reason, and no command enables a drive from then on."""
+    refused = next((event for event in seen.events if event.code == "START_REFUSED"), None)
+    if refused is None:
+        return "no START was refused"
+    for cycle in range(refused.cycle, seen.last + 1):
+        if Controlword.ENABLE_OPERATION in seen.commands.words(cycle):
+            return f"a drive was enabled in cycle {cycle}, after {refused.text}"
+    return None
 
 
 def limit_follows_the_heat(seen: Observation) -> str | None:

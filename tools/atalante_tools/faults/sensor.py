@@ -7,7 +7,8 @@ from typing import Final
 from atalante_emulator.faults import Fault
 from atalante_hal.robot import CELLS, FEET, IMUS
 from atalante_hal.types import SupervisorState
-from atalante_tools.faults.scenario import Case, Scenario
+from atalante_tools.faults.checks import start_is_refused
+from atalante_tools.faults.scenario import Case, Press, Scenario
 
 _ACTIVE: Final = SupervisorState.ACTIVE
 _HOLD: Final = SupervisorState.HOLD
@@ -18,6 +19,17 @@ _IMUS: Final = tuple(f"IMU_{name.upper()}" for name in IMUS)
 _FEET: Final = tuple(f"FOOT_{name.upper()}" for name in FEET)
 #: What the cells of a foot say under somebody's weight [N].
 _STANDS: Final = {f"{cell}_ForceZ": 150.0 for cell in CELLS}
+#: For good, and each of another node; the two last are of what the checks compare.
+_RIDDEN_THROUGH: Final = {
+    "FOOT_LEFT doubled": Fault("duplicate", "FOOT_LEFT_STATE"),
+    "FOOT_LEFT a cycle late": Fault("delay", "FOOT_LEFT_STATE"),
+    "IMU_TORSO doubled": Fault("duplicate", "IMU_TORSO_STATE"),
+    "PENDANT doubled": Fault("duplicate", "PENDANT_STATE"),
+    "PENDANT a cycle late": Fault("delay", "PENDANT_STATE"),
+    "an unknown frame": Fault("foreign", "left_leg", can_id=0x7FF),
+    f"{_QUIET} a cycle late": Fault("delay", f"{_QUIET}_STATE"),
+    "IMU_PELVIS a cycle late": Fault("delay", "IMU_PELVIS_STATE"),
+}
 
 
 def _imu(kind: str, cycles: int, *, ridden: int) -> tuple[Case, ...]:
@@ -28,18 +40,20 @@ def _imu(kind: str, cycles: int, *, ridden: int) -> tuple[Case, ...]:
     )
 
 
+def _stuck(node: str, cycles: int) -> tuple[Fault, ...]:
+    """An encoder that shows its joint where it was, jumps to where it is by then, and is referenced by a restart."""
+    return Fault("encoder_stuck", node, 0, cycles), Fault("reset", node, cycles + 30, 3)
+
+
 SCENARIOS: Final = (
     Scenario(
         "F27",
         (
-            *(
-                Case(node, (Fault("encoder_stuck", node, 0, 200),), node=node)
-                for node in ("LEFT_SH", _KNEE, "RIGHT_SH")
-            ),
+            *(Case(node, _stuck(node, 200), node=node) for node in ("LEFT_SH", _KNEE, "RIGHT_SH")),
             *(
                 Case(
                     f"{node}, which has little to do",
-                    (Fault("encoder_stuck", node, 0, 300),),
+                    _stuck(node, 300),
                     node=node,
                     noticed=within,
                     reacted=within,
@@ -75,6 +89,20 @@ SCENARIOS: Final = (
             *(
                 Case(f"{1e3 * by:g} mrad for good", (Fault("encoder_jump", _QUIET, 0, 100, by=by),), node=_QUIET)
                 for by in (0.025, -0.025, 0.1, -1.0)  # five times what the joint can move in a cycle are 20 mrad
+            ),
+            Case(
+                "25 mrad that stay",
+                (Fault("encoder_jump", _QUIET, by=0.025),),
+                node=_QUIET,
+                watched=400,
+                recovers=False,
+                checks=(start_is_refused,),
+            ),
+            Case(
+                "25 mrad that stay, and the drive restarts",
+                (Fault("encoder_jump", _QUIET, by=0.025), Fault("reset", _QUIET, 100, 3)),
+                node=_QUIET,
+                watched=400,
             ),
         ),
         lasting=Case("25 mrad", (Fault("encoder_jump", _QUIET, by=0.025),)),
@@ -136,6 +164,95 @@ SCENARIOS: Final = (
                     f"{rate:g} rad/s", (Fault("value", f"{_QUIET}_STATE", 0, 100, Velocity=100.0 * rate),), node=_QUIET
                 )
                 for rate in (0.7, -0.7)
+            ),
+        ),
+    ),
+    Scenario(
+        "F62",
+        (
+            Case(
+                "LEFT_SA by 1 rad, before the start",
+                (Fault("encoder_jump", "LEFT_SA", by=1.0),),
+                phase=None,
+                state=SupervisorState.OFF,
+                node="LEFT_SA",
+                watched=400,
+                recovers=False,
+                checks=(start_is_refused,),
+            ),
+            # The controller follows the encoder as long as the joint can.
+            Case(
+                "RIGHT_SA at 2 rad/s",
+                (Fault("encoder_drift", "RIGHT_SA", rate=2.0),),
+                node="RIGHT_SA",
+                noticed=400,
+                reacted=400,
+                recovers=False,
+                checks=(start_is_refused,),
+            ),
+        ),
+    ),
+    Scenario(
+        "F59",
+        (
+            *(
+                Case(
+                    f"{torque:g} Nm of a drive that is off",
+                    (Fault("value", f"{_QUIET}_STATE", Torque=torque),),
+                    phase=None,
+                    noticed=300,
+                    reacted=300,
+                    watched=100,
+                    recovers=False,
+                    checks=(start_is_refused,),
+                )
+                for torque in (-400.0, 5.0)
+            ),
+            Case(
+                "-400 Nm of a drive that holds",
+                (Press("hold"), Fault("value", f"{_QUIET}_STATE", 20, Torque=-400.0)),
+                state=_HOLD,
+                noticed=5,
+                reacted=5,
+                recovers=False,
+                checks=(start_is_refused,),
+            ),
+        ),
+    ),
+    Scenario(
+        "F60",
+        (
+            *(
+                Case(
+                    f"{name}, and a velocity 0.7 rad/s off",
+                    (Fault("value", f"{_QUIET}_STATE", 0, 100, Velocity=70.0), disturbance),
+                    node=_QUIET,
+                )
+                for name, disturbance in _RIDDEN_THROUGH.items()
+            ),
+            *(
+                Case(
+                    f"{name}, and a drift of 0.1 rad/s",
+                    (disturbance, Fault("encoder_drift", "LEFT_SH", rate=0.1)),
+                    state=SupervisorState.FULL_ASSIST,
+                    dtc="ENC_DRIFT",
+                    noticed=1000,
+                    reacted=1000,
+                    recovers=False,
+                )
+                for name, disturbance in _RIDDEN_THROUGH.items()
+            ),
+        ),
+    ),
+    Scenario(
+        "F61",
+        (
+            Case(
+                "IMU_LEFT_TIBIA for good",
+                (Fault("imu_invalid", "IMU_LEFT_TIBIA"),),
+                node="LEFT_FH",
+                watched=200,
+                recovers=False,
             ),
         ),
     ),

@@ -1,0 +1,249 @@
+"""Starts that are refused: what drives report must fit their state, and a joint must be where it can be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from atalante_hal.cia402 import Controlword, DriveState
+from atalante_hal.diagnostics import Dtc
+from atalante_hal.robot import JOINTS, load_robot
+from atalante_hal.start import powered, refusal
+from atalante_hal.types import SupervisorState
+
+ROBOT = load_robot()
+IDLE = ROBOT.thresholds.idle_torque
+S, D = SupervisorState, DriveState
+joints = pytest.mark.parametrize("joint", range(12), ids=JOINTS)
+
+
+@pytest.mark.parametrize("state", DriveState)
+@joints
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_torque_a_drive_may_report_depends_on_its_state(state: DriveState, joint: int, sign: float):
+    on = state in (D.OPERATION_ENABLED, D.QUICK_STOP_ACTIVE)
+    states = np.full(12, float(D.SWITCH_ON_DISABLED))
+    states[joint] = state
+    assert powered(states).tolist() == [on and j == joint for j in range(12)]
+    most = (ROBOT.torque_max[joint] if on else 0.0) + IDLE
+    torque = np.zeros(12)
+    torque[joint] = sign * most
+    assert refusal(ROBOT, states, torque) is None
+    torque[joint] = sign * np.nextafter(most, np.inf)
+    why = refusal(ROBOT, states, torque)
+    assert why is not None
+    limit = f"its limit of {ROBOT.torque_max[joint]:.0f} Nm" if on else "2 Nm, it makes no torque"
+    assert why == f"the drive of {JOINTS[joint]} reports {sign * most:.0f} Nm in {state.name}; must be within {limit}"
+
+
+@pytest.mark.parametrize("torque", [np.nan, np.inf, -np.inf])
+def test_a_torque_that_is_no_number_is_refused(torque: float):
+    why = refusal(ROBOT, np.full(12, float(D.OPERATION_ENABLED)), np.full(12, torque))
+    assert why is not None
+    assert "left_FH" in why
+
+
+def test_an_unknown_state_makes_no_torque():
+    why = refusal(ROBOT, np.full(12, 99.0), np.full(12, 3.0))
+    assert why == "the drive of left_FH reports 3 Nm in state 99; must be within 2 Nm, it makes no torque"
+
+
+class Lie:
+    """A signal of a joint's state message that is another than the truth while `by` is set."""
+
+    def __init__(self, rig, joint: str, signal: str) -> None:
+        self._at = rig.emulator.signals.index(f"{joint.upper()}_STATE", signal)
+        self.value: float | None = None
+        self.more = 0.0
+        rig.emulator.before_send.append(self._rewrite)
+
+    def _rewrite(self, cycle: int, values: np.ndarray) -> None:
+        values[self._at] = values[self._at] + self.more if self.value is None else self.value
+
+
+def refused(rig) -> list[str]:
+    return [event.text for event in rig.hal.events if event.code == "START_REFUSED"]
+
+
+@joints
+@pytest.mark.parametrize("torque", [-400.0, 3.0])
+def test_a_torque_of_a_drive_that_is_off_refuses_the_start(make_rig, joint: int, torque: float):
+    rig = make_rig(starts=False)
+    lie = Lie(rig, JOINTS[joint], "Torque")
+    rig.until(S.READY)
+    lie.value = torque
+    rig.run(1)
+    seen = set()
+    rig.operator.start()
+    for _ in range(30):
+        rig.run(1)
+        seen |= rig.controlwords()
+    assert seen == {Controlword.QUICK_STOP}
+    assert rig.hal.state.supervisor is S.READY
+    assert refused(rig) == [
+        f"START refused: the drive of {JOINTS[joint]} reports {torque:.0f} Nm in SWITCH_ON_DISABLED; "
+        "must be within 2 Nm, it makes no torque"
+    ]
+    assert rig.hal.reason == refused(rig)[0]
+    lie.value = None
+    rig.operator.start()
+    assert rig.until(S.ACTIVE, 50).supervisor is S.ACTIVE
+
+
+@pytest.mark.parametrize(("torque", "follows"), [(-400.0, False), (60.0, True)])
+def test_a_torque_of_a_drive_that_holds_is_followed_within_its_limit(make_rig, torque: float, follows: bool):
+    rig = make_rig()
+    rig.until(S.ACTIVE)
+    rig.operator.hold()
+    rig.until(S.HOLD)
+    rig.run(20)
+    Lie(rig, "right_FH", "Torque").value = torque
+    rig.run(2)
+    rig.operator.start()
+    first = None
+    for _ in range(10):
+        rig.hal.read()
+        sent = rig.hal.hold().copy()
+        enabled = Controlword.ENABLE_OPERATION in rig.controlwords()
+        if enabled:
+            first = sent[JOINTS.index("right_FH")]
+            break
+    assert (first == pytest.approx(60.0, abs=0.1)) if follows else first is None
+    assert bool(refused(rig)) is not follows
+
+
+def test_a_torque_that_begins_while_a_drive_is_being_enabled_ends_the_start(make_rig):
+    rig = make_rig(starts=False)
+    rig.until(S.READY)
+    rig.operator.start()
+    lie = Lie(rig, "left_SK", "Torque")
+    while D.SWITCHED_ON not in rig.run(1).drive_state.tolist():
+        pass
+    lie.value = -400.0
+    for _ in range(30):
+        rig.run(1)
+        assert np.abs(rig.hal._commands.torque).max() < 5.0
+        assert rig.hal.state.supervisor is S.READY
+    assert "reports -400 Nm in SWITCHED_ON" in refused(rig)[0]
+    assert set(rig.controlwords()) == {Controlword.QUICK_STOP}
+
+
+def test_nothing_is_followed_of_a_drive_that_is_off(make_rig):
+    rig = make_rig(starts=False)
+    Lie(rig, "left_SK", "Torque").value = 1.5
+    rig.until(S.READY)
+    rig.operator.start()
+    for _ in range(30):
+        state = rig.run(1)
+        if state.drive_state[3] not in (D.OPERATION_ENABLED, D.QUICK_STOP_ACTIVE):
+            assert rig.last_commands()["left"]["SK_TargetTorque"] == pytest.approx(0.0, abs=0.02)
+    assert rig.hal.moving
+
+
+class TestRange:
+    GONE = 1.0  # rad
+
+    def outside(self, rig) -> Lie:
+        lie = Lie(rig, "left_SA", "Position")
+        lie.more = self.GONE * ROBOT.gear[4] * ROBOT.polarity[4]
+        return lie
+
+    def test_a_joint_outside_its_range_is_not_ready(self, make_rig):
+        rig = make_rig(starts=False)
+        lie = self.outside(rig)
+        assert rig.run(500).supervisor is S.OFF
+        assert rig.hal.reason.startswith("left_SA is at 57.3 degrees, outside its range of -16.0 to 9.0 degrees")
+        rig.operator.start()
+        assert rig.run(10).supervisor is S.OFF
+        assert refused(rig) == [
+            f"START refused: left_SA is at {np.degrees(self.GONE):.1f} degrees, outside its range of -16.0 to 9.0 degrees; "
+            "move it back by hand with the drives off, or reference its encoder"
+        ]
+        lie.more = 0.0
+        rig.hal._plausibility.reference("LEFT_SA")
+        assert rig.until(S.READY, 50).supervisor is S.READY
+
+    def test_a_slightly_bent_end_stop_is_ready(self, make_rig):
+        rig = make_rig(starts=False)
+        low = ROBOT.position_min[4] - 0.9 * ROBOT.thresholds.position_tolerance
+        Lie(rig, "left_SA", "Position").more = low * ROBOT.gear[4] * ROBOT.polarity[4]
+        rig.until(S.READY)
+        rig.operator.start()
+        assert rig.until(S.ACTIVE, 50).supervisor is S.ACTIVE
+
+    def test_in_hold_the_start_is_refused(self, make_rig):
+        rig = make_rig()
+        rig.until(S.ACTIVE)
+        rig.operator.hold()
+        rig.until(S.HOLD)
+        rig.run(10)
+        lie = Lie(rig, "left_SA", "Position")
+        for cycle in range(800):  # too slow for a wrong velocity
+            lie.more = 0.0004 * cycle * ROBOT.gear[4] * ROBOT.polarity[4]
+            rig.run(1)
+        for _ in range(2):
+            before = len(refused(rig))
+            rig.operator.start()
+            for _ in range(30):
+                assert rig.run(1).supervisor is S.HOLD
+                assert rig.controlwords() == {Controlword.QUICK_STOP}
+            assert len(refused(rig)) == before + 1
+            assert "left_SA is at" in refused(rig)[-1]
+
+
+class TestJump:
+    """An encoder that jumped and stays there."""
+
+    def jumped(self, make_rig):
+        rig = make_rig()
+        rig.until(S.ACTIVE)
+        lie = Lie(rig, "right_SA", "Position")
+        lie.more = 0.1 * ROBOT.gear[10] * ROBOT.polarity[10]
+        assert rig.run(5).supervisor is S.HOLD
+        rig.run(400)  # cycles in which a joint can have gone over a radian
+        return rig, lie
+
+    def test_every_start_is_refused_with_the_reason(self, make_rig):
+        rig, _ = self.jumped(make_rig)
+        for count in (1, 2):
+            rig.operator.start()
+            for _ in range(50):
+                assert rig.run(1).supervisor is S.HOLD
+                assert rig.controlwords() == {Controlword.QUICK_STOP}
+            assert len(refused(rig)) == count
+            assert "the encoder of right_SA jumped by" in refused(rig)[-1]
+            assert "not used until it jumps back or its drive restarts" in refused(rig)[-1]
+
+    def test_it_starts_when_the_encoder_has_jumped_back(self, make_rig):
+        rig, lie = self.jumped(make_rig)
+        lie.more = 0.0
+        rig.run(30)
+        rig.operator.start()
+        assert rig.until(S.ACTIVE, 50).supervisor is S.ACTIVE
+
+    def test_it_starts_when_the_drive_has_restarted(self, make_rig):
+        rig, _ = self.jumped(make_rig)
+        emulator = rig.emulator
+        emulator._heartbeats.boot("RIGHT_FH", emulator.cycle)
+        rig.run(30)
+        rig.operator.start()
+        assert rig.run(50).supervisor is S.HOLD
+        emulator._heartbeats.boot("RIGHT_SA", emulator.cycle)
+        rig.run(30)
+        rig.operator.start()
+        assert rig.until(S.ACTIVE, 50).supervisor is S.ACTIVE
+
+
+def test_a_start_refused_by_a_diagnostic_enables_nothing(make_rig):
+    rig = make_rig()
+    rig.until(S.ACTIVE)
+    rig.operator.hold()
+    rig.until(S.HOLD)
+    rig.run(10)
+    supervision = rig.hal._supervision
+    rig.operator.start()
+    for _ in range(20):
+        supervision.report(Dtc.ENC_STUCK, "an encoder stands still")
+        rig.run(1)
+        assert Controlword.ENABLE_OPERATION not in rig.controlwords()
+    assert rig.hal.state.supervisor is not S.ACTIVE
