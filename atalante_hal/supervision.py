@@ -244,6 +244,8 @@ class Supervision:
             self._heartbeats.acknowledge(faulty)
             self._transceiver.acknowledge()
             self.start_wanted = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
+            if state.supervisor is _S.OFF and self.hindered:
+                self._refuse_start(self.memory.text_of(self.memory.worst()))
         elif self.start_wanted:
             self.start_wanted -= 1
             if hindrance := self._hindrance(nodes_well):

@@ -419,7 +419,7 @@ def test_a_start_that_is_refused_is_said_and_the_hal_has_the_reason(
     said = capsys.readouterr().err
     assert "the HAL did not become ACTIVE, its events say why; type start to press START again" in said
     assert [event.text for event in world.hal.events if event.code == "START_REFUSED"] == [world.hal.reason]
-    assert world.hal.reason.startswith("START is refused: LEFT_FH: its torque limit is")
+    assert world.hal.reason.startswith("START refused: LEFT_FH: its torque limit is")
 
 
 def test_typed_lines_are_obeyed(world: World, capsys: pytest.CaptureFixture[str]) -> None:

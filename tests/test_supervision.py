@@ -455,12 +455,12 @@ def test_a_start_in_hold_is_refused_with_the_reason_while_a_node_is_missing(make
     rig.operator.start()
     rig.run(2)
     assert "START_REFUSED" in rig.codes()
-    assert rig.hal.reason.startswith("START is refused: LEFT_SK: a node is silent")
+    assert rig.hal.reason.startswith("START refused: LEFT_SK: a node is silent")
     rig.bus.to_hal = lambda frames: frames
     rig.run(2)
     rig.operator.start()
     rig.run(2)
-    assert rig.hal.reason == "START is refused: not heard or not trusted yet: LEFT_SK"
+    assert rig.hal.reason == "START refused: not heard or not trusted yet: LEFT_SK"
     assert rig.run(ENABLE_CYCLES + 50).supervisor is S.HOLD
     rig.operator.start()
     assert rig.until(S.ACTIVE, 20).supervisor is S.ACTIVE
