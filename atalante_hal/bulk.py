@@ -1,8 +1,8 @@
-"""Array codec for a whole log: every signal of a message, over any number of its frames at once, of any DBC.
+"""Array codec for logs: decodes all frames of one message of any DBC, and computes their E2E CRCs.
 
-The codec of the loop (`codec.Codec`) decodes many messages of one cycle and leans on our rule that no signal crosses a 64-bit
-word. Here it is one layout and many rows, and nothing is asked of the layout: Intel and Motorola, straddling, 64-bit, IEEE
-floats and multiplexed signals come out exactly as cantools decodes them. The E2E check of a column is here as well.
+The codec of the control loop (`codec.Codec`) decodes many messages of one cycle and requires that no signal crosses a 64-bit
+word. This codec decodes many frames of one message and supports every layout: Intel and Motorola, signals across 64-bit words,
+64-bit signals, IEEE floats and multiplexed signals. The values are equal to those of cantools.
 """
 
 from __future__ import annotations
@@ -35,11 +35,13 @@ _UINT64 = range(1 << 64)
 
 @dataclass(frozen=True)
 class Column:
-    """One signal over many frames.
+    """Values of one signal in many frames.
 
-    `values` is shape (n,): int64 or uint64 where the DBC's factor and offset are integers (Python integers where neither is
-    wide enough), float64 otherwise. `present` is None, or shape (n,) and False where the multiplexer puts another signal into
-    the frame; the value there means nothing.
+    Attributes:
+        values: physical values, shape (n,), DBC units; int64 or uint64 if factor and offset in the DBC are integers (Python
+            integers if neither type is wide enough), otherwise float64.
+        present: frames with the signal, shape (n,); None: all. The multiplexer selects another signal in the other frames, and
+            their values are meaningless.
     """
 
     values: Values
@@ -47,39 +49,46 @@ class Column:
 
 
 def payload_words(frames: Frames, length: int) -> Words:
-    """Payloads of records of `length` bytes as little-endian words, one word of all frames after the other. Shape (words, n)."""
+    """Return payloads as little-endian words, with the first words of all frames in the first row. Shape (words, n).
+
+    Args:
+        frames: `FRAME` records, shape (n,).
+        length: payload length, bytes.
+    """
     count = (length + 7) // 8
     return np.ascontiguousarray(as_words(frames)[:, 1 : 1 + count].T)
 
 
 class BulkCodec:
-    """Compiled plan of one layout. `fields` is its own order: signed, unsigned, float; `place` tells where a signal is."""
+    """Codec of one message layout. `fields` is ordered by kind: signed, unsigned, float; `index` returns the row of a signal."""
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
         kinds = ("signed", "unsigned", "float")
         self.fields: tuple[Field, ...] = tuple(sorted(layout.fields, key=lambda f: kinds.index(f.kind)))
-        self._place = {field.name: place for place, field in enumerate(self.fields)}
+        self._index = {field.name: index for index, field in enumerate(self.fields)}
         self._signed = sum(f.kind == "signed" for f in self.fields)
         self._plan()
 
-    def place(self, name: str) -> int:
-        """Row of a signal in what `extract` returns.
+    def index(self, name: str) -> int:
+        """Return the index of a signal in `fields`, which is its row in the result of `extract`.
 
         Raises:
-            KeyError: with the names there are.
+            KeyError: If the message has no such signal; the error lists the signals.
         """
         try:
-            return self._place[name]
+            return self._index[name]
         except KeyError:
-            raise KeyError(f"no signal {name!r} in {self.layout.name}: {', '.join(self._place)}") from None
+            raise KeyError(
+                f"signal of {self.layout.name} must be one of {', '.join(self._index)}, got {name!r}"
+            ) from None
 
     def _plan(self) -> None:
-        """Where each field is taken from: an Intel word, a Motorola word, or one put together from two."""
+        """Assign each field to its source: an Intel word, a byte-swapped (Motorola) word, or a word joined from two."""
         rows: dict[tuple[str, int], int] = {}
-        self._little: list[int] = []  # words used as they are
-        self._big: list[int] = []  # words used byte-swapped
-        self._joined: list[tuple[bool, int, int]] = []  # (Motorola, first word, shift) of straddling fields
+        self._little: list[int] = []  # Intel words
+        self._big: list[int] = []  # Motorola words, byte-swapped
+        self._joined: list[tuple[bool, int, int]] = []  # (is Motorola, first word, shift) of fields across two words
         sources: list[tuple[str, int]] = []
         left: list[int] = []
         for number, field in enumerate(self.fields):
@@ -106,24 +115,24 @@ class BulkCodec:
         self._right_unsigned = np.array(right[self._signed :], np.uint64)[:, None]
 
     def extract(self, words: Words) -> Words:
-        """Raw codes: signed ones as two's complement of 64 bits, floats as their bits. Shape (fields, n).
+        """Extract the raw codes: signed ones as two's complement of 64 bits, floats as their bits. Shape (fields, n).
 
         Args:
-            words: of `payload_words`.
+            words: result of `payload_words`, shape (words, n).
         """
         stack = np.empty((len(self._little) + len(self._big) + len(self._joined), words.shape[1]), np.uint64)
-        place = len(self._little)
-        stack[:place] = words[self._little]
+        row = len(self._little)
+        stack[:row] = words[self._little]
         if self._big:
-            stack[place : place + len(self._big)] = words[self._big].byteswap()
-            place += len(self._big)
+            stack[row : row + len(self._big)] = words[self._big].byteswap()
+            row += len(self._big)
         for big_endian, word, bit in self._joined:
             first, second = words[word], words[word + 1]
             if big_endian:
-                stack[place] = (first.byteswap() << np.uint64(bit)) | (second.byteswap() >> np.uint64(_WORD - bit))
+                stack[row] = (first.byteswap() << np.uint64(bit)) | (second.byteswap() >> np.uint64(_WORD - bit))
             else:
-                stack[place] = (first >> np.uint64(bit)) | (second << np.uint64(_WORD - bit))
-            place += 1
+                stack[row] = (first >> np.uint64(bit)) | (second << np.uint64(_WORD - bit))
+            row += 1
         raw: Words = stack.take(self._sources, axis=0)
         np.left_shift(raw, self._left, out=raw)
         signed = raw[: self._signed].view(np.int64)
@@ -131,12 +140,17 @@ class BulkCodec:
         np.right_shift(raw[self._signed :], self._right_unsigned, out=raw[self._signed :])
         return raw
 
-    def values(self, raw: Words, place: int) -> Values:
-        """Physical values of one field, integers exact. Shape (n,), DBC units."""
-        field, codes = self.fields[place], raw[place]
+    def values(self, raw: Words, index: int) -> Values:
+        """Return the physical values of one field, integers exact. Shape (n,), DBC units.
+
+        Args:
+            raw: result of `extract`, shape (fields, n).
+            index: index of the field in `fields`.
+        """
+        field, codes = self.fields[index], raw[index]
         if field.kind == "float":
             unsigned, floating = _FLOATS[field.length]
-            with np.errstate(invalid="ignore", over="ignore"):  # a payload may well hold a signalling NaN
+            with np.errstate(invalid="ignore", over="ignore"):  # any payload is allowed, also a signalling NaN
                 real = codes.astype(unsigned).view(floating).astype(np.float64)
                 return np.asarray(real * field.factor + field.offset)
         integers = codes.view(np.int64) if field.kind == "signed" or field.length < _WORD else codes
@@ -148,47 +162,62 @@ class BulkCodec:
             column = column * exact(int(field.factor))
         return column if field.offset == 0 else np.asarray(column + exact(int(field.offset)))
 
-    def present(self, raw: Words, place: int) -> Mask | None:
-        """Frames that carry the field; None: all of them. Shape (n,)."""
+    def present(self, raw: Words, index: int) -> Mask | None:
+        """Return the frames with the field, shape (n,); None: all frames.
+
+        Args:
+            raw: result of `extract`, shape (fields, n).
+            index: index of the field in `fields`.
+        """
         mask: Mask | None = None
-        for multiplexer, allowed in self.fields[place].selectors:
-            there = np.isin(raw[self._place[multiplexer]].view(np.int64), list(allowed))
-            mask = there if mask is None else mask & there
+        for multiplexer, allowed in self.fields[index].selectors:
+            selected = np.isin(raw[self._index[multiplexer]].view(np.int64), list(allowed))
+            mask = selected if mask is None else mask & selected
         return mask
 
     def undefined(self, raw: Words, multiplexer: str) -> Mask:
-        """Frames whose multiplexer has a value for which the DBC gives no layout. Shape (n,)."""
-        place = self._place[multiplexer]
-        unknown = ~np.isin(raw[place].view(np.int64), list(self.layout.multiplexers[multiplexer]))
-        there = self.present(raw, place)
-        return unknown if there is None else unknown & there
+        """Return the frames whose multiplexer has a value without a layout in the DBC. Shape (n,).
+
+        Args:
+            raw: result of `extract`, shape (fields, n).
+            multiplexer: name of the multiplexer signal.
+        """
+        index = self._index[multiplexer]
+        unknown = ~np.isin(raw[index].view(np.int64), list(self.layout.multiplexers[multiplexer]))
+        present = self.present(raw, index)
+        return unknown if present is None else unknown & present
 
     def decode(self, frames: Frames) -> dict[str, Column]:
-        """Every signal of frames of this message, in DBC order.
+        """Decode every signal of frames of this message, in the order of the DBC.
 
         Args:
             frames: `FRAME` records, shape (n,), each at least as long as the message.
 
         Raises:
-            ValueError: a frame is shorter than the message.
+            ValueError: If a frame is shorter than the message.
         """
         length = self.layout.length
         if len(frames) and int(frames["len"].min()) < length:
-            raise ValueError(f"{self.layout.name} has {length} bytes; a frame has {int(frames['len'].min())}")
+            raise ValueError(
+                f"frames of {self.layout.name} must have at least {length} bytes, got {int(frames['len'].min())}"
+            )
         raw = self.extract(payload_words(frames, length))
-        places = [self._place[field.name] for field in self.layout.fields]
-        return {self.fields[p].name: Column(self.values(raw, p), self.present(raw, p)) for p in places}
+        indices = [self._index[field.name] for field in self.layout.fields]
+        return {self.fields[p].name: Column(self.values(raw, p), self.present(raw, p)) for p in indices}
 
 
 def raw_range(field: Field) -> range:
-    """Raw codes an integer field can hold."""
+    """Return the range of raw codes of an integer field."""
     if field.kind == "signed":
         return range(-(1 << field.length - 1), 1 << field.length - 1)
     return range(1 << field.length)
 
 
 def _integer_type(field: Field) -> Any:
-    """Type that holds every raw and physical value of a field with integer factor and offset: int64, uint64 or Python's own."""
+    """Return the type that holds every raw and physical value of a field with integer factor and offset.
+
+    It is int64, uint64, or object for Python integers.
+    """
     factor, offset = int(field.factor), int(field.offset)
     codes = raw_range(field)
     reached = [x for code in (codes[0], codes[-1]) for x in (code, code * factor, code * factor + offset)]
@@ -198,35 +227,49 @@ def _integer_type(field: Field) -> Any:
     return np.uint64 if all(x in _UINT64 for x in reached) else np.object_
 
 
-# -- E2E Profile 5 of a column ---------------------------------------------------------------------------------------------
+# -- CRC of E2E Profile 5 ------------------------------------------------------------------------------------------------
 
 
 @cache
 def _byte_table(followed_by: int) -> npt.NDArray[np.uint16]:
-    """What a byte adds to the CRC (over GF(2), start 0) with that many bytes behind it. Shape (256,)."""
+    """Return the contribution of a byte to the CRC (over GF(2), start 0), by its value. Shape (256,).
+
+    Args:
+        followed_by: number of bytes after the byte.
+    """
     zeros = bytes(followed_by)
     return np.array([crc_hqx(bytes([byte]) + zeros, 0) for byte in range(256)], np.uint16)
 
 
 @cache
 def _pair_table(followed_by: int) -> npt.NDArray[np.uint16]:
-    """The same for two bytes read as one little-endian number. Shape (65536,)."""
+    """Return the contribution of two bytes to the CRC, by their little-endian number. Shape (65536,).
+
+    Args:
+        followed_by: number of bytes after the two bytes.
+    """
     return np.bitwise_xor.outer(_byte_table(followed_by), _byte_table(followed_by + 1)).reshape(-1)
 
 
 def crc_of_zeros(length: int, data_id: int) -> int:
-    """CRC of an empty payload of `length` bytes under a Data ID: the constant of the affine map."""
+    """Return the CRC of a payload of zeros, which is the constant of the affine map.
+
+    Args:
+        length: payload length with the CRC, bytes.
+        data_id: Data ID of the message (E2E Profile 5).
+    """
     return crc(bytes(length - CRC_BYTES), data_id_bytes(data_id))
 
 
 def crc_differences(frames: Frames, length: int) -> npt.NDArray[np.uint16]:
-    """Received CRC xor what the payload contributes to it. Shape (n,).
+    """Return the received CRC xor the contribution of the payload. Shape (n,).
 
-    The CRC is affine over GF(2): a frame is intact exactly when this is `crc_of_zeros(length, data_id)`. Payloads go through
-    the map two bytes at a time, one gather in a table of 65536 a pair.
+    The CRC is affine over GF(2), so a frame is intact if and only if the result is `crc_of_zeros(length, data_id)`. A lookup
+    table of 65536 entries gives the contribution of each pair of bytes.
 
     Args:
-        frames: records whose payloads have `length` bytes and begin with the CRC, low byte first.
+        frames: `FRAME` records, shape (n,), whose payloads begin with the CRC, low byte first.
+        length: payload length with the CRC, bytes.
     """
     data_id_length = len(data_id_bytes(0))
     payload = frames.view(np.uint16).reshape(-1, FRAME_BYTES // 2)[:, 4:]

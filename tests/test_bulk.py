@@ -1,4 +1,4 @@
-"""Bulk codec against cantools on every layout there is, and the E2E check of a column against one frame at a time."""
+"""Bulk codec against cantools on every kind of layout, and CRCs of columns against CRCs of single frames."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from atalante_hal.codec import Codec
 from atalante_hal.e2e import crc, data_id_bytes
 from atalante_hal.frame import Frames, new_frames
 
-#: DBCs with every layout a foreign network may have; every message is decoded as cantools does.
+#: DBCs with every kind of layout; each message is compared with cantools.
 COLLECTION = sorted(Path(__file__).with_name("foreign").glob("*.dbc"))
 
 HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: A B\n\n'
@@ -28,7 +28,7 @@ FORMATS = (
 EXTENDED = 1 << 31
 
 
-#: Messages that must be refused: name of the case -> (DBC text, words of the reason).
+#: Messages with an unsupported layout: case -> (DBC text, part of the reason).
 REFUSED = {
     "signal of 65 bits": (
         HEAD + 'BO_ 1 M: 16 A\n SG_ Long : 0|65@1+ (1,0) [0|0] "" B\n',
@@ -97,7 +97,7 @@ REFUSED = {
 
 
 def random_frames(generator: np.random.Generator, layout: Layout, count: int) -> Frames:
-    """Random payloads, with garbage behind them as a bus may leave it."""
+    """Return frames with random payloads and random bytes after them, as a reused receive buffer has."""
     frames = new_frames(count)
     frames["can_id"], frames["len"] = layout.frame_id, layout.length
     frames["data"] = generator.integers(0, 256, (count, 64))
@@ -114,7 +114,7 @@ def same(ours: object, theirs: object) -> bool:
 
 
 def compare(path: Path, generator: np.random.Generator, count: int) -> int:
-    """Every message of a DBC on random payloads; returns how many values were compared."""
+    """Compare every message of a DBC on random payloads; return the number of compared values."""
     database = cantools.database.load_file(path, strict=False)
     compared = 0
     found = catalogue(path)
@@ -135,7 +135,7 @@ def compare(path: Path, generator: np.random.Generator, count: int) -> int:
             try:
                 expected = message.decode(payload, decode_choices=False)
             except cantools.database.DecodeError:
-                assert undefined[row], f"{layout.name} cannot be decoded by cantools, and we do not say so"
+                assert undefined[row], f"{layout.name} is undefined for cantools but not for the codec"
                 continue
             assert not undefined[row]
             there = {name for name, c in columns.items() if c.present is None or c.present[row]}
@@ -147,22 +147,22 @@ def compare(path: Path, generator: np.random.Generator, count: int) -> int:
 
 
 @pytest.mark.parametrize("path", COLLECTION, ids=lambda path: path.stem)
-def test_decodes_like_cantools(path: Path) -> None:
+def test_values_are_equal_to_cantools(path: Path) -> None:
     assert compare(path, np.random.default_rng(len(path.stem)), 200) > 500
 
 
-def test_the_collection_is_there() -> None:
-    """A collection that was not found would pass every test on it."""
+def test_collection_has_at_least_six_dbcs() -> None:
+    """Without this test, a missing folder would skip all comparisons."""
     assert len(COLLECTION) >= 6
 
 
-def test_decodes_our_network_like_cantools() -> None:
+def test_values_of_the_robot_network_are_equal_to_cantools() -> None:
     assert compare(atalante_dbc.DBC_FILE, np.random.default_rng(1), 10) > 5000
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_decodes_random_layouts_like_cantools(seed: int, tmp_path: Path) -> None:
-    """Messages filled with signals of any length, place, byte order, sign and kind."""
+def test_values_of_random_layouts_are_equal_to_cantools(seed: int, tmp_path: Path) -> None:
+    """The messages have signals of random length, position, byte order, sign and kind."""
     generator = np.random.default_rng(seed)
     path = tmp_path / "random.dbc"
     path.write_text(_random_dbc(generator, 25))
@@ -195,7 +195,7 @@ def _random_dbc(generator: np.random.Generator, messages: int) -> str:
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_refuses_by_name(name: str, tmp_path: Path) -> None:
+def test_unsupported_layout_is_named_with_the_reason(name: str, tmp_path: Path) -> None:
     text, reason = REFUSED[name]
     path = tmp_path / "foreign.dbc"
     path.write_text(text)
@@ -206,7 +206,7 @@ def test_refuses_by_name(name: str, tmp_path: Path) -> None:
         found.layout("M")
 
 
-def test_refusing_one_message_leaves_the_others(tmp_path: Path) -> None:
+def test_unsupported_message_does_not_affect_the_others(tmp_path: Path) -> None:
     path = tmp_path / "foreign.dbc"
     path.write_text(
         HEAD
@@ -220,29 +220,29 @@ def test_refusing_one_message_leaves_the_others(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "\x00\x01", "BO_ what"])
-def test_what_is_no_dbc_gets_a_sentence(text: str, tmp_path: Path) -> None:
+def test_file_that_is_no_dbc_is_rejected(text: str, tmp_path: Path) -> None:
     path = tmp_path / "foreign.dbc"
     path.write_text(text)
     with pytest.raises(atalante_dbc.DbcError, match="cannot be read as a DBC"):
         catalogue(path)
 
 
-def test_a_missing_dbc_gets_a_sentence(tmp_path: Path) -> None:
+def test_missing_dbc_is_reported(tmp_path: Path) -> None:
     with pytest.raises(atalante_dbc.DbcError, match=r"cannot be read as a DBC: No such file"):
         catalogue(tmp_path / "none.dbc")
 
 
-def test_short_frames_are_refused(network: atalante_dbc.Network) -> None:
+def test_short_frames_are_rejected(network: atalante_dbc.Network) -> None:
     layout = catalogue(atalante_dbc.DBC_FILE).layout("LEFT_FH_STATE")
     frames = new_frames(2)
     frames["len"] = 12, 8
-    with pytest.raises(ValueError, match="LEFT_FH_STATE has 12 bytes; a frame has 8"):
+    with pytest.raises(ValueError, match="frames of LEFT_FH_STATE must have at least 12 bytes, got 8"):
         BulkCodec(layout).decode(frames)
     assert network.message("LEFT_FH_STATE").length == 12
 
 
-def test_same_values_as_the_codec_of_the_loop(network: atalante_dbc.Network) -> None:
-    """Two codecs of ours, compiled in different ways, agree to the last bit."""
+def test_values_are_equal_to_the_codec_of_the_control_loop(network: atalante_dbc.Network) -> None:
+    """Both codecs give the same values to the last bit."""
     generator = np.random.default_rng(3)
     found = catalogue(atalante_dbc.DBC_FILE)
     for message in network.messages:
@@ -253,24 +253,24 @@ def test_same_values_as_the_codec_of_the_loop(network: atalante_dbc.Network) -> 
         out = np.zeros(single.size)
         for row in range(5):
             single.decode(frames[row : row + 1].copy(), out)
-            for place, (_, signal) in enumerate(single.signals):
-                assert columns[signal.name].values[row] == out[place]
+            for index, (_, signal) in enumerate(single.signals):
+                assert columns[signal.name].values[row] == out[index]
     assert network.messages
 
 
-def test_a_field_knows_its_place() -> None:
+def test_index_finds_a_signal_or_lists_the_valid_names() -> None:
     codec = BulkCodec(catalogue(atalante_dbc.DBC_FILE).layout("LEFT_FH_STATE"))
-    assert codec.fields[codec.place("Position")].name == "Position"
-    with pytest.raises(KeyError, match="no signal 'Nothing' in LEFT_FH_STATE"):
-        codec.place("Nothing")
+    assert codec.fields[codec.index("Position")].name == "Position"
+    with pytest.raises(KeyError, match=r"signal of LEFT_FH_STATE must be one of .*, got 'Nothing'"):
+        codec.index("Nothing")
 
 
 # -- E2E -------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("length", [2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64])
-def test_crc_of_a_column(length: int) -> None:
-    """The affine map, two bytes a gather, against the standard library's CRC of each frame."""
+def test_crc_differences_are_equal_to_single_crcs(length: int) -> None:
+    """The affine map gives the CRC of `e2e.crc` for each frame."""
     generator = np.random.default_rng(length)
     frames = new_frames(300)
     frames["len"] = length
@@ -282,8 +282,8 @@ def test_crc_of_a_column(length: int) -> None:
     assert (differences ^ crc_of_zeros(length, data_id)).tolist() == expected
 
 
-def test_crc_tells_the_data_id() -> None:
-    """What is left over names the Data ID a frame was protected with, so a masquerade can be told from damage."""
+def test_crc_difference_identifies_the_data_id() -> None:
+    """The difference is unique for each Data ID, which distinguishes a wrong identifier from a damaged frame."""
     length = 12
     constants = {crc_of_zeros(length, data_id): data_id for data_id in range(1 << 16)}
     assert len(constants) == 1 << 16

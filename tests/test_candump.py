@@ -1,4 +1,4 @@
-"""The array parser of candump logs against python-can's reader, on whole lines, odd lines and garbage."""
+"""Array parser of candump logs against the reader of python-can, on regular lines, irregular lines and damaged lines."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from atalante_hal.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE
 from atalante_tools.validate import log as log_module
 from atalante_tools.validate.candump import MARGIN, Channels, Parsed, parse
-from atalante_tools.validate.chunk import NOT_SAID, RECEIVED, SENT, Chunk
+from atalante_tools.validate.chunk import NO_DIRECTION, RECEIVED, SENT, Chunk
 from atalante_tools.validate.log import Log, open_log
 
 
@@ -24,7 +24,7 @@ def parsed(text: str | bytes) -> tuple[Parsed, list[str]]:
 
 
 def one(line: str) -> tuple[dict[str, object], bool]:
-    """The frame of a line, and whether it could be read."""
+    """Return the frame of a line, and whether the line is a frame."""
     result, names = parsed(line + "\n")
     if not len(result.chunk):
         return {}, False
@@ -62,7 +62,7 @@ def random_lines(seed: int, count: int) -> list[str]:
 
 
 @pytest.mark.parametrize("ending", ["\n", "\r\n"])
-def test_like_python_can(ending: str, tmp_path: Path) -> None:
+def test_frames_are_equal_to_those_of_python_can(ending: str, tmp_path: Path) -> None:
     lines = random_lines(1, 3000)
     path = tmp_path / "random.log"
     path.write_bytes("".join(line + ending for line in lines).encode())
@@ -83,11 +83,11 @@ def test_like_python_can(ending: str, tmp_path: Path) -> None:
         assert stamp * 1e-9 == pytest.approx(message.timestamp, abs=1e-6)
         assert log.channels.names[channel] == message.channel
     sent = np.concatenate([c.sent for c in chunks]).tolist()
-    said = {"R": RECEIVED, "T": SENT}
-    assert sent == [said.get(line[-1], NOT_SAID) if line[-2] == " " else NOT_SAID for line in lines]
+    directions = {"R": RECEIVED, "T": SENT}
+    assert sent == [directions.get(line[-1], NO_DIRECTION) if line[-2] == " " else NO_DIRECTION for line in lines]
 
 
-def test_the_size_of_chunks_makes_no_difference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunk_size_does_not_change_the_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "random.log"
     path.write_text("".join(f"{line}\n" for line in random_lines(2, 800)))
 
@@ -121,7 +121,7 @@ def test_the_size_of_chunks_makes_no_difference(tmp_path: Path, monkeypatch: pyt
         ("(1700000000.000001) a-very-long-channel-name-indeed 123#11", {"channel": "a-very-long-channel-name-indeed"}),
     ],
 )
-def test_lines_of_every_shape(line: str, expected: dict[str, object]) -> None:
+def test_lines_of_every_format_are_read(line: str, expected: dict[str, object]) -> None:
     frame, readable = one(line)
     assert readable
     assert {key: frame[key] for key in expected} == expected
@@ -152,8 +152,8 @@ def test_lines_of_every_shape(line: str, expected: dict[str, object]) -> None:
         "(1700000000.000000) vcan0 4000000F#00",
     ],
 )
-def test_what_is_no_frame_is_counted(line: str) -> None:
-    """Alone, and between good lines, which must all survive."""
+def test_lines_that_are_no_frame_are_counted(line: str) -> None:
+    """The line is rejected alone and between valid lines, which are all read."""
     good = "(1700000000.000000) left_leg 181##1AABB R"
     assert one(line) == ({}, False)
     for lines in ([line, good, good], [good, line, good], [good, good, line]):
@@ -163,14 +163,14 @@ def test_what_is_no_frame_is_counted(line: str) -> None:
         assert bool((result.chunk.frames["can_id"] == 0x181).all())
 
 
-def test_blank_lines_are_nothing() -> None:
+def test_blank_lines_are_ignored() -> None:
     result, _ = parsed("\n  \n(1700000000.000000) left_leg 181##1AABB R\n\n")
     assert (len(result.chunk), result.unreadable) == (1, 0)
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_no_damage_makes_a_wrong_frame(seed: int) -> None:
-    """One changed byte a line: the line is still read as python-can reads it, or counted as unreadable; never another frame."""
+def test_damaged_lines_never_give_a_wrong_frame(seed: int) -> None:
+    """A line with one changed byte is read as by `parse_simply`, or counted as unreadable."""
     generator = np.random.default_rng(seed)
     lines = random_lines(seed, 400)
     damaged = []
@@ -188,11 +188,11 @@ def test_no_damage_makes_a_wrong_frame(seed: int) -> None:
     assert [n[c.channels[0]] for c, n in kept] == [names[k] for k in result.chunk.channels.tolist()]
     readable = [line for line, (single, _) in zip(damaged, alone, strict=True) if len(single.chunk)]
     for line, frame, stamp in zip(readable, result.chunk.frames, result.chunk.stamps.tolist(), strict=True):
-        assert plainly(line.decode()) == (stamp, int(frame["can_id"]), frame["data"][: frame["len"]].tobytes())
+        assert parse_simply(line.decode()) == (stamp, int(frame["can_id"]), frame["data"][: frame["len"]].tobytes())
 
 
-def plainly(line: str) -> tuple[int, int, bytes]:
-    """A line read the simple way, one part after the other; raises on what is no frame."""
+def parse_simply(line: str) -> tuple[int, int, bytes]:
+    """Parse a line part by part; raise an exception if it is no frame."""
     time, _, frame, *direction = line.split()
     assert time[0] + time[-1] == "()"
     assert direction in ([], ["R"], ["T"], ["r"], ["t"])
@@ -211,8 +211,8 @@ def plainly(line: str) -> tuple[int, int, bytes]:
     return int(seconds) * 10**9 + int(decimals.ljust(9, "0")), number, bytes.fromhex(data)
 
 
-def test_times_of_changing_width(tmp_path: Path) -> None:
-    """Virtual time begins at 0 and grows a digit now and then."""
+def test_seconds_with_different_numbers_of_digits_are_read(tmp_path: Path) -> None:
+    """Virtual time begins at 0, so the number of its digits grows."""
     path = tmp_path / "virtual.log"
     stamps = [0, 1, 999_999, 9_999_999, 10_000_000, 99_999_999, 100_000_000, 1_234_567_890]
     path.write_text("".join(f"({s // 10**6}.{s % 10**6:06d}) can0 100#00\n" for s in stamps))
@@ -220,7 +220,7 @@ def test_times_of_changing_width(tmp_path: Path) -> None:
     assert chunk.stamps.tolist() == [s * 1000 for s in stamps]
 
 
-def test_a_line_longer_than_any_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_line_longer_than_the_buffer_is_unreadable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(log_module, "_PIECE_BYTES", 512)
     path = tmp_path / "long.log"
     path.write_text("(0.000001) can0 100#00\n" + "x" * 2000 + "\n(0.000002) can0 100#00\n")
@@ -234,7 +234,7 @@ def read(path: Path) -> tuple[Log, list[Chunk]]:
     return log, list(log.chunks())
 
 
-def test_compressed_logs(tmp_path: Path) -> None:
+def test_compressed_log_is_read_up_to_its_truncation(tmp_path: Path) -> None:
     import gzip
 
     lines = "".join(f"{line}\n" for line in random_lines(3, 4000))

@@ -1,4 +1,4 @@
-"""`atalante decode` against cantools: every value in Parquet and in MCAP, for our network and for foreign ones."""
+"""Command `atalante decode` against cantools: every value in Parquet and MCAP, for the robot and for foreign networks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from atalante_tools.decode.mcap import encode
 COLLECTION = sorted(Path(__file__).with_name("foreign").glob("*.dbc"))
 BEGIN = 1_700_000_000.0
 
-#: What a decoder may say about one signal of one message, in order of time.
+#: (message, signal) -> (time [s], value) in order of time.
 Series = dict[tuple[str, str], list[tuple[float, Any]]]
 
 
@@ -34,7 +34,7 @@ def run(*arguments: object) -> Result:
 
 
 def random_log(dbc: Path, path: Path, count: int) -> tuple[Path, Series]:
-    """A log of random payloads, and what cantools makes of it."""
+    """Write a log of random payloads; return its path and the values that cantools decodes."""
     generator = np.random.default_rng(count)
     database = cantools.database.load_file(dbc, strict=False)
     layouts = catalogue(dbc).layouts
@@ -60,7 +60,7 @@ def random_log(dbc: Path, path: Path, count: int) -> tuple[Path, Series]:
 
 
 def _decode(message: Any, data: bytes) -> dict[str, Any]:
-    """What cantools decodes; with an undefined multiplexer, the signals that are always there."""
+    """Return the values that cantools decodes; nothing for an undefined multiplexer."""
     try:
         return dict(message.decode(data, decode_choices=False))
     except cantools.database.DecodeError:
@@ -111,7 +111,7 @@ def read_mcap(path: Path) -> Series:
 
 
 @pytest.mark.parametrize("dbc", [*COLLECTION, atalante_dbc.DBC_FILE], ids=lambda path: path.stem)
-def test_parquet_like_cantools(dbc: Path, tmp_path: Path) -> None:
+def test_parquet_values_are_equal_to_cantools(dbc: Path, tmp_path: Path) -> None:
     log, expected = random_log(dbc, tmp_path / "random.log", 300)
     result = run("decode", log, "--dbc", dbc, "-o", tmp_path / "out.parquet")
     assert result.exit_code == 0
@@ -119,7 +119,7 @@ def test_parquet_like_cantools(dbc: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("dbc", [*COLLECTION, atalante_dbc.DBC_FILE], ids=lambda path: path.stem)
-def test_mcap_like_cantools(dbc: Path, tmp_path: Path) -> None:
+def test_mcap_values_are_equal_to_cantools(dbc: Path, tmp_path: Path) -> None:
     log, expected = random_log(dbc, tmp_path / "random.log", 300)
     result = run("decode", log, "--dbc", dbc, "-o", tmp_path / "out.mcap")
     assert result.exit_code == 0
@@ -128,7 +128,7 @@ def test_mcap_like_cantools(dbc: Path, tmp_path: Path) -> None:
     assert check(found, {k: v for k, v in expected.items() if k not in wide}) > 200
 
 
-def test_columns_of_the_table(tmp_path: Path) -> None:
+def test_parquet_has_the_documented_columns(tmp_path: Path) -> None:
     log, _ = random_log(atalante_dbc.DBC_FILE, tmp_path / "random.log", 200)
     run("decode", log, "-o", tmp_path / "out.parquet")
     table = pq.read_table(tmp_path / "out.parquet")
@@ -144,7 +144,7 @@ def test_columns_of_the_table(tmp_path: Path) -> None:
         assert row["channel"] == "can1"
 
 
-def test_several_logs_and_what_is_left_out(tmp_path: Path) -> None:
+def test_skipped_frames_of_several_logs_are_counted(tmp_path: Path) -> None:
     log, expected = random_log(atalante_dbc.DBC_FILE, tmp_path / "first.log", 200)
     values = sum(map(len, expected.values()))
     second = tmp_path / "second.log"
@@ -160,16 +160,16 @@ def test_several_logs_and_what_is_left_out(tmp_path: Path) -> None:
     assert result.exit_code == 0
     assert f"{2 * values} values of 400 frames" in result.stderr
     for sentence in (
-        "1 frames of identifiers that the DBC does not have",
-        "2 frames that carry no data",
-        "1 frames shorter than their message",
+        "1 frames with an identifier that is not in the DBC",
+        "2 frames without data",
+        "1 frames shorter than the message in the DBC",
         "1 lines that are no CAN frame",
     ):
         assert sentence in result.stderr
     assert pq.read_metadata(tmp_path / "out.parquet").num_rows == 2 * values
 
 
-def test_several_chunks_and_channels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_several_chunks_and_channels_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from atalante_tools.validate import log as log_module
 
     monkeypatch.setattr(log_module, "_PIECE_BYTES", 4096)
@@ -192,7 +192,7 @@ def test_several_chunks_and_channels(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert {"/can/LEFT_FH_STATE", "/can/can1/LEFT_FH_STATE"} <= topics
 
 
-def test_nothing_to_decode(tmp_path: Path) -> None:
+def test_log_without_known_messages_fails(tmp_path: Path) -> None:
     log = tmp_path / "empty.log"
     log.write_text("(1700000001.000000) can1 7FF##100\n")
     assert run("decode", log, "-o", tmp_path / "out.parquet").exit_code == 1
@@ -208,32 +208,32 @@ def test_nothing_to_decode(tmp_path: Path) -> None:
         ("no/out.mcap", 1, "cannot be written"),
     ],
 )
-def test_a_wrong_target_gets_a_sentence(out: str, code: int, sentence: str, tmp_path: Path) -> None:
+def test_wrong_output_path_is_reported(out: str, code: int, sentence: str, tmp_path: Path) -> None:
     log, _ = random_log(atalante_dbc.DBC_FILE, tmp_path / "random.log", 100)
     result = run("decode", log, "-o", tmp_path / out)
     assert result.exit_code == code
     assert sentence in result.stderr
 
 
-def test_a_missing_log_gets_a_sentence(tmp_path: Path) -> None:
+def test_missing_log_is_reported(tmp_path: Path) -> None:
     result = run("decode", tmp_path / "none.log", "-o", tmp_path / "out.parquet")
     assert result.exit_code == 1
-    assert "there is no log" in result.stderr
+    assert "none.log does not exist" in result.stderr
     assert not (tmp_path / "out.parquet").exists()
 
 
-def test_refused_messages_are_named(tmp_path: Path) -> None:
+def test_unsupported_messages_are_named(tmp_path: Path) -> None:
     dbc = tmp_path / "foreign.dbc"
     dbc.write_text('VERSION ""\nBS_:\nBU_: A\n\nBO_ 1 Long: 16 A\n SG_ S : 0|65@1+ (1,0) [0|0] "" A\n')
     log = tmp_path / "a.log"
     log.write_text("(1.000000) can0 001##1" + "00" * 16 + "\n")
     result = run("decode", log, "--dbc", dbc, "-o", tmp_path / "out.parquet")
     assert "Long is not decoded: S has 65 bits" in result.stderr
-    assert "1 frames of messages that are not supported" in result.stderr
+    assert "1 frames of messages with an unsupported layout" in result.stderr
 
 
-def test_encoding_of_many_fields() -> None:
-    """Field numbers above 15 take two bytes of tag, above 2047 three."""
+def test_field_numbers_with_long_tags_are_encoded() -> None:
+    """Field numbers above 15 have tags of two bytes, above 2047 of three."""
     numbers = [1, 15, 16, 300, 2047, 2048]
     files = descriptor_pb2.FileDescriptorProto(name="m.proto", package="p")
     message = files.message_type.add(name="M")
@@ -250,7 +250,7 @@ def test_encoding_of_many_fields() -> None:
 
 @pytest.mark.parametrize("suffix", ["mcap", "parquet"])
 @pytest.mark.parametrize(("error", "code"), [(OSError(28, "No space left on device"), 1), (KeyboardInterrupt(), 130)])
-def test_what_does_not_become_whole_leaves_the_file_of_before(
+def test_failed_write_leaves_the_previous_file(
     suffix: str, error: BaseException, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log, _ = random_log(COLLECTION[0], tmp_path / "random.log", 20)

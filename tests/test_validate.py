@@ -1,4 +1,4 @@
-"""`atalante validate` from outside: log formats, damaged logs, live buses, reports, the rules file, what was not judged."""
+"""Command `atalante validate`: log formats, damaged logs, live buses, reports, the rules file, list of unchecked items."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from atalante_hal.codec import Codec
 from atalante_hal.e2e import crc, data_id_bytes
 from atalante_hal.frame import FRAME, Frames, new_frames
 from atalante_tools.cli import cli
-from atalante_tools.validate.chunk import NOT_SAID, Chunk
-from atalante_tools.validate.judge import Judge
+from atalante_tools.validate.chunk import NO_DIRECTION, Chunk
+from atalante_tools.validate.judge import Validator
 from atalante_tools.validate.log import LogError, open_log
 from atalante_tools.validate.plan import Plan
 from atalante_tools.validate.project import Project, ProjectError, load_project
@@ -35,7 +35,7 @@ NETWORK = atalante_dbc.load()
 HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: A B\n\n'
 BEGIN = 1_700_000_000.0
 
-#: A network of somebody else: classic CAN, no bus, no E2E, cycle times.
+#: DBC of a foreign network: classic CAN with cycle times, without buses and E2E.
 FOREIGN = (
     HEAD
     + """BO_ 256 Speed: 8 A
@@ -60,7 +60,7 @@ VAL_ 256 Gear 0 "P" 1 "R" 2 "N" 3 "D" 5 "S" ;
 
 
 def node_frames(cycles: int) -> list[can.Message]:
-    """What the node LEFT_FH says for a while: its state every millisecond, its status every 100."""
+    """Return the messages of the node LEFT_FH: its state every millisecond, its status every 100 ms."""
     noise = np.random.default_rng(0)
     found = []
     for cycle in range(cycles):
@@ -106,7 +106,7 @@ def write(path: Path, messages: list[can.Message]) -> Path:
 
 
 def run(*arguments: object) -> Result:
-    """The command as a user types it; an exception that is no exit code is a defect."""
+    """Run the command; any exception but an exit code fails the test."""
     result = CliRunner().invoke(cli, [str(argument) for argument in arguments])
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     return result
@@ -130,7 +130,7 @@ def good(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".mf4", ".log.gz", ".asc.gz"])
-def test_every_format_is_judged_the_same(suffix: str, tmp_path: Path) -> None:
+def test_every_log_format_gives_the_same_findings(suffix: str, tmp_path: Path) -> None:
     damaged = [m for m in MESSAGES if m.arbitration_id != 0x181 or not 0.2 <= m.timestamp - BEGIN <= 0.201]
     damaged[50].data[5] ^= 1
     try:
@@ -145,14 +145,14 @@ def test_every_format_is_judged_the_same(suffix: str, tmp_path: Path) -> None:
     assert result.exit_code == 1
 
 
-def test_csv_has_no_flags_and_the_report_says_so(tmp_path: Path) -> None:
+def test_report_lists_the_flag_rules_as_unchecked_for_csv(tmp_path: Path) -> None:
     result = run("validate", write(tmp_path / "night.csv", MESSAGES), "--node", "LEFT_FH")
     assert result.exit_code == 0
     assert "frame-fdf, frame-brs, frame-esi: this log format does not keep CAN FD flags" in result.stdout
 
 
-def test_trc(tmp_path: Path) -> None:
-    """python-can writes no CAN FD into .trc; a classic network does."""
+def test_trc_log_has_no_findings(tmp_path: Path) -> None:
+    """Use a classic network, because python-can writes no CAN FD frames into .trc."""
     dbc = tmp_path / "foreign.dbc"
     dbc.write_text(FOREIGN)
     messages = [
@@ -167,7 +167,7 @@ def test_trc(tmp_path: Path) -> None:
 # -- damaged logs ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_truncated_line_is_not_judged_and_everything_before_it_is(good: Path) -> None:
+def test_all_lines_before_a_truncated_line_are_checked(good: Path) -> None:
     good.write_bytes(good.read_bytes()[:-10])
     result = run("validate", good, "--node", "LEFT_FH")
     assert "ends within a line" in result.stdout
@@ -178,11 +178,11 @@ def test_a_truncated_line_is_not_judged_and_everything_before_it_is(good: Path) 
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # asammdf leaves a damaged file open
 @pytest.mark.parametrize("suffix", [".asc", ".blf", ".mf4", ".log", ".csv"])
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.5, 0.97])
-def test_a_broken_off_log_gets_a_sentence(suffix: str, share: float, tmp_path: Path) -> None:
+def test_truncated_log_is_reported(suffix: str, share: float, tmp_path: Path) -> None:
     path = write(tmp_path / f"night{suffix}", MESSAGES)
     whole = path.read_bytes()
     cut = int(share * len(whole))
-    path.write_bytes(whole[: cut - (whole[cut - 1 : cut] == b"\n")])  # at the end of a line nobody could notice
+    path.write_bytes(whole[: cut - (whole[cut - 1 : cut] == b"\n")])  # a cut at the end of a line cannot be detected
     result = run("validate", path, "--node", "LEFT_FH")
     assert result.exit_code == 1
     output = result.stdout + result.stderr
@@ -191,7 +191,7 @@ def test_a_broken_off_log_gets_a_sentence(suffix: str, share: float, tmp_path: P
 
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".mf4", ".trc", ".csv"])
 @pytest.mark.parametrize("content", [b"", b"\n", b"no log at all\n", bytes(range(256)) * 20])
-def test_what_is_no_log_gets_a_sentence(suffix: str, content: bytes, tmp_path: Path) -> None:
+def test_file_without_frames_is_reported(suffix: str, content: bytes, tmp_path: Path) -> None:
     path = tmp_path / f"strange{suffix}"
     path.write_bytes(content)
     result = run("validate", path)
@@ -201,7 +201,7 @@ def test_what_is_no_log_gets_a_sentence(suffix: str, content: bytes, tmp_path: P
     assert "Traceback" not in output
 
 
-def test_an_unsorted_log_is_sorted_and_judged(tmp_path: Path) -> None:
+def test_unsorted_log_is_sorted_and_checked(tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
     lines = write(tmp_path / "sorted.log", MESSAGES).read_text().splitlines()
     shuffled = tmp_path / "shuffled.log"
@@ -211,8 +211,8 @@ def test_an_unsorted_log_is_sorted_and_judged(tmp_path: Path) -> None:
     assert "not in order of time" in result.stderr
 
 
-def test_the_same_frames_on_two_channels(tmp_path: Path) -> None:
-    """A gateway, or a recording of both ends: the second copy is on the wrong bus, and the first is judged as always."""
+def test_copy_on_a_second_channel_is_on_the_wrong_bus(tmp_path: Path) -> None:
+    """A gateway copies the frames: only the copies are reported."""
     twice = [m for message in MESSAGES for m in (message, _on(message, 1))]
     result = run("validate", write(tmp_path / "twice.blf", twice), "--node", "LEFT_FH", "--json")
     assert rules_of(result) == {"wrong-bus"}
@@ -224,54 +224,56 @@ def _on(message: can.Message, channel: int) -> can.Message:
     return copy
 
 
-def test_a_babbling_node_with_ever_new_identifiers(plan: Plan) -> None:
-    """Thousands of identifiers are a hundred findings and the rest in one, in no time."""
+def test_unknown_identifiers_beyond_one_hundred_are_combined(plan: Plan) -> None:
+    """20,000 frames with random identifiers give 100 findings and one for all other identifiers."""
     generator = np.random.default_rng(0)
     frames = new_frames(20_000)
     frames["can_id"] = generator.integers(0, 1 << 29, len(frames)).astype(np.uint32) | np.uint32(1 << 31)
     frames["can_id"][:500] = 0x7E0
-    judge = Judge(plan)
+    validator = Validator(plan)
     stamps = np.arange(len(frames), dtype=np.int64) * 1000
-    judge.judge(Chunk(frames, stamps, np.zeros(len(frames), np.uint8), np.full(len(frames), NOT_SAID, np.int8)), ["a"])
-    judge.finish()
-    found = [finding for finding in judge.findings.all() if finding.rule == "unknown-id"]
+    validator.check(
+        Chunk(frames, stamps, np.zeros(len(frames), np.uint8), np.full(len(frames), NO_DIRECTION, np.int8)), ["a"]
+    )
+    validator.finish()
+    found = [finding for finding in validator.findings.all() if finding.rule == "unknown-id"]
     assert len(found) == 101
     assert sum(finding.count for finding in found) == len(frames)
     assert max(found, key=lambda f: f.count if f.message != "(others)" else 0).message == "0x7e0"
 
 
-def test_many_channel_names_are_no_overflow(tmp_path: Path) -> None:
+def test_log_with_400_channel_names_is_read(tmp_path: Path) -> None:
     path = tmp_path / "names.log"
     path.write_text("".join(f"({k}.000000) ch{k} 7FF#00\n" for k in range(400)))
     result = run("validate", path)
     assert "400 frames" in result.stdout
 
 
-def test_candump_on_the_terminal_is_no_log(tmp_path: Path) -> None:
+def test_terminal_output_of_candump_is_rejected_with_a_hint(tmp_path: Path) -> None:
     path = tmp_path / "terminal.log"
     path.write_text("  vcan0  181   [8]  11 22 33 44 55 66 77 88\n" * 3)
     result = run("validate", path)
     assert result.exit_code == 1
-    assert "a .log is what `candump -l` writes" in result.stdout
+    assert "a .log file must have the format of `candump -l`" in result.stdout
 
 
-def test_several_logs_one_of_which_is_missing(good: Path, tmp_path: Path) -> None:
+def test_missing_logs_do_not_stop_the_other_logs(good: Path, tmp_path: Path) -> None:
     result = run("validate", tmp_path / "none.log", good, tmp_path / "none.txt", "--node", "LEFT_FH")
     assert result.exit_code == 1
-    assert "there is no log" in result.stderr
-    assert "no suffix of a CAN log" in result.stderr
+    assert "none.log does not exist" in result.stderr
+    assert "the suffix of a CAN log must be one of" in result.stderr
     assert f"{len(MESSAGES)} frames" in result.stdout
 
 
-def test_open_log_says_what_is_valid(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match=r"use one of \.log, \.asc, \.blf"):
+def test_unknown_suffix_error_lists_the_valid_suffixes(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"must be one of \.log, \.asc, \.blf.*night\.pcap"):
         open_log(tmp_path / "night.pcap")
 
 
 # -- reports ---------------------------------------------------------------------------------------------------------------
 
 
-def test_json_objects_have_exactly_the_promised_keys(good: Path) -> None:
+def test_json_objects_have_exactly_the_documented_keys(good: Path) -> None:
     result = run("validate", good, "--json")
     lines = [json.loads(line) for line in result.stdout.splitlines()]
     assert lines
@@ -279,11 +281,11 @@ def test_json_objects_have_exactly_the_promised_keys(good: Path) -> None:
         assert set(line) == {"rule", "message", "node", "count", "first_s", "last_s", "worst"}
         assert line["rule"] == "never-seen"
         assert line["first_s"] == pytest.approx(BEGIN, abs=1.0)
-    # One node on the desk, on one channel: its bus is taken to be left_leg, and the rest of that bus is missing.
+    # The only channel has frames of left_leg, so the other messages of left_leg are missing.
     assert {line["node"] for line in lines} == {"HAL", *(f"LEFT_{j}" for j in ("TH", "SH", "SK", "SA", "HA"))}
 
 
-def test_junit(good: Path, tmp_path: Path) -> None:
+def test_junit_has_one_case_per_rule(good: Path, tmp_path: Path) -> None:
     path = tmp_path / "result.xml"
     run("validate", good, "--junit", path)
     (suite,) = ET.parse(path).getroot()
@@ -298,7 +300,7 @@ def test_junit(good: Path, tmp_path: Path) -> None:
 
 
 class _Outside(HTMLParser):
-    """Everything a page would ask somebody else for."""
+    """Collect the tags of a page and its links to other resources."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -310,7 +312,7 @@ class _Outside(HTMLParser):
         self.asked += [f"{tag} {name}={value}" for name, value in attrs if name in ("src", "href", "action", "srcset")]
 
 
-def test_html_has_the_plots_and_asks_nobody(good: Path, tmp_path: Path) -> None:
+def test_html_has_the_plots_and_no_external_resources(good: Path, tmp_path: Path) -> None:
     lines = good.read_text().splitlines(keepends=True)
     good.write_text("".join(lines[:200] + lines[203:]))
     path = tmp_path / "night.html"
@@ -327,26 +329,26 @@ def test_html_has_the_plots_and_asks_nobody(good: Path, tmp_path: Path) -> None:
     assert "url(" not in page
 
 
-def test_a_report_that_cannot_be_written(good: Path) -> None:
+def test_report_to_a_full_device_fails_with_one_line(good: Path) -> None:
     result = run("validate", good, "--node", "LEFT_FH", "--html", "/dev/full")
     assert result.exit_code == 1
     assert result.stderr == "atalante: /dev/full cannot be written: No space left on device\n"
 
 
-def test_text_explains_the_rules_that_were_broken(good: Path) -> None:
+def test_text_report_explains_the_violated_rules(good: Path) -> None:
     result = run("validate", good)
-    assert "never-seen: A cyclic message that is not in the log at all [BA_ GenMsgCycleTime]" in result.stdout
+    assert "never-seen: A cyclic message is not in the log [BA_ GenMsgCycleTime]" in result.stdout
     assert "LEFT_TH_STATE" in result.stdout
 
 
-def test_list_rules() -> None:
+def test_list_rules_prints_every_rule() -> None:
     result = run("validate", "--list-rules")
     assert result.exit_code == 0
     for rule in RULES:
         assert rule.id in result.stdout
 
 
-def test_list_rules_for_scripts() -> None:
+def test_list_rules_as_json_has_every_threshold() -> None:
     listed = [json.loads(line) for line in run("validate", "--list-rules", "--json").stdout.splitlines()]
     assert [rule["rule"] for rule in listed] == [rule.id for rule in RULES]
     assert all(rule["meaning"] and rule["source"] for rule in listed)
@@ -356,22 +358,22 @@ def test_list_rules_for_scripts() -> None:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ((), "name one or more logs, or a bus"),
-        (("a.log", "-i", "virtual", "-c", "x"), "name one or more logs, or a bus"),
+        ((), "name one or more logs, or a live bus"),
+        (("a.log", "-i", "virtual", "-c", "x"), "name one or more logs, or a live bus"),
         (("-i", "virtual"), "virtual needs a channel"),
-        (("a.log", "--node", "NOBODY"), "no message of the DBC is sent by 'NOBODY'"),
+        (("a.log", "--node", "NO_NODE"), "--node must be a sender in the DBC"),
     ],
 )
-def test_usage(arguments: tuple[str, ...], sentence: str) -> None:
+def test_wrong_arguments_give_a_usage_error(arguments: tuple[str, ...], sentence: str) -> None:
     result = run("validate", *arguments)
     assert result.exit_code == 2
     assert sentence in result.stderr
 
 
-# -- what was not judged ---------------------------------------------------------------------------------------------------
+# -- unchecked items -------------------------------------------------------------------------------------------------------
 
 
-def test_a_foreign_network_is_judged_as_far_as_its_dbc_goes(tmp_path: Path) -> None:
+def test_foreign_network_is_checked_within_its_dbc(tmp_path: Path) -> None:
     dbc = tmp_path / "foreign.dbc"
     dbc.write_text(FOREIGN)
     messages = [
@@ -395,13 +397,13 @@ def test_a_foreign_network_is_judged_as_far_as_its_dbc_goes(tmp_path: Path) -> N
         "the DBC has no attribute Bus",
         "no cyclic message SYNC",
         "no message has a signal DriveState",
-        "no rule looked at the values of these signals (1): Speed.Raw",
-        "not in the log, and need not be (1): Event",
+        "no rule checked the values of these signals (1): Speed.Raw",
+        "not in the log and not required (1): Event",
     ):
         assert sentence in result.stderr
 
 
-def test_refused_messages_are_named(tmp_path: Path) -> None:
+def test_unsupported_messages_are_named(tmp_path: Path) -> None:
     dbc = tmp_path / "foreign.dbc"
     dbc.write_text(HEAD + 'BO_ 1 Long: 16 A\n SG_ S : 0|65@1+ (1,0) [0|0] "" B\n')
     messages = [
@@ -414,14 +416,14 @@ def test_refused_messages_are_named(tmp_path: Path) -> None:
     assert "S has 65 bits" in result.stdout
 
 
-def test_no_log_is_called_good_without_saying_what_was_not_judged(good: Path) -> None:
+def test_report_without_findings_lists_the_unchecked_signals(good: Path) -> None:
     result = run("validate", good, "--node", "LEFT_FH")
     assert result.exit_code == 0
     assert "LEFT_FH_STATUS.FirmwareVersion" in result.stdout
-    assert result.stdout.splitlines()[-1] == "no findings; what is listed as not judged was not looked at"
+    assert result.stdout.splitlines()[-1] == "no findings; see above for the items that were not checked"
 
 
-def test_j1939_groups_of_several_senders_have_no_common_cycle(tmp_path: Path) -> None:
+def test_j1939_groups_of_several_senders_have_no_timing_findings(tmp_path: Path) -> None:
     dbc = Path(__file__).with_name("foreign") / "j1939.dbc"
     messages = [
         can.Message(
@@ -430,11 +432,11 @@ def test_j1939_groups_of_several_senders_have_no_common_cycle(tmp_path: Path) ->
         for k in range(20)
     ]
     result = run("validate", write(tmp_path / "truck.log", messages), "--dbc", dbc)
-    assert "parameter groups that several addresses send (1): CCVS" in result.stdout
+    assert "parameter groups with several sender addresses (1): CCVS" in result.stdout
     assert "unknown-id" not in result.stdout
 
 
-# -- the project's rules file ----------------------------------------------------------------------------------------------
+# -- rules file of a project -----------------------------------------------------------------------------------------------
 
 
 def test_silenced_findings_are_reported_as_silenced(good: Path, tmp_path: Path) -> None:
@@ -458,7 +460,7 @@ def test_thresholds_change_what_is_found(good: Path, tmp_path: Path) -> None:
     assert rules_of(result) == {"cycle-fast"}
 
 
-def test_channels_can_be_named(tmp_path: Path) -> None:
+def test_channels_are_assigned_to_buses(tmp_path: Path) -> None:
     rules = tmp_path / "rules.toml"
     rules.write_text('[channels]\n0 = "right_leg"\n')
     path = write(tmp_path / "night.blf", MESSAGES)
@@ -467,30 +469,30 @@ def test_channels_can_be_named(tmp_path: Path) -> None:
     rules.write_text('[channels]\n0 = "middle_leg"\n')
     result = run("validate", path, "--rules", rules)
     assert result.exit_code == 2
-    assert "names the bus 'middle_leg'; the DBC has left_leg" in result.stderr
+    assert "[channels] must name buses of the DBC (left_leg" in result.stderr
 
 
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        ("[no-rule]\nx = 1\n", "there is no rule 'no-rule'"),
+        ("[no-rule]\nx = 1\n", "a rule must be one of log-empty, .*, got 'no-rule'"),
         ("[crc]\nx = 1\n", "crc has no threshold"),
-        ("[cycle-gap]\nx = 1\n", "cycle-gap has no threshold 'x'; it has cycles"),
-        ("[cycle-gap]\ncycles = -1\n", "not negative"),
-        ("[cycle-gap]\ncycles = 'two'\n", "is a number"),
-        ("[cycle-gap]\ncycles = nan\n", "is a number"),
-        ("[stuck]\ngroups = 'Gyro'\n", "list of names"),
-        ("[velocity]\nposition = 3\n", "is a name"),
-        ("[[silence]]\nrule = 'crc'\n", "needs a reason"),
-        ("[[silence]]\nrule = 'crc'\nreason = ' '\n", "needs a reason"),
-        ("[[silence]]\nrule = 'what'\nreason = 'x'\n", "names one of the rules"),
-        ("[[silence]]\nrule = 'crc'\nwhy = 'x'\n", "has the keys rule, message, reason"),
-        ("silence = 1\n", "list of tables"),
-        ("channels = 1\n", "name of a bus"),
+        ("[cycle-gap]\nx = 1\n", "a threshold of cycle-gap must be one of cycles, got 'x'"),
+        ("[cycle-gap]\ncycles = -1\n", "must be a number of at least 0, got -1"),
+        ("[cycle-gap]\ncycles = 'two'\n", "must be a number of at least 0, got 'two'"),
+        ("[cycle-gap]\ncycles = nan\n", "must be a number of at least 0, got nan"),
+        ("[stuck]\ngroups = 'Gyro'\n", "must be a list of names, got 'Gyro'"),
+        ("[velocity]\nposition = 3\n", "must be a name, got 3"),
+        ("[[silence]]\nrule = 'crc'\n", "must have a reason"),
+        ("[[silence]]\nrule = 'crc'\nreason = ' '\n", "must have a reason"),
+        ("[[silence]]\nrule = 'what'\nreason = 'x'\n", "must be one of log-empty, .*, got 'what'"),
+        ("[[silence]]\nrule = 'crc'\nwhy = 'x'\n", "must have only the keys rule, message, reason"),
+        ("silence = 1\n", "must be a list of tables"),
+        ("channels = 1\n", "must assign the name of a bus"),
         ("[", "cannot be read as TOML"),
     ],
 )
-def test_a_wrong_rules_file_is_refused_by_key(content: str, sentence: str, tmp_path: Path) -> None:
+def test_wrong_rules_file_is_rejected_by_key(content: str, sentence: str, tmp_path: Path) -> None:
     path = tmp_path / "rules.toml"
     path.write_text(content)
     with pytest.raises(ProjectError, match=sentence):
@@ -500,8 +502,8 @@ def test_a_wrong_rules_file_is_refused_by_key(content: str, sentence: str, tmp_p
 # -- live ------------------------------------------------------------------------------------------------------------------
 
 
-def test_a_live_bus(plan: Plan) -> None:
-    """A node that sends while the command listens; every fifth frame is damaged."""
+def test_damaged_frames_of_a_live_bus_are_reported(plan: Plan) -> None:
+    """A node sends while the command listens; every fifth frame is damaged."""
     sender = can.Bus(interface="virtual", channel="validate", protocol=can.CanProtocol.CAN_FD)
     done = threading.Event()
 
@@ -530,7 +532,7 @@ def test_a_live_bus(plan: Plan) -> None:
 
 
 class Played:
-    """A bus that plays frames, a few a `receive`, and then fails or falls silent."""
+    """Bus that returns up to 37 recorded frames per `receive`, then fails or stays empty."""
 
     name = "played"
     dropped = 3
@@ -552,7 +554,7 @@ class Played:
         return self._at >= len(self._chunk)
 
     def send(self, frames: Frames) -> None:
-        raise AssertionError("a validator sends nothing")
+        raise AssertionError("the validator must not send frames")
 
     def close(self) -> None:
         pass
@@ -560,27 +562,27 @@ class Played:
 
 @pytest.mark.parametrize("fails", [False, True])
 @pytest.mark.parametrize("count", [1, 2])
-def test_listening_is_like_reading(fails: bool, count: int, good: Path, plan: Plan) -> None:
-    """The same frames from a bus, or from two, trip what a log of them trips, and what the bus lost is a finding."""
+def test_live_bus_gives_the_findings_of_its_log(fails: bool, count: int, good: Path, plan: Plan) -> None:
+    """One or two buses with the frames of a log give its findings; frames lost by the bus are also reported."""
     (chunk,) = open_log(good).chunks()
-    halves = [chunk.select(np.flatnonzero(np.arange(len(chunk)) % count == place)) for place in range(count)]
-    buses = {f"can{place}": Played(half, fails) for place, half in enumerate(halves)}
+    halves = [chunk.select(np.flatnonzero(np.arange(len(chunk)) % count == number)) for number in range(count)]
+    buses = {f"can{number}": Played(half, fails) for number, half in enumerate(halves)}
     result = listen(
         buses,
         plan,
         Project(),
         name="played",
-        over=lambda: not fails and all(bus.ended for bus in buses.values()),
+        stopped=lambda: not fails and all(bus.ended for bus in buses.values()),
         node="LEFT_FH",
     )
-    assert result.judge.frames == len(chunk)
+    assert result.validator.frames == len(chunk)
     rules = {finding.rule for finding in result.findings}
     assert "dropped" in rules
     assert ("log-truncated" in rules) == fails
     assert (rules - {"dropped", "log-truncated"} == set()) == (count == 1)
 
 
-def test_a_bus_that_is_not_there() -> None:
+def test_missing_bus_gives_exit_code_3() -> None:
     result = run("validate", "-i", "nonsense", "-c", "x")
     assert result.exit_code == 3
 
@@ -599,20 +601,19 @@ def test_jitter_is_the_distance_from_the_median() -> None:
     assert jitter_p99(shifted) == pytest.approx(0.3)
 
 
-def test_nothing_is_judged_in_an_empty_log(plan: Plan) -> None:
-    judge = Judge(plan)
-    judge.judge(Chunk(np.zeros(0, FRAME), np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros(0, np.int8)), [])
-    judge.finish()
-    result = report("nothing", judge)
+def test_log_without_frames_is_not_approved(plan: Plan) -> None:
+    validator = Validator(plan)
+    validator.check(Chunk(np.zeros(0, FRAME), np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros(0, np.int8)), [])
+    validator.finish()
+    result = report("nothing", validator)
     assert result.findings == ()
-    assert text(result).splitlines()[-1] == "nothing was judged"
+    assert text(result).splitlines()[-1] == "no frame was checked"
 
 
-def test_no_garbage_raises(plan: Plan) -> None:
-    """Any bytes at all in the records of a chunk are judged without an exception."""
+def test_random_records_are_checked_without_an_exception(plan: Plan) -> None:
     generator = np.random.default_rng(0)
     for count in (1, 2, 700):
-        judge = Judge(plan)
+        validator = Validator(plan)
         for _ in range(3):
             frames: Frames = generator.integers(0, 256, count * FRAME.itemsize, dtype=np.uint8).view(FRAME)
             known = generator.integers(0, 2, count) > 0
@@ -622,7 +623,7 @@ def test_no_garbage_raises(plan: Plan) -> None:
             frames["len"] = generator.choice([8, 12, 16, 24, 32, 48, 3, 200], count)
             stamps = np.sort(generator.integers(0, 10**9, count))
             channels = generator.integers(0, 2, count).astype(np.uint8)
-            judge.judge(Chunk(frames, stamps, channels, np.full(count, NOT_SAID, np.int8)), ["a", "b"])
-        judge.finish()
-        assert judge.frames == 3 * count
-        assert len(judge.findings) > 0
+            validator.check(Chunk(frames, stamps, channels, np.full(count, NO_DIRECTION, np.int8)), ["a", "b"])
+        validator.finish()
+        assert validator.frames == 3 * count
+        assert len(validator.findings) > 0

@@ -1,4 +1,4 @@
-"""Each rule against a mutation of a good log that trips it and nothing else; the good log of a full run trips none."""
+"""Validator rules: each mutation of a valid log violates exactly one rule; the valid log of a run violates none."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from atalante_hal.frame import Frames
 from atalante_hal.types import Command, SupervisorState
 from atalante_tools.options import Target
 from atalante_tools.rig import open_hal
-from atalante_tools.validate.coverage import unjudged, unseen_signals
+from atalante_tools.validate.coverage import unchecked, unseen_signals
 from atalante_tools.validate.findings import Finding
-from atalante_tools.validate.judge import Judge
+from atalante_tools.validate.judge import Validator
 from atalante_tools.validate.log import open_log
 from atalante_tools.validate.plan import Plan
 from atalante_tools.validate.project import Project
@@ -29,7 +29,7 @@ from atalante_tools.validate.rules import RULE_OF
 NETWORK = atalante_dbc.load()
 MS = 1_000_000  # ns
 CYCLES = 1200
-#: A cycle in which the drives are enabled and the HAL is ACTIVE.
+#: Cycle in which the drives are enabled and the HAL is ACTIVE.
 MIDDLE = 800
 
 
@@ -43,7 +43,7 @@ class Line:
     data: bytes
     sent: bool
     flags: str = "#1"  # "" for a classic frame
-    text: str = ""  # written instead
+    text: str = ""  # replaces the whole line if not empty
 
     def __str__(self) -> str:
         seconds, rest = divmod(self.stamp, 10**9)
@@ -56,29 +56,31 @@ class Line:
 
 @dataclasses.dataclass
 class Recording:
-    """A log that tests may change: `of` finds the frames of a message."""
+    """Log that tests may change; `of` finds the frames of a message."""
 
     lines: list[Line]
 
     def copy(self) -> Recording:
         lines = ((e.stamp, e.channel, e.identifier, e.data, e.sent, e.flags, e.text) for e in self.lines)
-        return Recording(list(starmap(Line, lines)))  # `replace` takes three times as long, and a log has 30,000
+        return Recording(
+            list(starmap(Line, lines))
+        )  # `dataclasses.replace` takes three times as long, and a log has 30,000 lines
 
     def of(self, message: str) -> list[Line]:
         identifier = f"{NETWORK.message(message).frame_id:03X}"
         return [line for line in self.lines if line.identifier == identifier]
 
     def at(self, message: str, after: int = MIDDLE) -> Line:
-        """The first frame of a message behind the middle of the log."""
+        """Return the first frame of a message `after` cycles or more from the begin of the log."""
         return next(line for line in self.of(message) if line.stamp >= self.lines[0].stamp + after * MS)
 
     def behind(self, line: Line) -> list[Line]:
-        """Frames of the same message from this one on."""
+        """Return the frames of the same message from this frame to the end."""
         same = [other for other in self.lines if other.identifier == line.identifier]
         return same[[other is line for other in same].index(True) :]
 
     def insert(self, line: Line, new: Line) -> None:
-        """Put a line behind another."""
+        """Insert a line after another."""
         self.lines.insert([other is line for other in self.lines].index(True) + 1, new)
 
     def remove(self, lines: list[Line]) -> None:
@@ -90,7 +92,7 @@ class Recording:
 
 
 def set_raw(line: Line, message: str, signal: str, raw: int, data_id: int | None = None) -> None:
-    """Write the raw code of a signal into a frame and protect it again."""
+    """Write the raw code of a signal into a frame and update the CRC."""
     layout = NETWORK.message(message)
     field = layout.signal(signal)
     mask = (1 << field.length) - 1
@@ -109,7 +111,7 @@ def raw_of(line: Line, message: str, signal: str) -> int:
 
 
 class _Tap:
-    """Both directions, stamped with the cycle, as `atalante demo --can-log` records them."""
+    """Recorder of both directions, with stamps of the cycle, as in `atalante demo --can-log`."""
 
     def __init__(self) -> None:
         self.cycle = 0
@@ -149,29 +151,29 @@ def recording() -> Recording:
 
 def validate(
     lines: str, path: Path, plan: Plan, *, project: Project | None = None, pieces: int | None = None
-) -> tuple[Judge, list[Finding]]:
-    """Judge a log, in chunks of `pieces` frames if given."""
+) -> tuple[Validator, list[Finding]]:
+    """Check a log, in chunks of `pieces` frames if given."""
     path.write_text(lines)
-    judge = Judge(plan, project)
+    validator = Validator(plan, project)
     log = open_log(path)
     for chunk in log.chunks():
         width = pieces or len(chunk)
         for first in range(0, len(chunk), width):
-            judge.judge(chunk.select(np.arange(first, min(first + width, len(chunk)))), log.channels.names)
-    judge.finish(log.remarks)
-    return judge, judge.findings.all()
+            validator.check(chunk.select(np.arange(first, min(first + width, len(chunk)))), log.channels.names)
+    validator.finish(log.remarks)
+    return validator, validator.findings.all()
 
 
 def text_of(recording: Recording) -> str:
     return "".join(f"{line}\n" for line in recording.lines)
 
 
-# -- mutations: rule -> what is done to the good log -----------------------------------------------------------------------
+# -- mutations: rule -> change of the valid log ----------------------------------------------------------------------------
 
 
 @dataclasses.dataclass
 class Mutant:
-    """The changed log; `cut` characters are missing at its end."""
+    """Changed log; `cut` characters are missing at its end."""
 
     log: Recording
     cut: int = 0
@@ -374,7 +376,7 @@ def garbage(log: Recording) -> None:
 
 
 def exchanged(log: Recording) -> None:
-    """Two frames of different cycles, apart from their stamps, change places."""
+    """Move a frame behind frames with later stamps."""
     status, sync = log.at("LEFT_FH_STATUS"), log.at("SYNC_LEFT_LEG", MIDDLE + 150)
     log.remove([status])
     log.insert(sync, status)
@@ -388,7 +390,7 @@ def last_line(_log: Recording) -> None:
     pass
 
 
-#: Rule -> mutation. `MULTIPLEXED` and `REFUSED` are added to the network for the rules it has no message for.
+#: Rule -> mutation. `MULTIPLEXED` and `REFUSED` are added to the network for rules that need such messages.
 MUTATIONS: dict[str, Callable[[Recording], None]] = {
     "log-empty": nothing,
     "log-truncated": last_line,
@@ -460,7 +462,7 @@ def network() -> Plan:
 
 @pytest.fixture(scope="module")
 def extended_network(tmp_path_factory: pytest.TempPathFactory) -> Plan:
-    """Our network with a multiplexed message and one whose layout is not supported."""
+    """Return the network of the robot with a multiplexed message and a message with an unsupported layout."""
     path = tmp_path_factory.mktemp("dbc") / "extended.dbc"
     text = atalante_dbc.DBC_FILE.read_text()
     attributes = "".join(
@@ -474,8 +476,8 @@ def test_every_rule_has_a_mutation() -> None:
     assert set(MUTATIONS) == set(RULE_OF)
 
 
-def speak(log: Recording, hash32: int) -> None:
-    """Let all nodes report the hash of another DBC."""
+def set_dbc_hash(log: Recording, hash32: int) -> None:
+    """Replace the DBC hash that all nodes report."""
     for message in NETWORK.messages:
         if message.name.endswith("_STATUS"):
             for line in log.of(message.name):
@@ -486,7 +488,7 @@ def mutant_of(rule: str, recording: Recording, plan: Plan) -> str:
     log = recording.copy()
     MUTATIONS[rule](log)
     if plan.catalogue.hash32 != NETWORK.hash32:
-        speak(log, plan.catalogue.hash32)
+        set_dbc_hash(log, plan.catalogue.hash32)
     text = text_of(log)
     return text[:-20] if rule == "log-truncated" else text
 
@@ -495,36 +497,36 @@ def dbc_of(rule: str, network: Plan, extended_network: Plan) -> Plan:
     return extended_network if rule in ("unsupported", "multiplexer") else network
 
 
-def test_the_good_log_trips_nothing(
-    recording: Recording, network: Plan, extended_network: Plan, tmp_path: Path
-) -> None:
+def test_valid_log_has_no_findings(recording: Recording, network: Plan, extended_network: Plan, tmp_path: Path) -> None:
     for dbc in (network, extended_network):
         log = recording.copy()
-        speak(log, dbc.catalogue.hash32)
-        judge, found = validate(text_of(log), tmp_path / "good.log", dbc)
+        set_dbc_hash(log, dbc.catalogue.hash32)
+        validator, found = validate(text_of(log), tmp_path / "good.log", dbc)
         assert found == []
-        assert judge.frames == len(recording.lines)
+        assert validator.frames == len(recording.lines)
 
 
-def test_all_buses_on_one_channel(recording: Recording, network: Plan, tmp_path: Path) -> None:
-    """candump on vcan0: no finding, and the report says that buses and senders could not be told apart."""
+def test_all_buses_on_one_channel_are_reported_as_unchecked(
+    recording: Recording, network: Plan, tmp_path: Path
+) -> None:
+    """A log of one virtual channel has no findings; the rules for bus and sender are listed as unchecked."""
     log = recording.copy()
     text = text_of(log)
     for bus in NETWORK.buses:
         text = text.replace(f" {bus} ", " vcan0 ")
     text = text.replace(" T\n", "\n").replace(" R\n", "\n")
-    judge, found = validate(text, tmp_path / "vcan.log", network)
+    validator, found = validate(text, tmp_path / "vcan.log", network)
     assert found == []
-    rules = {rule for item in unjudged(judge) for rule in item.rules}
+    rules = {rule for item in unchecked(validator) for rule in item.rules}
     assert {"wrong-bus", "sender"} <= rules
-    judge, _ = validate(text_of(log), tmp_path / "named.log", network)
-    assert not {"wrong-bus", "sender"} & {rule for item in unjudged(judge) for rule in item.rules}
+    validator, _ = validate(text_of(log), tmp_path / "named.log", network)
+    assert not {"wrong-bus", "sender"} & {rule for item in unchecked(validator) for rule in item.rules}
 
 
-def test_every_signal_is_judged_or_said_not_to_be(recording: Recording, network: Plan, tmp_path: Path) -> None:
-    """A signal on which no mutation could ever be found is in the list of those that no rule looked at."""
-    judge, _ = validate(text_of(recording), tmp_path / "good.log", network)
-    unseen = {f"{layout.name}.{name}" for layout, name in unseen_signals(judge)}
+def test_unchecked_signals_are_listed(recording: Recording, network: Plan, tmp_path: Path) -> None:
+    """Signals without a rule are in the list of unchecked signals; signals with a rule are not."""
+    validator, _ = validate(text_of(recording), tmp_path / "good.log", network)
+    unseen = {f"{layout.name}.{name}" for layout, name in unseen_signals(validator)}
     assert "SYNC_LEFT_LEG.Cycle" in unseen
     assert "PENDANT_STATE.RequestCounter" in unseen
     for seen in (
@@ -537,10 +539,10 @@ def test_every_signal_is_judged_or_said_not_to_be(recording: Recording, network:
 
 
 @pytest.mark.parametrize("rule", RULE_OF)
-def test_a_mutation_trips_its_rule_alone(
+def test_mutation_violates_only_its_rule(
     rule: str, recording: Recording, network: Plan, extended_network: Plan, tmp_path: Path
 ) -> None:
-    """In one chunk, and in chunks of 61 cycles: what is carried from chunk to chunk must make no difference."""
+    """One chunk and chunks of 1601 frames give the same findings."""
     dbc = dbc_of(rule, network, extended_network)
     text = mutant_of(rule, recording, dbc)
     _, found = validate(text, tmp_path / "mutant.log", dbc)

@@ -1,4 +1,7 @@
-"""`atalante decode`: the signals of CAN logs as Parquet or MCAP, `log -> bulk codec -> columns -> file`, chunk by chunk."""
+"""Command `atalante decode`: convert the signals of CAN logs to Parquet or MCAP.
+
+Data flow, chunk by chunk: log -> bulk codec -> columns -> file.
+"""
 
 from __future__ import annotations
 
@@ -23,20 +26,21 @@ _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 @click.argument("logs", nargs=-1, required=True, metavar="LOG...", type=click.Path(path_type=Path))
 @click.option(
     "-o", "--out", required=True, type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
-    help="What to write: .parquet (one row a value) or .mcap (one topic a message, protobuf).",
+    help="Output file: .parquet (one row per value) or .mcap (protobuf, one topic per message).",
 )  # fmt: skip
-@click.option("--dbc", type=_FILE, default=None, help="The network; the robot's own unless given.")
+@click.option("--dbc", type=_FILE, default=None, help="DBC of the logs.  [default: the DBC of the robot]")
 def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
     """Decode CAN logs (.log of candump, .asc, .blf, .mf4, .trc, .csv) to signals in physical units.
 
-    Nothing is judged: see `atalante validate`. Frames of other identifiers, or too short, are counted and left out.
+    No rule is checked; use `atalante validate` for that. Frames with an unknown identifier or a payload that is too short are
+    counted and skipped.
 
     \b
     Example: atalante decode night.log -o night.parquet
              atalante decode drive.blf --dbc vehicle.dbc -o drive.mcap
     """
     if out.suffix.lower() not in (".parquet", ".mcap"):
-        raise click.UsageError(f"{out} must end in .parquet or .mcap")
+        raise click.UsageError(f"--out must end in .parquet or .mcap, got {out}")
     from atalante_dbc import DBC_FILE
     from atalante_dbc.foreign import catalogue
     from atalante_tools.decode.signals import Decoder
@@ -49,7 +53,7 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
     sources = [open_log(path) for path in logs]
     decoder = Decoder(plan)
     progress = Progress()
-    with _whole(out) as part, closing(_sink(part, out.suffix.lower(), plan)) as sink:
+    with _complete_file(out) as part, closing(_sink(part, out.suffix.lower(), plan)) as sink:
         for source in sources:
             for chunk in source.chunks():
                 for piece in decoder.decode(chunk):
@@ -63,17 +67,19 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
                 say(remark.sentence)
     say(f"{out}: {sink.values} values of {decoder.decoded} frames")
     if decoder.left_out:
-        say(f"left out: {decoder.left_out}")
+        say(f"skipped: {decoder.left_out}")
     if not decoder.decoded:
         raise SystemExit(FAILED)
 
 
 @contextmanager
-def _whole(out: Path) -> Iterator[Path]:
-    """Where to write what becomes `out` once it is whole; what does not become whole goes again.
+def _complete_file(out: Path) -> Iterator[Path]:
+    """Provide a temporary path, and rename it to `out` after the `with` block.
+
+    If the block raises an exception, the temporary file is removed and an existing `out` is unchanged.
 
     Raises:
-        Failed: the file cannot be written.
+        Failed: If the file cannot be written.
     """
     part = out.with_name(f"{out.name}.part")
     try:
@@ -86,7 +92,11 @@ def _whole(out: Path) -> Iterator[Path]:
 
 
 def _sink(out: Path, suffix: str, plan: Plan) -> Sink:
-    """A file of the kind the suffix names."""
+    """Open the output file in the format of the suffix.
+
+    Raises:
+        Failed: If a package for the format is not installed.
+    """
     try:
         if suffix == ".parquet":
             from atalante_tools.decode.parquet import ParquetSink
@@ -98,4 +108,4 @@ def _sink(out: Path, suffix: str, plan: Plan) -> Sink:
             return McapSink(out, plan)
     except ModuleNotFoundError as error:
         raise Failed(f"a {suffix} file needs {error.name}: type `pip install 'atalante-hal[decode]'`") from error
-    raise AssertionError(f"{suffix} was let through")
+    raise AssertionError(f"suffix must be .parquet or .mcap, got {suffix}")

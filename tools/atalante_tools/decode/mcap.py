@@ -1,7 +1,7 @@
-"""Decoded signals as MCAP: one topic a message, `/can/LEFT_FH_STATE`, with a protobuf schema made from the DBC.
+"""Writer of decoded signals as MCAP, with one topic per message (`/can/LEFT_FH_STATE`) and protobuf schemas from the DBC.
 
-Every field is eight bytes wide (double, or a fixed-width integer where the DBC's values are integers), so that the messages of a
-whole column are encoded by array operations. Fields that the multiplexer leaves out are absent, not zero.
+Every field is eight bytes wide: a double, or a fixed-width integer if the values in the DBC are integers. Therefore array
+operations encode all messages of a chunk. Fields that the multiplexer does not select are absent, not zero.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _TYPES: dict[str, tuple[Any, str]] = {
 
 
 class McapSink:
-    """Writes the messages of a chunk in order of time."""
+    """MCAP file; the messages of each chunk are written in the order of the log."""
 
     def __init__(self, path: Path, plan: Plan) -> None:
         self._plan = plan
@@ -41,11 +41,16 @@ class McapSink:
         self._writer.add_metadata("dbc", {"file": plan.catalogue.path.name, "crc32": f"{plan.catalogue.hash32:08X}"})
         self._topics: dict[tuple[int, int], int] = {}
         self._schemas: dict[int, int] = {}
-        self._waiting: list[tuple[int, int, int, bytes]] = []  # place in the chunk, topic, stamp, payload
+        self._waiting: list[tuple[int, int, int, bytes]] = []  # index in the chunk, topic, stamp [ns], payload
 
     def write(self, piece: Piece, channels: Sequence[str]) -> None:
-        """Encode the messages of a piece."""
-        columns = [piece.column(place) for place in range(len(piece.codec.fields))]
+        """Encode the messages of a piece.
+
+        Args:
+            piece: decoded frames of one message.
+            channels: names of the channels of the log.
+        """
+        columns = [piece.column(index) for index in range(len(piece.codec.fields))]
         layout = self._plan.layouts[piece.row]
         if piece.row not in self._schemas:
             self._schemas[piece.row] = self._writer.register_schema(
@@ -61,10 +66,10 @@ class McapSink:
         self.values += int(patterns.sum())
         for pattern in np.unique(patterns, axis=0) if any(m is not None for m in masks) else patterns[:1]:
             where = np.flatnonzero((patterns == pattern).all(axis=1))
-            there = [number for number, present in enumerate(pattern.tolist()) if present]
-            payloads = encode([(number + 1, columns[number].values[where]) for number in there], len(where))
+            present_fields = [number for number, present in enumerate(pattern.tolist()) if present]
+            payloads = encode([(number + 1, columns[number].values[where]) for number in present_fields], len(where))
             self._waiting += zip(
-                piece.places[where].tolist(),
+                piece.indices[where].tolist(),
                 topics[where].tolist(),
                 piece.stamps[where].tolist(),
                 payloads,
@@ -72,14 +77,17 @@ class McapSink:
             )
 
     def flush(self) -> None:
-        """Write the messages of the chunk."""
+        """Write the encoded messages of the chunk to the file."""
         self._waiting.sort(key=lambda message: message[0])
         for _, topic, stamp, payload in self._waiting:
             self._writer.add_message(topic, stamp, payload, stamp)
         self._waiting.clear()
 
     def _topic(self, row: int, channel: int, channels: Sequence[str]) -> int:
-        """One topic a message; a message that comes on several channels gets one for each."""
+        """Return the topic of a message on a channel.
+
+        It is `/can/MESSAGE` for the first channel of the message and `/can/CHANNEL/MESSAGE` for further channels.
+        """
         topic = self._topics.get((row, channel))
         if topic is None:
             layout = self._plan.layouts[row]
@@ -91,13 +99,18 @@ class McapSink:
         return topic
 
     def close(self) -> None:
-        """Finish the file."""
+        """Write the end of the file and close it."""
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._file.close()
 
 
 def encode(fields: Sequence[tuple[int, npt.NDArray[Any]]], count: int) -> list[bytes]:
-    """Protobuf messages of eight-byte fields, given as (field number, values of shape (count,))."""
+    """Encode protobuf messages with eight-byte fields.
+
+    Args:
+        fields: (field number, values of shape (count,)) of each field.
+        count: number of messages.
+    """
     tags = [_varint(number << 3 | _FIXED64) for number, _ in fields]
     width = sum(len(tag) + 8 for tag in tags)
     out = np.empty((count, width), np.uint8)
@@ -121,7 +134,7 @@ def _varint(number: int) -> bytes:
 
 
 def _descriptor(layout: Layout, fields: Sequence[tuple[str, str]]) -> bytes:
-    """Descriptor set of the message: proto2, whose optional fields can be absent."""
+    """Return the descriptor set of a message as proto2, in which optional fields can be absent."""
     files = FileDescriptorSet()
     file = files.file.add(name=f"{layout.name}.proto", package=_PACKAGE)
     message = file.message_type.add(name=layout.name)

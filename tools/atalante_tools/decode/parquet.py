@@ -1,14 +1,15 @@
-"""Decoded signals as Parquet: one row a value, so that any DBC gives the same seven columns.
+"""Writer of decoded signals as Parquet, with one row per value, so that every DBC gives the same seven columns.
 
-| column | what |
+| column | content |
 |---|---|
-| time | of the frame, ns |
+| time | stamp of the frame, ns |
 | channel, message, signal | names |
-| value | physical, float64 |
-| integer | the exact integer where float64 cannot hold every value of the signal, otherwise null |
-| text | its name in the value table, null where there is none |
+| value | physical value, float64 |
+| integer | exact integer if float64 cannot hold every value of the signal, otherwise null |
+| text | name of the value in the value table, null without a name |
 
-Rows of one signal lie together: `pandas.read_parquet(file, filters=[("signal", "==", "Position")])` reads little else.
+The rows of one signal are contiguous, so that `pandas.read_parquet(file, filters=[("signal", "==", "Position")])` reads only a
+small part of the file.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from atalante_hal.bulk import Column, raw_range
 from atalante_tools.decode.signals import Piece
 from atalante_tools.validate.plan import Plan
 
-_EXACT = 1 << 53  # integers up to here are exact in float64
+_EXACT = 1 << 53  # largest range of integers that are exact in float64
 _DECIMAL = pa.decimal128(38, 0)
 _NAMES = pa.dictionary(pa.int32(), pa.string())
 _SCHEMA = pa.schema(
@@ -44,7 +45,7 @@ _SCHEMA = pa.schema(
 
 
 class ParquetSink:
-    """Writes one row group a chunk."""
+    """Parquet file with one row group per chunk."""
 
     def __init__(self, path: Path, plan: Plan) -> None:
         self._plan = plan
@@ -68,15 +69,24 @@ class ParquetSink:
         )
 
     def write(self, piece: Piece, channels: Sequence[str]) -> None:
-        """Add the values of a piece."""
+        """Add the values of a piece.
+
+        Args:
+            piece: decoded frames of one message.
+            channels: names of the channels of the log.
+        """
         self._channels = channels
-        for place, field in enumerate(piece.codec.fields):
-            column, stamps, on = piece.column(place), piece.stamps, piece.channels
-            texts = self._texts_of(field, piece.raw[place].view(np.int64))
+        for index, field in enumerate(piece.codec.fields):
+            column, stamps, channel_of_row = piece.column(index), piece.stamps, piece.channels
+            texts = self._texts_of(field, piece.raw[index].view(np.int64))
             if column.present is not None:
-                there = column.present
-                column, stamps, on = Column(column.values[there], None), stamps[there], on[there]
-                texts = None if texts is None else texts[there]
+                present = column.present
+                column, stamps, channel_of_row = (
+                    Column(column.values[present], None),
+                    stamps[present],
+                    channel_of_row[present],
+                )
+                texts = None if texts is None else texts[present]
             count = len(stamps)
             if not count:
                 continue
@@ -85,21 +95,21 @@ class ParquetSink:
             message = np.full(count, piece.row, np.int32)
             signal = np.full(count, self._signal_number[field.name], np.int32)
             values = column.values.astype(np.float64)
-            self._rows.append((stamps, on.astype(np.int32), message, signal, values, texts))
+            self._rows.append((stamps, channel_of_row.astype(np.int32), message, signal, values, texts))
             self._integers.append(_exact(field, column.values))
             self.values += count
 
     def flush(self) -> None:
-        """Write what was gathered as a row group."""
+        """Write the values since the last call as a row group."""
         if not self._rows:
             return
-        times, on, messages, signals, values, texts = (
+        times, channel_of_row, messages, signals, values, texts = (
             np.concatenate(column) for column in zip(*self._rows, strict=True)
         )
         channels = pa.array(list(self._channels), pa.string())
         columns = [
             pa.array(times, pa.timestamp("ns")),
-            pa.DictionaryArray.from_arrays(on, channels),
+            pa.DictionaryArray.from_arrays(channel_of_row, channels),
             pa.DictionaryArray.from_arrays(messages, self._messages),
             pa.DictionaryArray.from_arrays(signals, self._signals),
             pa.array(values),
@@ -111,7 +121,7 @@ class ParquetSink:
         self._integers.clear()
 
     def _texts_of(self, field: Field, codes: npt.NDArray[np.int64]) -> npt.NDArray[np.int32] | None:
-        """Number of each code's name in the value table, -1 where it has none."""
+        """Return the index into `_texts` of each code, -1 for a code without a name; None for a field without a value table."""
         if not field.choices:
             return None
         known = np.array(sorted(field.choices), np.int64)
@@ -120,12 +130,12 @@ class ParquetSink:
         return np.where(known[at] == codes, numbers[at], np.int32(-1))
 
     def close(self) -> None:
-        """Finish the file."""
+        """Write the end of the file and close it."""
         self._writer.close()
 
 
 def _exact(field: Field, values: npt.NDArray[Any]) -> Any:
-    """The integers of a field that float64 cannot hold, as decimals; nulls for any other field."""
+    """Return the values as decimals if float64 cannot hold every value of the field, otherwise nulls."""
     codes = raw_range(field) if field.kind != "float" else range(0)
     if values.dtype.kind == "f" or not codes or max(-codes[0], codes[-1]) * abs(field.factor) <= _EXACT:
         return pa.nulls(len(values), _DECIMAL)

@@ -1,4 +1,4 @@
-"""Frames to columns: the decoded signals of one message in one chunk."""
+"""Decoder from chunks of frames to columns of signals, which the sinks write to files."""
 
 from __future__ import annotations
 
@@ -19,40 +19,45 @@ from atalante_tools.validate.stream import sort
 
 @dataclass(frozen=True)
 class Piece:
-    """The frames of one message in one chunk, decoded."""
+    """Decoded frames of one message in one chunk."""
 
-    row: int  # of the plan
+    row: int  # row of the message in the plan
     codec: BulkCodec
     raw: Words  # shape (fields, n)
     stamps: npt.NDArray[np.int64]  # ns
-    channels: npt.NDArray[np.uint8]
-    places: npt.NDArray[np.intp]  # in the chunk
+    channels: npt.NDArray[np.uint8]  # index in the channel names of the log
+    indices: npt.NDArray[np.intp]  # index of each frame in the chunk
 
-    def column(self, place: int) -> Column:
-        """Physical values of a field of `codec.fields`."""
-        return Column(self.codec.values(self.raw, place), self.codec.present(self.raw, place))
+    def column(self, index: int) -> Column:
+        """Return the physical values of field `index` of `codec.fields`."""
+        return Column(self.codec.values(self.raw, index), self.codec.present(self.raw, index))
 
 
 class Sink(Protocol):
-    """A file that takes decoded pieces."""
+    """Output file for decoded pieces."""
 
-    values: int  # written so far
+    values: int  # number of values so far
 
     def write(self, piece: Piece, channels: Sequence[str]) -> None:
-        """Add the values of a piece."""
+        """Add the values of a piece.
+
+        Args:
+            piece: decoded frames of one message.
+            channels: names of the channels of the log.
+        """
         ...
 
     def flush(self) -> None:
-        """A chunk is complete."""
+        """Write the values of the chunk to the file."""
         ...
 
     def close(self) -> None:
-        """Finish the file; what was not flushed is left out."""
+        """Close the file; values since the last `flush` are not written."""
         ...
 
 
 class Decoder:
-    """Decodes chunks; counts what was left out, and why."""
+    """Decoder of chunks; counts the skipped frames by reason."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
@@ -62,11 +67,11 @@ class Decoder:
 
     @property
     def left_out(self) -> str:
-        """Frames that were not decoded, as a phrase."""
+        """Return the numbers of skipped frames with their reasons, for a message; empty if none was skipped."""
         return ", ".join(f"{count} frames {why}" for why, count in self._left_out.items() if count)
 
     def decode(self, chunk: Chunk) -> Iterator[Piece]:
-        """The pieces of a chunk, by message."""
+        """Yield the decoded pieces of a chunk, one per message."""
         plan, can_ids = self._plan, chunk.frames["can_id"]
         rows = plan.rows(can_ids & np.uint32(~ID_REMOTE & 0xFFFFFFFF))
         carries = (can_ids & np.uint32(ID_ERROR | ID_REMOTE)) == 0
@@ -75,10 +80,10 @@ class Decoder:
         long = chunk.frames["len"] >= self._lengths[np.where(supported, rows, 0)]
         good = supported & long
         self.frames += len(chunk)
-        self._left_out["of identifiers that the DBC does not have"] += int((carries & ~known).sum())
-        self._left_out["that carry no data (remote or error)"] += int((~carries).sum())
-        self._left_out["of messages that are not supported"] += int((known & ~supported).sum())
-        self._left_out["shorter than their message"] += int((supported & ~long).sum())
+        self._left_out["with an identifier that is not in the DBC"] += int((carries & ~known).sum())
+        self._left_out["without data (remote or error)"] += int((~carries).sum())
+        self._left_out["of messages with an unsupported layout"] += int((known & ~supported).sum())
+        self._left_out["shorter than the message in the DBC"] += int((supported & ~long).sum())
         stream = sort(chunk, rows, np.flatnonzero(good))
         self.decoded += len(stream)
         for family in plan.families:
@@ -86,7 +91,7 @@ class Decoder:
             if span.start == span.stop or not family.codec.fields:
                 continue
             raw = family.codec.extract(payload_words(stream.frames[span], family.length))
-            for row, first, behind in stream.bounds(family):
-                of = slice(span.start + first, span.start + behind)
-                places = stream.places[of]
-                yield Piece(row, family.codec, raw[:, first:behind], stream.stamps[of], chunk.channels[places], places)
+            for row, first, end in stream.bounds(family):
+                of = slice(span.start + first, span.start + end)
+                indices = stream.indices[of]
+                yield Piece(row, family.codec, raw[:, first:end], stream.stamps[of], chunk.channels[indices], indices)

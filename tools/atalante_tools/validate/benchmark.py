@@ -1,7 +1,7 @@
-"""How fast a log is judged, beside what others need to decode it: lines of `atalante bench`.
+"""Benchmarks of `atalante bench`: time to check a log, with other decoders as baselines.
 
-The log is a run of the emulated robot in ACTIVE, repeated until it is 1.3 million frames long, with counters and checksums that
-go on over the seams: every rule has to find it clean.
+The log is a run of the emulated robot in ACTIVE, repeated to 1.3 million frames. Alive counters and CRCs are computed again for
+the repeated frames, so that no rule reports a finding.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from atalante_tools.bench.measure import Block, Effort, Measurement, require
 from atalante_tools.validate.plan import Plan
 from atalante_tools.validate.project import Project
 
-#: Cycles recorded (whole periods of every message, and long enough for the joints to come to rest), and how often they are
-#: repeated: 50,000 cycles, 1.3 million frames.
+#: Recorded cycles and number of repetitions: together 50,000 cycles, 1.3 million frames. The recording holds whole periods of
+#: every message and is long enough for the joints to come to rest.
 _CYCLES, _REPEATED = 2000, 25
 _QUICK_CYCLES, _QUICK_REPEATED = 300, 2
-#: Frames that python-can and cantools get in a block: they take their time.
+#: Frames in a block of the baseline python-can with cantools, which is slow.
 _SLICE = 30_000
 _MS = 1_000_000  # ns
 _BEGIN = 1_700_000_000 * 1000 * _MS
@@ -36,7 +36,16 @@ _LENGTHS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64])
 
 
 def judge_log(effort: Effort) -> Measurement:
-    """Read, decode and judge a candump log by all rules; the baseline reads and decodes it. CPU seconds a frame."""
+    """Measure reading, decoding and checking a candump log by all rules.
+
+    The baseline reads and decodes the same log with python-can and cantools.
+
+    Args:
+        effort: number of rounds, and whether the log is short.
+
+    Returns:
+        CPU seconds per frame.
+    """
     import can
     import cantools
     from cantools.database.can import Database
@@ -53,11 +62,20 @@ def judge_log(effort: Effort) -> Measurement:
                     count += 1
             return (time.process_time() - begin) / count
 
-        return effort.interleave(_judging(path, frames), baseline, share=0.02)
+        return effort.interleave(_validation(path, frames), baseline, share=0.02)
 
 
 def judge_against_mdf(effort: Effort) -> Measurement:
-    """The same work; the baseline is asammdf decoding the same frames from MF4, where nothing is parsed and nothing judged."""
+    """Measure the work of `judge_log` against asammdf.
+
+    The baseline decodes the same frames from MF4. It parses no text and checks no rule.
+
+    Args:
+        effort: number of rounds, and whether the log is short.
+
+    Returns:
+        CPU seconds per frame.
+    """
     try:
         from asammdf import MDF
     except ImportError:
@@ -70,27 +88,30 @@ def judge_against_mdf(effort: Effort) -> Measurement:
             begin = time.process_time()
             source = MDF(mdf)
             found = source.extract_bus_logging({"CAN": [(_dbc(), 0)]})
-            require(len(found.groups) > 40, f"asammdf found {len(found.groups)} messages")
+            require(len(found.groups) > 40, f"asammdf must find more than 40 messages, got {len(found.groups)}")
             elapsed = time.process_time() - begin
             found.close()
             source.close()
             return elapsed / len(frames)
 
-        return effort.interleave(_judging(path, frames), baseline, share=0.02)
+        return effort.interleave(_validation(path, frames), baseline, share=0.02)
 
 
-def _judging(path: Path, frames: Frames) -> Block:
+def _validation(path: Path, frames: Frames) -> Block:
+    """Return a block that checks the log and requires a report without findings."""
     from atalante_dbc.foreign import catalogue
-    from atalante_tools.validate.run import judge_log
+    from atalante_tools.validate.run import validate_log
 
     plan = Plan(catalogue(_dbc()))
 
     def block() -> float:
         begin = time.process_time()
-        result = judge_log(path, plan, Project())
+        result = validate_log(path, plan, Project())
         elapsed = time.process_time() - begin
-        require(result.judge.frames == len(frames), f"{result.judge.frames} of {len(frames)} frames were judged")
-        require(not result.findings, f"the log is not clean: {[f.as_json() for f in result.findings][:3]}")
+        require(
+            result.validator.frames == len(frames), f"{result.validator.frames} of {len(frames)} frames were checked"
+        )
+        require(not result.findings, f"the log must have no findings, got {[f.as_json() for f in result.findings][:3]}")
         return elapsed / len(frames)
 
     return block
@@ -107,7 +128,7 @@ def _dbc() -> Path:
 
 @contextmanager
 def _log(effort: Effort) -> Iterator[tuple[Path, Frames]]:
-    """A candump log in a temporary folder, and its frames."""
+    """Provide the path of a candump log in a temporary folder, and its frames."""
     cycles, repeated = (_QUICK_CYCLES, _QUICK_REPEATED) if effort.quick else (_CYCLES, _REPEATED)
     frames, cycle, sent = _repeat(*_record(cycles), cycles, repeated)
     with tempfile.TemporaryDirectory(prefix="atalante-bench-") as folder:
@@ -117,7 +138,7 @@ def _log(effort: Effort) -> Iterator[tuple[Path, Frames]]:
 
 
 class _Tap:
-    """Every frame of the HAL, with cycle and direction."""
+    """Recorder of every frame that the HAL sends or receives, with cycle and direction."""
 
     def __init__(self) -> None:
         self.cycle = 0
@@ -132,9 +153,15 @@ class _Tap:
 
 @cache
 def _record(cycles: int) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """The robot holding its pose in ACTIVE: frames, their cycle from 0, and which ones the HAL sent.
+    """Record the robot while it holds its pose in ACTIVE.
 
-    The hold carries gravity, so that the joints come to rest where they began: a repetition joins on without a jump.
+    The hold compensates gravity, so the joints come to rest at their first position and a repetition begins without a jump.
+
+    Args:
+        cycles: number of cycles in ACTIVE.
+
+    Returns:
+        The frames, the cycle of each frame from 0, and which frames the HAL sent; shapes (n,).
     """
     from atalante_hal.types import SupervisorState
     from atalante_tools.options import EMBEDDED, Target
@@ -156,7 +183,10 @@ def _record(cycles: int) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.
             else:
                 hal.hold()
                 tap.taken.clear()
-            require(hal.state.cycle < cycles + 2000, "the robot is ACTIVE")
+            require(
+                hal.state.cycle < cycles + 2000,
+                f"the robot must be ACTIVE within 2000 cycles, got {hal.state.supervisor.name}",
+            )
     taken = tap.taken
     frames = np.concatenate([f for f, _, _ in taken])
     counts = [len(f) for f, _, _ in taken]
@@ -166,7 +196,7 @@ def _record(cycles: int) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.
 def _repeat(
     frames: Frames, cycle: npt.NDArray[np.int64], sent: npt.NDArray[np.bool_], cycles: int, times: int
 ) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """The recording over and over, with alive counters and checksums as if it had been one run."""
+    """Repeat the recording, with alive counters and CRCs of one continuous run. Shapes (n,) to (times * n,)."""
     whole = new_frames(len(frames) * times)
     whole.view("<u8").reshape(times, -1)[:] = frames.view("<u8")
     octets = whole.view(np.uint8).reshape(-1, FRAME_BYTES)
@@ -179,30 +209,30 @@ def _repeat(
         of = octets[rows]
         of[:, HEADER_BYTES + COUNTER_BYTE] = np.arange(len(rows))
         of[:, HEADER_BYTES : HEADER_BYTES + CRC_BYTES] = 0
-        right = crc_differences(of.reshape(-1).view(whole.dtype), message.length)
-        right ^= np.uint16(crc_of_zeros(message.length, message.data_id))
-        of[:, HEADER_BYTES : HEADER_BYTES + CRC_BYTES] = right[:, None].view(np.uint8)
+        crcs = crc_differences(of.reshape(-1).view(whole.dtype), message.length)
+        crcs ^= np.uint16(crc_of_zeros(message.length, message.data_id))
+        of[:, HEADER_BYTES : HEADER_BYTES + CRC_BYTES] = crcs[:, None].view(np.uint8)
         octets[rows] = of
     offset = np.repeat(np.arange(times) * cycles, len(frames))
     return whole, np.tile(cycle, times) + offset, np.tile(sent, times)
 
 
 def _write(path: Path, frames: Frames, stamps: npt.NDArray[np.int64], sent: npt.NDArray[np.bool_]) -> None:
-    """Frames as candump writes them, a channel a bus."""
+    """Write frames in the format of candump, with one channel per bus; `stamps` are in ns."""
     from atalante_dbc import load
 
     head = {m.frame_id: f"{m.bus} {m.frame_id:03X}##1" for m in load().messages}
     data, lines = frames["data"].tobytes().hex().upper(), []
     columns = (frames["can_id"].tolist(), frames["len"].tolist(), stamps.tolist(), sent.tolist())
-    for place, (can_id, length, stamp, ours) in enumerate(zip(*columns, strict=True)):
+    for row, (can_id, length, stamp, is_sent) in enumerate(zip(*columns, strict=True)):
         seconds, rest = divmod(stamp // 1000, 10**6)
-        payload = data[128 * place : 128 * place + 2 * length]
-        lines.append(f"({seconds}.{rest:06d}) {head[can_id]}{payload} {'T' if ours else 'R'}\n")
+        payload = data[128 * row : 128 * row + 2 * length]
+        lines.append(f"({seconds}.{rest:06d}) {head[can_id]}{payload} {'T' if is_sent else 'R'}\n")
     path.write_text("".join(lines))
 
 
 def _write_mdf(path: Path, frames: Frames) -> None:
-    """The same frames as MF4 bus logging, the way python-can lays it out."""
+    """Write frames as MF4 bus logging, in the layout of python-can."""
     from asammdf import MDF, Signal
     from asammdf.blocks.v4_blocks import SourceInformation
     from asammdf.blocks.v4_constants import BUS_TYPE_CAN, SOURCE_BUS

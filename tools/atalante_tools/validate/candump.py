@@ -1,11 +1,11 @@
-"""Candump's log format (`candump -l`, python-can's .log) parsed by array operations: a few hundred thousand lines at a time.
+"""Parser for the log format of candump (`candump -l`, .log of python-can), with array operations on many lines.
 
     (1700000000.123456) left_leg 181##15A0F004000000041 R
      time                channel id fd flags, payload   direction (may be missing)
 
-Every line is checked against exactly this shape; a line of another shape (remote frame, raw DLC, odd spacing) is read one by
-one, and one that is no frame at all is counted. Nothing is guessed: an array path that took a damaged line for a shorter frame
-would make the validator lie.
+The array operations accept a line only if it has exactly this format. All other lines (remote frame, raw DLC, other spacing) are
+parsed individually by a regular expression. Lines that are no frame are counted. A damaged line is never read as a shorter frame,
+because the validator would then report a wrong length or a lost frame.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, FRAME_BYTES, ID_ERROR, ID_EXTENDED, ID_REMOTE, new_frames
-from atalante_tools.validate.chunk import NOT_SAID, RECEIVED, SENT, Chunk
+from atalante_tools.validate.chunk import NO_DIRECTION, RECEIVED, SENT, Chunk
 
 Text = npt.NDArray[np.uint8]
-Places = npt.NDArray[np.intp]
+Positions = npt.NDArray[np.intp]
 
-#: Bytes that must be readable before and behind the text: the widest window that is looked at.
+#: Bytes that must be readable before and after the text; at least the width of the widest window that is read.
 MARGIN = 160
 _NEWLINE, _RETURN, _SPACE, _OPEN, _CLOSE, _HASH, _DOT = b"\n\r ()#."
-_MOST_CHANNELS = 256
-_NAME_BYTES = 16  # longest channel name read at once; Linux allows 15
-_LONGEST = 2 * 64  # hexadecimal digits
+_MAX_CHANNELS = 256
+_NAME_BYTES = 16  # longest channel name that the array operations read; Linux allows 15
+_MAX_DIGITS = 2 * 64  # hexadecimal digits
 _STANDARD, _ALL_BITS = 0x7FF, 0x1FFF_FFFF
 _NOT_HEX = 255
 _HEX = np.full(256, _NOT_HEX, np.uint8)
 _HEX[np.frombuffer(b"0123456789", np.uint8)] = np.arange(10)
 _HEX[np.frombuffer(b"ABCDEF", np.uint8)] = _HEX[np.frombuffer(b"abcdef", np.uint8)] = np.arange(10, 16)
-#: Two characters read as one little-endian number; anything else than two hexadecimal digits is far too large.
+#: Value of two characters, indexed by their little-endian number; 0xFFFF if they are not two hexadecimal digits.
 _HEX_PAIR = np.full(1 << 16, 0xFFFF, np.uint16)
 _HEX_PAIR.reshape(256, 256)[:] = np.where(
     (_HEX < 16) & (_HEX < 16)[:, None], _HEX.astype(np.uint16) << 4 | _HEX[:, None], 0xFFFF
 )
-#: The last k bytes of a word, k = 0..8.
+#: Masks of the last k bytes of a word, k = 0..8.
 _TAIL = np.array([0, *((((1 << 8 * k) - 1) << 64 - 8 * k) for k in range(1, 9))], np.uint64)
 _ZEROS = np.uint64(0x3030303030303030)
 _LINE = re.compile(
@@ -50,22 +50,28 @@ _LINE = re.compile(
 
 @dataclass
 class Channels:
-    """Channel names in the order they turned up."""
+    """Channel names in the order of their first frames."""
 
     names: list[str] = field(default_factory=list)
 
     def index(self, name: str) -> int:
-        """Number of a channel, a new one for a name not seen before; only damage makes more of them than a byte counts."""
+        """Return the index of a channel; a new name is appended.
+
+        Names beyond the 256th share the last index. Only damaged logs have that many.
+
+        Args:
+            name: name of the channel in the log.
+        """
         if name not in self.names:
-            if len(self.names) == _MOST_CHANNELS:
-                return _MOST_CHANNELS - 1
+            if len(self.names) == _MAX_CHANNELS:
+                return _MAX_CHANNELS - 1
             self.names.append(name)
         return self.names.index(name)
 
 
 @dataclass
 class Parsed:
-    """Frames of a piece of text, and the lines that are none."""
+    """Frames of a piece of text, and the count of lines that are no frame."""
 
     chunk: Chunk
     unreadable: int  # lines
@@ -73,15 +79,18 @@ class Parsed:
 
 
 def parse(text: Text, begin: int, end: int, channels: Channels) -> Parsed:
-    """All whole lines of `text[begin:end]`, which ends behind a newline; `MARGIN` bytes around it exist.
+    """Parse all lines of `text[begin:end]`.
 
     Args:
-        channels: grows by the names found.
+        text: log as bytes, with at least `MARGIN` bytes before `begin` and after `end`.
+        begin: index of the first byte of a line.
+        end: index after the newline of the last line.
+        channels: channel names of the log; new names are appended.
     """
     lines = _Lines(text, begin, end)
     count = len(lines.starts)
     frames = new_frames(count)
-    chunk = Chunk(frames, np.zeros(count, np.int64), np.zeros(count, np.uint8), np.full(count, NOT_SAID, np.int8))
+    chunk = Chunk(frames, np.zeros(count, np.int64), np.zeros(count, np.uint8), np.full(count, NO_DIRECTION, np.int8))
     if not count:
         return Parsed(chunk, 0, b"")
     regular = lines.split()
@@ -90,85 +99,96 @@ def parse(text: Text, begin: int, end: int, channels: Channels) -> Parsed:
     regular &= _identifiers(lines, frames)
     chunk.sent[:] = lines.sent
     regular &= _payloads(lines, frames, regular)
-    return _one_by_one(lines, chunk, regular, channels)
+    return _parse_individually(lines, chunk, regular, channels)
 
 
 class _Lines:
-    """Where the parts of every line are; places in the text, shape (lines,)."""
+    """Positions of the parts of each line, as indices into the text. Shape (lines,)."""
 
     def __init__(self, text: Text, begin: int, end: int) -> None:
         self.text, self.begin, self.end = text, begin, end
-        self.ends: Places = np.flatnonzero(text[begin:end] == _NEWLINE) + begin
-        self.starts: Places = np.empty_like(self.ends)
+        self.ends: Positions = np.flatnonzero(text[begin:end] == _NEWLINE) + begin
+        self.starts: Positions = np.empty_like(self.ends)
         if len(self.starts):
             self.starts[0], self.starts[1:] = begin, self.ends[:-1] + 1
 
-    def window(self, places: Places, width: int) -> Text:
-        """`width` bytes from each place. Shape (places, width)."""
-        rows: Text = np.ndarray((len(self.text) - width,), f"V{width}", self.text, strides=(1,))[places].view(np.uint8)
-        return rows.reshape(len(places), width)
+    def window(self, positions: Positions, width: int) -> Text:
+        """Return `width` bytes from each position. Shape (positions, width)."""
+        rows: Text = np.ndarray((len(self.text) - width,), f"V{width}", self.text, strides=(1,))[positions].view(
+            np.uint8
+        )
+        return rows.reshape(len(positions), width)
 
-    def word(self, places: Places) -> npt.NDArray[np.uint64]:
-        """Eight bytes from each place as one number, the first the lowest."""
-        return np.ndarray((len(self.text) - 8,), "<u8", self.text, strides=(1,))[places]
+    def word(self, positions: Positions) -> npt.NDArray[np.uint64]:
+        """Return eight bytes from each position as a little-endian number. Shape (positions,)."""
+        return np.ndarray((len(self.text) - 8,), "<u8", self.text, strides=(1,))[positions]
 
-    def pair(self, places: Places) -> npt.NDArray[np.uint16]:
-        """Two bytes from each place as one number, the first the lower."""
-        return np.ndarray((len(self.text) - 2,), "<u2", self.text, strides=(1,))[places]
+    def pair(self, positions: Positions) -> npt.NDArray[np.uint16]:
+        """Return two bytes from each position as a little-endian number. Shape (positions,)."""
+        return np.ndarray((len(self.text) - 2,), "<u2", self.text, strides=(1,))[positions]
 
     def split(self) -> npt.NDArray[np.bool_]:
-        """Find every part; returns which lines have the usual shape so far."""
+        """Find the parts of each line; return which lines have the regular format so far. Shape (lines,)."""
         stops = self.ends - (self.text[self.ends[0] - 1] == _RETURN)
         last = self.pair(stops - 2)
-        said = last & 0xFF == _SPACE
+        has_direction = last & 0xFF == _SPACE
         letter = last >> 8 & 0xDF  # upper case
         is_sent = letter == ord("T")
-        self.sent = np.where(said, np.where(is_sent, SENT, RECEIVED), NOT_SAID).astype(np.int8)
-        regular: npt.NDArray[np.bool_] = ~said | is_sent | (letter == ord("R"))
-        self.stops: Places = stops - 2 * said
+        self.sent = np.where(has_direction, np.where(is_sent, SENT, RECEIVED), NO_DIRECTION).astype(np.int8)
+        regular: npt.NDArray[np.bool_] = ~has_direction | is_sent | (letter == ord("R"))
+        self.stops: Positions = stops - 2 * has_direction
         self.marks = self._marks(regular)
-        #: Eight characters from the fourth before the #: blank, three digits, #, #, flags, payload.
+        #: Eight characters around the first #. Before it: a blank and three digits. After it: a second #, flags and payload.
         self.head = self.word(self.marks - 4)
         self.fd = self.head >> np.uint64(40) & np.uint64(0xFF) == _HASH
-        self.data: Places = self.marks + 1 + 2 * self.fd
+        self.data: Positions = self.marks + 1 + 2 * self.fd
         self.digits = self.stops - self.data
-        regular &= (self.digits >= 0) & (self.digits <= _LONGEST) & (self.digits & 1 == 0)
+        regular &= (self.digits >= 0) & (self.digits <= _MAX_DIGITS) & (self.digits & 1 == 0)
         self.extended = self.head & np.uint64(0xFF) != _SPACE
-        self.id_starts: Places = self.marks - 3
+        self.id_starts: Positions = self.marks - 3
         if bool(self.extended.any()):
             self.id_starts = self.marks - np.where(self.extended, 8, 3)
             regular &= self.text[self.id_starts - 1] == _SPACE
         self.closes = self._closes(regular)
         return regular
 
-    def _marks(self, regular: npt.NDArray[np.bool_]) -> Places:
-        """The first # of each line: one that does not follow another."""
+    def _marks(self, regular: npt.NDArray[np.bool_]) -> Positions:
+        """Return the position of the first # of each line. Shape (lines,)."""
         is_hash = (self.text[self.begin - 1 : self.end] == _HASH).view(np.uint8)
-        return self._one_a_line(np.flatnonzero(is_hash[1:] > is_hash[:-1]) + self.begin, regular)
+        return self._one_per_line(np.flatnonzero(is_hash[1:] > is_hash[:-1]) + self.begin, regular)
 
-    def _closes(self, regular: npt.NDArray[np.bool_]) -> Places:
-        """The ) of each line; its place in the line seldom changes."""
+    def _closes(self, regular: npt.NDArray[np.bool_]) -> Positions:
+        """Return the position of the ) of each line. Shape (lines,).
+
+        The offset of the first line is tried for all lines, because it seldom changes.
+        """
         text, starts = self.text, self.starts
         width = int(np.argmax(text[starts[0] : starts[0] + MARGIN] == _CLOSE))
-        closes: Places = starts + width
-        behind = self.pair(closes) == _CLOSE | _SPACE << 8
-        if not bool(behind.all()):
-            closes = self._one_a_line(
+        closes: Positions = starts + width
+        after = self.pair(closes) == _CLOSE | _SPACE << 8
+        if not bool(after.all()):
+            closes = self._one_per_line(
                 np.flatnonzero(text[self.begin : self.end] == _CLOSE) + self.begin, regular, alone=False
             )
-            behind = self.pair(closes) == _CLOSE | _SPACE << 8
-        regular &= behind & (text[starts] == _OPEN) & (closes < self.id_starts)
+            after = self.pair(closes) == _CLOSE | _SPACE << 8
+        regular &= after & (text[starts] == _OPEN) & (closes < self.id_starts)
         return closes
 
-    def _one_a_line(self, found: Places, regular: npt.NDArray[np.bool_], *, alone: bool = True) -> Places:
-        """The first of the places found that lies in each line; a line without one (or with two) is not regular."""
+    def _one_per_line(self, found: Positions, regular: npt.NDArray[np.bool_], *, alone: bool = True) -> Positions:
+        """Select for each line the first of the found positions.
+
+        Args:
+            found: positions in the text, ascending.
+            regular: set to False for a line without a position; shape (lines,).
+            alone: also set `regular` to False for a line with several positions.
+        """
         if len(found) == len(self.starts) and bool(((found > self.starts) & (found < self.stops)).all()):
             return found
         if not len(found):
             regular[:] = False
             return self.starts + MARGIN // 8
         at = np.minimum(np.searchsorted(found, self.starts), len(found) - 1)
-        first: Places = found[at]
+        first: Positions = found[at]
         inside = (first >= self.starts) & (first < self.stops)
         if alone:
             after = found[np.minimum(at + 1, len(found) - 1)]
@@ -178,7 +198,7 @@ class _Lines:
 
 
 def _times(lines: _Lines, stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Seconds with six or nine decimals to nanoseconds."""
+    """Write the time of each line to `stamps` [ns]; return which lines have a regular time. Shape (lines,)."""
     text, closes = lines.text, lines.closes
     decimals = 9 if text[closes[0] - 10] == _DOT else 6
     dots = closes - decimals - 1
@@ -191,11 +211,11 @@ def _times(lines: _Lines, stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_
         upper, ok = _number(lines.word(dots - 16), np.maximum(count - 8, 0))
         seconds += upper * np.uint64(10**8)
         regular &= ok
-    behind = lines.word(closes - 8)
-    fraction, ok = _number(behind, np.full(1, min(decimals, 8)))
+    last_eight = lines.word(closes - 8)
+    fraction, ok = _number(last_eight, np.full(1, min(decimals, 8)))
     regular &= ok
     if decimals == 6:
-        regular &= behind >> np.uint64(8) & np.uint64(0xFF) == _DOT
+        regular &= last_eight >> np.uint64(8) & np.uint64(0xFF) == _DOT
         stamps[:] = seconds * np.uint64(10**9) + fraction * np.uint64(1000)
     else:
         first = text[dots + 1] - np.uint8(ord("0"))
@@ -207,20 +227,20 @@ def _times(lines: _Lines, stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_
 def _number(
     word: npt.NDArray[np.uint64], digits: npt.NDArray[np.intp]
 ) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.bool_]]:
-    """The number that the last `digits` of eight characters spell, and whether they are all digits."""
+    """Return the number in the last `digits` of eight characters, and whether they are all digits. Shapes (lines,)."""
     tail = _TAIL[digits]
     word = (word & tail) | (_ZEROS & ~tail)
     changes = np.flatnonzero(word[1:] != word[:-1]) + 1
     if len(changes) * 4 > len(word):
-        return _spelled(word)
-    runs = np.concatenate([[0], changes])  # seconds stay the same for thousands of lines
-    number, valid = _spelled(word[runs])
+        return _parse_digits(word)
+    runs = np.concatenate([[0], changes])  # the seconds are equal in thousands of consecutive lines
+    number, valid = _parse_digits(word[runs])
     lengths = np.diff(runs, append=len(word))
     return number.repeat(lengths), valid.repeat(lengths)
 
 
-def _spelled(word: npt.NDArray[np.uint64]) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.bool_]]:
-    """Eight digits, the first in the lowest byte: pairs are joined, then fours, then all eight."""
+def _parse_digits(word: npt.NDArray[np.uint64]) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.bool_]]:
+    """Parse eight digits, the first in the lowest byte: combine pairs, then fours, then all eight."""
     above, below = word + np.uint64(0x4646464646464646), word - _ZEROS
     valid: npt.NDArray[np.bool_] = ((above | below) & np.uint64(0x8080808080808080)) == 0
     word = below * np.uint64(10) + (below >> np.uint64(8))
@@ -230,7 +250,7 @@ def _spelled(word: npt.NDArray[np.uint64]) -> tuple[npt.NDArray[np.uint64], npt.
 
 
 def _channels(lines: _Lines, numbers: npt.NDArray[np.uint8], channels: Channels) -> npt.NDArray[np.bool_]:
-    """Channel of each line: names are compared as two words."""
+    """Write the channel index of each line to `numbers`; return which lines have a regular name. Shape (lines,)."""
     stops = lines.id_starts - 1
     length = stops - lines.closes - 2
     regular: npt.NDArray[np.bool_] = (length > 0) & (length <= _NAME_BYTES)
@@ -242,8 +262,8 @@ def _channels(lines: _Lines, numbers: npt.NDArray[np.uint8], channels: Channels)
         first = int(np.argmax(left))
         if not left[first]:
             return regular
-        place = int(lines.closes[first]) + 2
-        name = lines.text[place : place + int(length[first])].tobytes()
+        begin = int(lines.closes[first]) + 2
+        name = lines.text[begin : begin + int(length[first])].tobytes()
         same = left & (low == low[first]) & (high == high[first])
         if b" " in name or b"\t" in name:
             regular &= ~same
@@ -253,7 +273,7 @@ def _channels(lines: _Lines, numbers: npt.NDArray[np.uint8], channels: Channels)
 
 
 def _identifiers(lines: _Lines, frames: npt.NDArray[np.void]) -> npt.NDArray[np.bool_]:
-    """Identifier, length and flags of each line."""
+    """Write identifier, length and flags of each line; return which lines have regular ones. Shape (lines,)."""
     head = lines.head.view(np.int64)
     number = _HEX[head >> 8 & 0xFF].astype(np.uint32) << 8 | _HEX_PAIR[head >> 16 & 0xFFFF]
     regular: npt.NDArray[np.bool_] = number < 16 << 8
@@ -267,7 +287,7 @@ def _identifiers(lines: _Lines, frames: npt.NDArray[np.void]) -> npt.NDArray[np.
         number = np.where(lines.extended, wide, number)
     regular &= lines.extended | (number <= _STANDARD)
     frames["can_id"] = number
-    frames["len"] = np.minimum(np.maximum(lines.digits, 0), _LONGEST) // 2
+    frames["len"] = np.minimum(np.maximum(lines.digits, 0), _MAX_DIGITS) // 2
     flags = _HEX[head >> 48 & 0xFF]
     regular &= ~lines.fd | (flags < 16)
     frames["flags"] = np.where(lines.fd, flags & (FLAG_BRS | FLAG_ESI) | FLAG_FDF, 0)
@@ -275,7 +295,7 @@ def _identifiers(lines: _Lines, frames: npt.NDArray[np.void]) -> npt.NDArray[np.
 
 
 def _payloads(lines: _Lines, frames: npt.NDArray[np.void], wanted: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Payload bytes, lines of one length after the other."""
+    """Write the payloads, grouped by length; return which lines of `wanted` are hexadecimal. Shape (lines,)."""
     regular = wanted.copy()
     digits = np.where(wanted, lines.digits, 0)
     memory = frames.view(np.uint8)
@@ -296,23 +316,23 @@ def _payloads(lines: _Lines, frames: npt.NDArray[np.void], wanted: npt.NDArray[n
     return regular
 
 
-def _one_by_one(lines: _Lines, chunk: Chunk, regular: npt.NDArray[np.bool_], channels: Channels) -> Parsed:
-    """Read the lines that are not of the usual shape; drop those that are no frame."""
+def _parse_individually(lines: _Lines, chunk: Chunk, regular: npt.NDArray[np.bool_], channels: Channels) -> Parsed:
+    """Parse the lines that do not have the regular format; remove and count the lines that are no frame."""
     keep = np.ones(len(regular), np.bool_)
     unreadable, first = 0, b""
-    for place in np.flatnonzero(~regular).tolist():
-        line = lines.text[lines.starts[place] : lines.ends[place]].tobytes()
+    for row in np.flatnonzero(~regular).tolist():
+        line = lines.text[lines.starts[row] : lines.ends[row]].tobytes()
         if not line.strip():
-            keep[place] = False
-        elif not _read_line(line, chunk, place, channels):
-            keep[place] = False
+            keep[row] = False
+        elif not _read_line(line, chunk, row, channels):
+            keep[row] = False
             first = first if unreadable else line
             unreadable += 1
     return Parsed(chunk if bool(keep.all()) else chunk.select(keep), unreadable, first)
 
 
-def _read_line(line: bytes, chunk: Chunk, place: int, channels: Channels) -> bool:
-    """One line of any shape candump writes."""
+def _read_line(line: bytes, chunk: Chunk, row: int, channels: Channels) -> bool:
+    """Write the frame of a line in any format of candump to `chunk`; return whether the line is a frame."""
     match = _LINE.fullmatch(line)
     if match is None:
         return False
@@ -329,9 +349,9 @@ def _read_line(line: bytes, chunk: Chunk, place: int, channels: Channels) -> boo
     frame["len"] = int(match[9] or 0) if match[8] else len(data)
     frame["flags"] = FLAG_FDF | int(match[6], 16) & (FLAG_BRS | FLAG_ESI) if match[5] else 0
     frame["data"][0, : len(data)] = list(data)
-    chunk.frames[place] = frame[0]
-    chunk.stamps[place] = int(match[1]) * 10**9 + int(match[2].ljust(9, b"0"))
-    chunk.channels[place] = channels.index(match[3].decode("ascii", "replace"))
+    chunk.frames[row] = frame[0]
+    chunk.stamps[row] = int(match[1]) * 10**9 + int(match[2].ljust(9, b"0"))
+    chunk.channels[row] = channels.index(match[3].decode("ascii", "replace"))
     letter = (match[12] or b"").upper()
-    chunk.sent[place] = SENT if letter == b"T" else RECEIVED if letter == b"R" else NOT_SAID
+    chunk.sent[row] = SENT if letter == b"T" else RECEIVED if letter == b"R" else NO_DIRECTION
     return True

@@ -1,4 +1,4 @@
-"""A piece of a log as arrays: what every reader delivers and every rule is judged on."""
+"""Frames of a piece of a log as arrays: output of every log reader, input of every rule."""
 
 from __future__ import annotations
 
@@ -10,26 +10,30 @@ import numpy.typing as npt
 
 from atalante_hal.frame import Frames
 
-#: Direction of a frame as its log says it.
-SENT, RECEIVED, NOT_SAID = 1, 0, -1
+#: Direction of a frame in its log; `NO_DIRECTION` if the log does not record it.
+SENT, RECEIVED, NO_DIRECTION = 1, 0, -1
 
 
 class LogError(ValueError):
-    """The log cannot be opened at all; the message says why, and what would be right."""
+    """Error for a log that cannot be opened; the message gives the reason and what to do."""
 
 
 @dataclass
 class Chunk:
-    """Frames in the order of the log. Shapes (n,)."""
+    """Frames of a piece of a log, in the order of the log. Shapes (n,)."""
 
     frames: Frames  # `FRAME` records
     stamps: npt.NDArray[np.int64]  # ns
-    channels: npt.NDArray[np.uint8]  # number of the log's channel
+    channels: npt.NDArray[np.uint8]  # index in the channel names of the log
     sent: npt.NDArray[np.int8]  # SENT, RECEIVED or NOT_SAID
 
     def __len__(self) -> int:
         return len(self.frames)
 
-    def select(self, places: npt.NDArray[Any]) -> Chunk:
-        """The frames at these places, or where a mask is True."""
-        return Chunk(self.frames[places], self.stamps[places], self.channels[places], self.sent[places])
+    def select(self, indices: npt.NDArray[Any]) -> Chunk:
+        """Return part of the frames.
+
+        Args:
+            indices: indices of frames, or a mask of shape (n,).
+        """
+        return Chunk(self.frames[indices], self.stamps[indices], self.channels[indices], self.sent[indices])

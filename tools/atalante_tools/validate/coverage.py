@@ -1,4 +1,7 @@
-"""What no rule looked at, and why. A firmware engineer must never take silence for approval."""
+"""List of the rules, messages and signals that were not checked in a log, each with the reason.
+
+Without this list, a report without findings would read as approval of everything in the log.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from atalante_dbc.foreign import Field, Layout
-from atalante_tools.validate.judge import Judge
+from atalante_tools.validate.judge import Validator
 from atalante_tools.validate.plan import UNKNOWN
 from atalante_tools.validate.value_rules import is_enumeration, is_hash, is_limited
 
@@ -16,148 +19,167 @@ _E2E = ("Crc", "Counter")
 
 
 @dataclass(frozen=True)
-class Unjudged:
-    """Rules that did not look at some things."""
+class Unchecked:
+    """Items that some rules did not check, with the reason."""
 
-    rules: tuple[str, ...]
-    what: tuple[str, ...]  # messages, signals, identifiers, channels; empty: the whole log
-    why: str
+    rules: tuple[str, ...]  # empty: all rules
+    items: tuple[str, ...]  # messages, signals or channels; empty: the whole log
+    reason: str
 
     def __str__(self) -> str:
-        rules = ", ".join(self.rules) or "no rule"
-        return f"{rules}: {self.why}" + (f" ({len(self.what)}): {', '.join(self.what)}" if self.what else "")
+        rules = ", ".join(self.rules) or "all rules"
+        return f"{rules}: {self.reason}" + (f" ({len(self.items)}): {', '.join(self.items)}" if self.items else "")
 
 
-def unjudged(judge: Judge, *, live: bool = False) -> list[Unjudged]:
-    """Everything that was not judged in a log that is finished."""
-    found = [*_of_the_log(judge, live), *_of_the_network(judge), *_of_messages(judge)]
-    signals = tuple(f"{layout.name}.{name}" for layout, name in unseen_signals(judge))
+def unchecked(validator: Validator, *, live: bool = False) -> list[Unchecked]:
+    """List everything that was not checked.
+
+    Args:
+        validator: finished validator of the log.
+        live: whether the frames came from a live bus, which counts lost frames.
+    """
+    found = [*_of_the_log(validator, live), *_of_the_network(validator), *_of_messages(validator)]
+    signals = tuple(f"{layout.name}.{name}" for layout, name in unseen_signals(validator))
     if signals:
-        why = "every raw value is allowed, so no rule looked at the values of these signals"
-        found.append(Unjudged((), signals, why))
+        reason = "every raw value is allowed, so no rule checked the values of these signals"
+        found.append(Unchecked((), signals, reason))
     return found
 
 
-def _of_the_log(judge: Judge, live: bool) -> Iterator[Unjudged]:
-    frames = judge.frame_rules
-    if not judge.keeps_flags:
-        yield Unjudged(("frame-fdf", "frame-brs", "frame-esi"), (), "this log format does not keep CAN FD flags")
+def _of_the_log(validator: Validator, live: bool) -> Iterator[Unchecked]:
+    frames = validator.frame_rules
+    if not validator.keeps_flags:
+        yield Unchecked(("frame-fdf", "frame-brs", "frame-esi"), (), "this log format does not keep CAN FD flags")
     if not frames.recorder:
-        why = "no frame of the log is marked as sent by the node that recorded it"
+        reason = "the log marks no frame as sent by the recording node"
         if frames.recorder == "":
-            why = "frames of several nodes are marked as sent: the log was recorded on a computer that plays them"
-        yield Unjudged(("sender",), (), why)
+            reason = "the log marks frames of several nodes as sent, so the recording node is unknown"
+        yield Unchecked(("sender",), (), reason)
     if not live:
-        yield Unjudged(("dropped",), (), "a log tells of lost frames only where the controller reported an overflow")
+        yield Unchecked(("dropped",), (), "a log records lost frames only if the CAN controller reported an overflow")
 
 
-def _of_the_network(judge: Judge) -> Iterator[Unjudged]:
-    plan = judge.plan
+def _of_the_network(validator: Validator) -> Iterator[Unchecked]:
+    plan = validator.plan
     mixed = tuple(
         name
-        for name, bus in zip(judge.channels, judge.homes.bus_of_channel, strict=False)
-        if bus == UNKNOWN and plan.is_ours
+        for name, bus in zip(validator.channels, validator.channel_map.bus_of_channel, strict=False)
+        if bus == UNKNOWN and plan.has_buses
     )
-    if not plan.is_ours:
-        yield Unjudged(("wrong-bus",), (), "the DBC has no attribute Bus; a message is at home where it came first")
+    if not plan.has_buses:
+        yield Unchecked(
+            ("wrong-bus",),
+            (),
+            "the DBC has no attribute Bus; the channel of the first frame is taken as the bus of a message",
+        )
     elif mixed:
-        why = "these channels carry several buses; name them in [channels] of a rules file if that is wrong"
-        yield Unjudged(("wrong-bus",), mixed, why)
-    if not judge.load.judged:
-        yield Unjudged(("bus-load",), (), "the DBC has neither NominalBitrate nor Baudrate")
-    if not judge.order.buses:
-        yield Unjudged(("sync-order", "state-late"), (), "the DBC has no cyclic message SYNC...")
-    if not judge.drives.drives:
-        yield Unjudged(("cia402-transition", "cia402-response"), (), f"no message has a signal {judge.drives.state}")
+        reason = (
+            "these channels carry messages of several buses; assign them in [channels] of a rules file if that is wrong"
+        )
+        yield Unchecked(("wrong-bus",), mixed, reason)
+    if not validator.load.checked:
+        yield Unchecked(("bus-load",), (), "the DBC has neither NominalBitrate nor Baudrate")
+    if not validator.order.buses:
+        yield Unchecked(("sync-order", "state-late"), (), "the DBC has no cyclic message SYNC...")
+    if not validator.drives.drives:
+        yield Unchecked(
+            ("cia402-transition", "cia402-response"), (), f"no message has a signal {validator.drives.state}"
+        )
     else:
-        deaf = tuple(
+        uncommanded = tuple(
             plan.name(drive.row)
-            for drives in judge.drives.drives.values()
+            for drives in validator.drives.drives.values()
             for drive in drives
             if drive.command_row == UNKNOWN
         )
-        if deaf:
-            yield Unjudged(("cia402-response",), deaf, f"the sender of these receives no {judge.drives.command}")
-    looked = {rule for family in plan.families for rule in judge.motion.judged(family)}
+        if uncommanded:
+            yield Unchecked(
+                ("cia402-response",),
+                uncommanded,
+                f"no message of the DBC carries a {validator.drives.command} for the senders of these messages",
+            )
+    looked = {rule for family in plan.families for rule in validator.motion.checked(family)}
     absent = tuple(rule for rule in ("velocity", "quaternion-norm", "stuck", "step") if rule not in looked)
     if absent:
-        yield Unjudged(absent, (), "no signal has the names these rules look for; a rules file may name others")
+        yield Unchecked(absent, (), "no signal has a name that these rules use; set other names in a rules file")
     if plan.refused:
         reasons = tuple(f"{m.name} ({m.reason})" for m in plan.refused)
-        yield Unjudged((), reasons, "messages whose DBC layout is not supported")
+        yield Unchecked((), reasons, "the DBC layout of these messages is not supported")
 
 
-def _of_messages(judge: Judge) -> Iterator[Unjudged]:
-    plan, counts = judge.plan, judge.counts
+def _of_messages(validator: Validator) -> Iterator[Unchecked]:
+    plan, counts = validator.plan, validator.counts
     seen = [row for row in range(len(plan.layouts)) if counts[row]]
-    for rules, rows, why in (
+    for rules, rows, reason in (
         (("crc", "crc-data-id", "counter-repeated", "counter-lost", "counter-sequence"),
          [r for r in seen if not plan.protected[r]],
-         "messages without E2EDataId and the Crc and Counter of E2E Profile 5"),
+         "messages without E2EDataId, or without the signals Crc and Counter of E2E Profile 5"),
         (("cycle-mean", "cycle-jitter", "cycle-gap", "cycle-fast", "timeout", "recovered"),
-         [r for r in seen if not plan.cycle_ns[r] and r not in judge.shared],
-         "messages that are not sent in a cycle"),
+         [r for r in seen if not plan.cycle_ns[r] and r not in validator.shared],
+         "messages that are not cyclic"),
         (("inhibit",),
          [r for r in seen if not plan.cycle_ns[r] and not plan.inhibit_ns[r]],
          "events without GenMsgDelayTime"),
         (("cycle-mean", "cycle-jitter", "cycle-gap", "cycle-fast", "timeout", "recovered", "inhibit"),
-         sorted(judge.shared),
-         "parameter groups that several addresses send"),
+         sorted(validator.shared),
+         "parameter groups with several sender addresses"),
         (("cycle-jitter",),
-         [r for r in seen if 0 < judge.timing.intervals[r] < judge.project.number("cycle-jitter", "min_intervals")
+         [r for r in seen if 0 < validator.timing.intervals[r] < validator.project.number("cycle-jitter", "min_intervals")
           and plan.cycle_ns[r]],
-         "too few intervals in the log to speak of 99 %"),
+         "too few intervals in the log for the 99 % quantile"),
         (("cycle-mean",),
-         [r for r in seen if judge.timing.intervals[r] < judge.project.number("cycle-mean", "min_intervals")
+         [r for r in seen if validator.timing.intervals[r] < validator.project.number("cycle-mean", "min_intervals")
           and plan.cycle_ns[r]],
          "too few intervals in the log"),
     ):  # fmt: skip
         if rows:
-            yield Unjudged(rules, _names(judge, rows), why)
-    silent = [row for row in range(len(plan.layouts)) if not counts[row]]
-    accused = {f.message for f in judge.findings.all() if f.rule == "never-seen"}
-    if left := [row for row in silent if plan.name(row) not in accused]:
-        yield Unjudged((), _names(judge, left), "messages of the DBC that are not in the log, and need not be")
+            yield Unchecked(rules, _names(validator, rows), reason)
+    absent_rows = [row for row in range(len(plan.layouts)) if not counts[row]]
+    reported = {f.message for f in validator.findings.all() if f.rule == "never-seen"}
+    if unseen := [row for row in absent_rows if plan.name(row) not in reported]:
+        yield Unchecked((), _names(validator, unseen), "messages of the DBC that are not in the log and not required")
 
 
-def unseen_signals(judge: Judge) -> list[tuple[Layout, str]]:
-    """Signals of messages in the log whose values no rule looked at: anything they say is taken for good."""
-    plan = judge.plan
+def unseen_signals(validator: Validator) -> list[tuple[Layout, str]]:
+    """Return the signals of received messages whose values no rule checked, with their layouts."""
+    plan = validator.plan
     found = []
     for family in plan.families:
-        motion = {name for names in judge.motion.judged(family).values() for name in names}
-        drives = {judge.drives.state} if family.rows.start in judge.drives.drives else set()
+        motion = {name for names in validator.motion.checked(family).values() for name in names}
+        drives = {validator.drives.state} if family.rows.start in validator.drives.drives else set()
         for row in family.rows:
             layout = plan.layouts[row]
-            if not judge.counts[row]:
+            if not validator.counts[row]:
                 continue
-            commands = _commands(judge, row)
+            commands = _commands(validator, row)
             covered = motion | drives | commands | (set(_E2E) if plan.protected[row] else set())
             found += [
-                (layout, f.name) for f in layout.fields if f.name not in covered and not _is_judged(judge, layout, f)
+                (layout, f.name)
+                for f in layout.fields
+                if f.name not in covered and not _is_checked(validator, layout, f)
             ]
     return found
 
 
-def _is_judged(judge: Judge, layout: Layout, field: Field) -> bool:
-    """Whether range, invalid code, value table, hash or multiplexer can find anything in it."""
+def _is_checked(validator: Validator, layout: Layout, field: Field) -> bool:
+    """Return whether a range, invalid code, value table, hash or multiplexer rule can reject a value of the field."""
     if is_limited(field) or is_enumeration(field) or field.invalid_raw is not None:
         return True
-    if is_hash(field, judge.values.hash_signal):
+    if is_hash(field, validator.values.hash_signal):
         return True
     known = layout.multiplexers.get(field.name)
     return known is not None and len(known) < 1 << min(field.length, 62)
 
 
-def _commands(judge: Judge, row: int) -> set[str]:
-    codec = next(family.codec for family in judge.plan.families if row in family.rows)
+def _commands(validator: Validator, row: int) -> set[str]:
+    codec = next(family.codec for family in validator.plan.families if row in family.rows)
     return {
-        codec.fields[drive.command_place].name
-        for drives in judge.drives.drives.values()
+        codec.fields[drive.command_index].name
+        for drives in validator.drives.drives.values()
         for drive in drives
         if drive.command_row == row
     }
 
 
-def _names(judge: Judge, rows: Sequence[int]) -> tuple[str, ...]:
-    return tuple(judge.plan.name(row) for row in np.sort(np.array(rows)).tolist())
+def _names(validator: Validator, rows: Sequence[int]) -> tuple[str, ...]:
+    return tuple(validator.plan.name(row) for row in np.sort(np.array(rows)).tolist())

@@ -1,4 +1,4 @@
-"""End-to-end protection of whole columns: the CRC of every frame, and what the alive counters say about lost ones."""
+"""Rules for end-to-end protection (E2E): CRC of every frame, and steps of the alive counters."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from atalante_tools.validate.stream import Stream
 
 Steps = npt.NDArray[np.int64]
 
-#: Steps of a message without a counter, or before which nothing was received.
-NO_STEPS = 0
+#: Counter step of a repeated frame, and mark of a frame without a counter or without a previous frame.
+REPEATED, NO_STEP = 0, -1
 
 
 def counter_steps(counters: npt.NDArray[np.uint8], before: npt.NDArray[np.uint8]) -> Steps:
-    """How far each counter moved since the frame before: 1 is in order, 0 repeated. Shape (n,), 0 to 255."""
+    """Return the step of each alive counter since the previous frame: 1 in order, 0 repeated. Shape (n,), 0 to 255."""
     return np.subtract(counters, before).astype(np.int64)
 
 
 class CrcRules:
-    """CRC against payload and Data ID."""
+    """Rules for the CRC over payload and Data ID."""
 
     def __init__(self, plan: Plan, findings: Findings) -> None:
         self._plan, self._findings = plan, findings
         lengths = np.where(plan.protected, plan.lengths, 0)
-        #: Rows of each payload length; they are neighbours.
+        #: Rows of the protected messages of each payload length, which are contiguous.
         self._spans = [
             range(int(r[0]), int(r[-1]) + 1) for n in np.unique(lengths[lengths > 0]) for r in [_at(plan, n)]
         ]
@@ -39,8 +39,8 @@ class CrcRules:
             if m.data_id is not None
         }
 
-    def judge(self, stream: Stream) -> npt.NDArray[np.bool_] | None:
-        """Report damaged frames. Returns None if all are intact, otherwise where they are; shape (n,)."""
+    def check(self, stream: Stream) -> npt.NDArray[np.bool_] | None:
+        """Report damaged frames; return which frames are intact, shape (n,), or None if all are."""
         intact: npt.NDArray[np.bool_] | None = None
         for rows in self._spans:
             span = stream.span(rows)
@@ -60,7 +60,16 @@ class CrcRules:
     def _report(
         self, of: Rows, stamps: npt.NDArray[np.int64], differences: npt.NDArray[np.uint16], length: int
     ) -> None:
-        """A CRC that is right for another message of this length says whose frame it is."""
+        """Report wrong CRCs.
+
+        A CRC that fits the Data ID of another message identifies that message, so the frame has the wrong identifier.
+
+        Args:
+            of: row of each frame, shape (k,).
+            stamps: stamp of each frame [ns], shape (k,).
+            differences: result of `crc_differences`, shape (k,).
+            length: payload length of the frames, bytes.
+        """
         names = [self._names.get((length, difference), "") for difference in differences.tolist()]
         foreign = np.array([bool(name) for name in names])
         if not bool(foreign.all()):
@@ -77,7 +86,7 @@ def _at(plan: Plan, length: int) -> npt.NDArray[np.intp]:
 
 
 class Counters:
-    """Alive counters of all messages; remembers the last of each."""
+    """Steps of the alive counters of all messages; keeps the last counter of each message."""
 
     def __init__(self, plan: Plan) -> None:
         self._protected = plan.protected
@@ -85,12 +94,12 @@ class Counters:
         self._seen = np.zeros(len(plan.layouts), np.bool_)
 
     def steps(self, stream: Stream) -> Steps:
-        """Counter steps of each frame; `NO_STEPS - 1` where there is nothing to compare with. Shape (n,)."""
+        """Return the counter step of each frame; `NO_STEP` without a counter or a previous frame. Shape (n,)."""
         counters = stream.frames.view(np.uint8).reshape(-1, FRAME_BYTES)[:, HEADER_BYTES + COUNTER_BYTE].copy()
         steps = counter_steps(counters, stream.before(counters, self._last))
-        steps[stream.starts[~self._seen[stream.present]]] = NO_STEPS - 1
+        steps[stream.starts[~self._seen[stream.present]]] = NO_STEP
         if not bool(self._protected[stream.present].all()):
-            steps[~self._protected[stream.rows]] = NO_STEPS - 1
+            steps[~self._protected[stream.rows]] = NO_STEP
         stream.last(counters, self._last)
         self._seen[stream.present] = True
         return steps

@@ -1,4 +1,4 @@
-"""What was found: one finding a rule, message and signal, with count, first, last and worst occurrence."""
+"""Findings: one per rule, message and signal, with count, first, last and worst occurrence."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from atalante_tools.validate.plan import Plan
 from atalante_tools.validate.rules import RULE_OF
 
 Stamps = npt.NDArray[np.int64]
-#: Messages told apart by an identifier or a channel that somebody else chose are unbounded; more than this many are one.
-MOST = 100
+#: Maximum number of findings of a rule in `_UNBOUNDED`; further ones are combined in one finding, `OTHERS`.
+MAX_UNKNOWN_IDS = 100
 OTHERS = "(others)"
+#: Rules whose number of findings is not bounded by the DBC.
 _UNBOUNDED = ("unknown-id",)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Finding:
-    """One rule broken by one signal, message or bus, however often."""
+    """All violations of one rule by one signal, message or bus."""
 
     rule: str
     message: str
@@ -30,21 +31,21 @@ class Finding:
     count: int
     first: int  # ns
     last: int  # ns
-    worst: str
-    badness: float
+    worst: str  # value of the worst occurrence, with unit
+    badness: float  # severity of the worst occurrence; larger is worse
 
     @property
     def first_s(self) -> float:
-        """Time of the first occurrence [s], as the log gives it."""
+        """Return the stamp of the first occurrence in the log [s]."""
         return self.first * 1e-9
 
     @property
     def last_s(self) -> float:
-        """Time of the last occurrence [s]."""
+        """Return the stamp of the last occurrence in the log [s]."""
         return self.last * 1e-9
 
     def as_json(self) -> dict[str, Any]:
-        """The finding as one object: exactly rule, message, node, count, first_s, last_s and worst."""
+        """Return the finding as a JSON object with the keys rule, message, node, count, first_s, last_s and worst."""
         return {
             "rule": self.rule,
             "message": self.message,
@@ -57,7 +58,7 @@ class Finding:
 
 
 class Findings:
-    """Gathers occurrences; the functions that judge hand them over as columns."""
+    """Collection of the findings of one log; the rules add their violations as columns."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
@@ -67,7 +68,7 @@ class Findings:
         return len(self._found)
 
     def all(self) -> list[Finding]:
-        """In the order of the rules, then by message."""
+        """Return the findings in the order of the rules, then by first occurrence."""
         order = list(RULE_OF)
         return sorted(self._found.values(), key=lambda f: (order.index(f.rule), f.first, f.message, f.signal))
 
@@ -83,22 +84,35 @@ class Findings:
         badness: npt.NDArray[Any] | None = None,
         unit: str | None = None,
     ) -> None:
-        """Occurrences of one message.
+        """Add violations of a rule by one message.
 
         Args:
-            stamps: shape (n,) [ns], n >= 1.
-            shown: what the worst value of each reads, shape (n,).
-            badness: how bad each is, shape (n,); by default `shown`.
-            unit: of `shown`, by default the rule's.
+            rule: identifier of the rule.
+            message: name of the message; a bus for the bus load, an identifier for an unknown message.
+            stamps: stamp of each violation, shape (n,) [ns], n >= 1.
+            node: sender of the message, if known.
+            signal: name of the signal; empty for a rule about the whole frame.
+            shown: value of each violation for the report, shape (n,).
+            badness: severity of each violation, shape (n,), larger is worse.  [default: `shown`]
+            unit: unit of `shown`.  [default: unit of the rule]
         """
         if badness is None:
             badness = np.asarray(shown, np.float64) if shown is not None else np.zeros(len(stamps))
         at = int(np.argmax(badness))
         worst = "" if shown is None else _text(shown[at], RULE_OF[rule].worst if unit is None else unit, signal)
-        found = Finding(
-            rule, message, node, signal, len(stamps), int(stamps.min()), int(stamps.max()), worst, float(badness[at])
+        self._merge(
+            Finding(
+                rule=rule,
+                message=message,
+                node=node,
+                signal=signal,
+                count=len(stamps),
+                first=int(stamps.min()),
+                last=int(stamps.max()),
+                worst=worst,
+                badness=float(badness[at]),
+            )
         )
-        self._merge(found)
 
     def add_rows(
         self,
@@ -111,7 +125,7 @@ class Findings:
         badness: npt.NDArray[Any] | None = None,
         unit: str | None = None,
     ) -> None:
-        """Occurrences of many messages, told apart by their row. Shapes (n,)."""
+        """Add violations of a rule by several messages; `rows` are the rows of the messages. Arguments as in `add`."""
         for row in np.unique(rows).tolist():
             of_row = rows == row
             self.add(
@@ -126,17 +140,41 @@ class Findings:
             )
 
     def add_whole(self, rule: str, row: int, first: int, last: int, *, shown: float, count: int = 1) -> None:
-        """Something about a message over a stretch of the log [ns]."""
+        """Add a violation of a rule by a message between the stamps `first` and `last` [ns]."""
         worst = _text(shown, RULE_OF[rule].worst, "")
-        self._merge(Finding(rule, self._plan.name(row), self._plan.sender(row), "", count, first, last, worst, shown))
+        self._merge(
+            Finding(
+                rule=rule,
+                message=self._plan.name(row),
+                node=self._plan.sender(row),
+                signal="",
+                count=count,
+                first=first,
+                last=last,
+                worst=worst,
+                badness=shown,
+            )
+        )
 
     def add_log(self, rule: str, stamp: int, count: int, sentence: str) -> None:
-        """Something about the log itself; the sentence says what."""
-        self._merge(Finding(rule, "", "", "", count, stamp, stamp, sentence, 0.0))
+        """Add a finding about the log itself; the sentence describes it."""
+        self._merge(
+            Finding(
+                rule=rule,
+                message="",
+                node="",
+                signal="",
+                count=count,
+                first=stamp,
+                last=stamp,
+                worst=sentence,
+                badness=0.0,
+            )
+        )
 
     def _merge(self, found: Finding) -> None:
         key = (found.rule, found.message, found.signal)
-        full = sum(rule == found.rule for rule, _, _ in self._found) >= MOST
+        full = sum(rule == found.rule for rule, _, _ in self._found) >= MAX_UNKNOWN_IDS
         if found.rule in _UNBOUNDED and key not in self._found and full:
             found.message = OTHERS
             key = (found.rule, found.message, "")

@@ -1,4 +1,4 @@
-"""The report as one HTML file: tables, and plots as inline SVG. It asks nothing of any network."""
+"""Report as one HTML file with tables and inline SVG plots. The file loads nothing from the network."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _WIDTH, _HEIGHT = 760, 200
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 28, 24, 36
 _LETTER = 7.0  # width of a character of the legend
 _COLOURS = ("#1b6ca8", "#c8553d", "#4f772d", "#7b4b94", "#b08900", "#3d5a6c", "#8d5524", "#555555")
-_POINTS = 720  # of a curve; more cannot be told apart
-_HISTOGRAMS = 12
+_POINTS = 720  # maximum points of a curve, about one per pixel
+_HISTOGRAMS = 12  # maximum number of histograms per log
 _TIMING = ("cycle-mean", "cycle-jitter", "cycle-gap", "cycle-fast", "timeout", "recovered", "state-late")
 _STYLE = """
 body { font: 14px/1.45 system-ui, sans-serif; margin: 2em auto; max-width: 74em; padding: 0 1em; color: #1c1c1c; }
@@ -35,7 +35,7 @@ svg text { font: 11px system-ui, sans-serif; fill: #333; }
 
 
 def write_html(results: Sequence[Report], path: Path) -> None:
-    """Write the report of all logs."""
+    """Write the reports of all logs into one file."""
     parts = ["<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><title>atalante validate</title>"]
     parts.append(f"<style>{_STYLE}</style></head><body><h1>CAN log against DBC</h1>")
     for result in results:
@@ -45,11 +45,11 @@ def write_html(results: Sequence[Report], path: Path) -> None:
 
 
 def _log(result: Report) -> list[str]:
-    judge, kind = result.judge, "bad" if result.findings or not result.judge.frames else "good"
-    catalogue = judge.plan.catalogue
+    validator, kind = result.validator, "bad" if result.findings or not result.validator.frames else "good"
+    catalogue = validator.plan.catalogue
     parts = [
-        f"<h2>{escape(result.name)}</h2><p>{judge.frames} frames in {result.duration_s:.3f} s on "
-        f"{escape(', '.join(judge.channels) or 'no channel')}; DBC {escape(str(catalogue.path))}, "
+        f"<h2>{escape(result.name)}</h2><p>{validator.frames} frames in {result.duration_s:.3f} s on "
+        f"{escape(', '.join(validator.channels) or 'no channel')}; DBC {escape(str(catalogue.path))}, "
         f"hash {catalogue.hash32:08X}. <span class='{kind}'>{escape(verdict(result))}</span></p>"
     ]
     if result.findings:
@@ -62,12 +62,12 @@ def _log(result: Report) -> list[str]:
     if result.silenced:
         rows_silenced = [(f.rule, f.message, f.signal, f.count, s.reason) for f, s in result.silenced]
         parts += ["<h3>Silenced</h3>", _table(("Rule", "Message", "Signal", "Count", "Reason"), rows_silenced)]
-    if result.unjudged:
-        rows_unjudged = [
-            (", ".join(u.rules) or "all", u.why, len(u.what) or "-", ", ".join(u.what)) for u in result.unjudged
+    if result.unchecked:
+        rows_unchecked = [
+            (", ".join(u.rules) or "all", u.reason, len(u.items) or "-", ", ".join(u.items)) for u in result.unchecked
         ]
-        parts += ["<h3>Not judged</h3>", _table(("Rules", "Why", "How many", "Which"), rows_unjudged)]
-    if judge.frames:
+        parts += ["<h3>Not checked</h3>", _table(("Rules", "Reason", "Count", "Items"), rows_unchecked)]
+    if validator.frames:
         parts += ["<h3>Load of each bus over time</h3>", _load_plot(result)]
         parts += ["<h3>Counter gaps over time</h3>", _gap_plot(result)]
         parts += ["<h3>Cycle times</h3>", *_histograms(result)]
@@ -95,7 +95,7 @@ def _rules() -> str:
 
 
 class _Axes:
-    """A plot area: data coordinates to pixels, frame and labels."""
+    """Plot area: converts data coordinates to pixels and draws axes, labels and curves."""
 
     def __init__(self, x: tuple[float, float], y: tuple[float, float], x_label: str, y_label: str) -> None:
         self._x, self._y = x, (y[0], y[1] if y[1] > y[0] else y[0] + 1.0)
@@ -103,7 +103,7 @@ class _Axes:
         self._shapes: list[str] = []
 
     def at(self, x: float, y: float) -> str:
-        """Pixels of a point."""
+        """Return the pixel coordinates of a point as `x,y`."""
         span = (self._x[1] - self._x[0]) or 1.0
         across = _LEFT + (x - self._x[0]) / span * (_WIDTH - _LEFT - _RIGHT)
         up = _HEIGHT - _BOTTOM - (y - self._y[0]) / (self._y[1] - self._y[0]) * (_HEIGHT - _TOP - _BOTTOM)
@@ -139,7 +139,7 @@ class _Axes:
         )
 
     def legend(self, names: Sequence[str]) -> None:
-        """As many names as there is room for."""
+        """Draw the legend; names beyond the width of the plot become an ellipsis."""
         across = float(_LEFT)
         for number, name in enumerate(names):
             width = 26 + _LETTER * len(name)
@@ -175,7 +175,7 @@ class _Axes:
 
 
 def _ticks(low: float, high: float, most: int) -> list[float]:
-    """At most so many round numbers (1, 2 or 5 and zeros) from `low` to `high`."""
+    """Return at most about `most` multiples of 1, 2 or 5 times a power of ten between `low` and `high`."""
     rough = (high - low) / most or 1.0
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(power * unit for unit in (1.0, 2.0, 5.0, 10.0) if power * unit >= rough * (1 - 1e-9))
@@ -184,11 +184,11 @@ def _ticks(low: float, high: float, most: int) -> list[float]:
 
 
 def _load_plot(result: Report) -> str:
-    load, begins = result.judge.load.load, result.judge.load.begins
+    load, begins = result.validator.load.load, result.validator.load.begins
     if len(begins) < 3:
-        return "<p class='small'>The log is too short for a load over time, or the DBC has no bit rate.</p>"
-    load, begins = 100.0 * load[1:-1], begins[1:-1] - (result.judge.begin or 0) * 1e-9
-    names = result.judge.load.names(result.judge.channels)
+        return "<p class='small'>The log is too short for a plot of the load, or the DBC has no bit rate.</p>"
+    load, begins = 100.0 * load[1:-1], begins[1:-1] - (result.validator.begin or 0) * 1e-9
+    names = result.validator.load.names(result.validator.channels)
     used = [bus for bus in range(load.shape[1]) if load[:, bus].any()]
     axes = _Axes(
         (float(begins[0]), float(begins[-1])), (0.0, max(60.0, 1.1 * float(load.max()))), "time [s]", "load [%]"
@@ -201,7 +201,7 @@ def _load_plot(result: Report) -> str:
 
 
 def _thinned(x: Vector, y: Vector) -> tuple[Vector, Vector]:
-    """The largest value of each of at most `_POINTS` stretches: peaks must not get lost."""
+    """Reduce a curve to at most `_POINTS` points; each keeps the maximum of its section, so that peaks remain visible."""
     step = math.ceil(len(x) / _POINTS)
     if step == 1:
         return x, y
@@ -210,31 +210,31 @@ def _thinned(x: Vector, y: Vector) -> tuple[Vector, Vector]:
 
 
 def _gap_plot(result: Report) -> str:
-    gaps = result.judge.timing.gaps
+    gaps = result.validator.timing.gaps
     if not gaps:
         return "<p class='small'>No alive counter has a gap.</p>"
-    begin = (result.judge.begin or 0) * 1e-9
+    begin = (result.validator.begin or 0) * 1e-9
     rows = sorted({row for _, row, _ in gaps})
     largest = max(lost for _, _, lost in gaps)
     axes = _Axes((0.0, result.duration_s or 1.0), (0.0, 1.1 * largest), "time [s]", "frames missing")
     for stamp, row, lost in gaps[:: max(1, len(gaps) // 4000)]:
-        name = result.judge.plan.name(row)
+        name = result.validator.plan.name(row)
         at = stamp * 1e-9 - begin
         axes.dot(at, float(lost), _COLOURS[rows.index(row) % len(_COLOURS)], f"{name}: {lost} at {at:.6f} s")
-    axes.legend([result.judge.plan.name(row) for row in rows[: len(_COLOURS)]])
+    axes.legend([result.validator.plan.name(row) for row in rows[: len(_COLOURS)]])
     return axes.svg()
 
 
 def _histograms(result: Report) -> list[str]:
-    """Of the messages with a finding about time, then of those that scatter most."""
-    judge = result.judge
-    accused = {f.message for f in result.findings if f.rule in _TIMING}
-    rows = [r for r in np.flatnonzero(judge.timing.intervals > 0).tolist() if judge.plan.cycle_ns[r] > 0]
-    spread = {row: _spread(judge.timing.histogram[row]) for row in rows}
-    rows.sort(key=lambda row: (judge.plan.name(row) not in accused, -spread[row]))
+    """Plot the histograms of the messages with timing findings, then of those with the widest spread of intervals."""
+    validator = result.validator
+    reported = {f.message for f in result.findings if f.rule in _TIMING}
+    rows = [r for r in np.flatnonzero(validator.timing.intervals > 0).tolist() if validator.plan.cycle_ns[r] > 0]
+    spread = {row: _spread(validator.timing.histogram[row]) for row in rows}
+    rows.sort(key=lambda row: (validator.plan.name(row) not in reported, -spread[row]))
     parts = []
     for row in rows[:_HISTOGRAMS]:
-        counts, cycle = judge.timing.histogram[row], judge.plan.cycle_ns[row] * 1e-6
+        counts, cycle = validator.timing.histogram[row], validator.plan.cycle_ns[row] * 1e-6
         used = np.flatnonzero(counts)
         first, last = max(0, int(used[0]) - 5), min(BINS, int(used[-1]) + 6)
         width = cycle / BINS_A_CYCLE
@@ -244,15 +244,18 @@ def _histograms(result: Report) -> list[str]:
             "interval [ms]",
             "log10 (1 + count)",
         )
-        for place in used.tolist():
-            axes.bar(place * width, width, math.log10(1 + int(counts[place])), _COLOURS[0])
+        for number in used.tolist():
+            axes.bar(number * width, width, math.log10(1 + int(counts[number])), _COLOURS[0])
         axes.mark(cycle, f"{cycle:g} ms")
-        more = " (the last bin has everything longer)" if int(counts[-1]) else ""
-        title = f"{judge.plan.name(row)}: {judge.timing.intervals[row]} intervals, mean {judge.timing.mean_ms(row):.4f} ms{more}"
+        more = " (the last bin also counts all longer intervals)" if int(counts[-1]) else ""
+        timing = validator.timing
+        title = (
+            f"{validator.plan.name(row)}: {timing.intervals[row]} intervals, mean {timing.mean_ms(row):.4f} ms{more}"
+        )
         parts += [f"<h4>{escape(title)}</h4>", axes.svg()]
     if len(rows) > _HISTOGRAMS:
-        parts.append(f"<p class='small'>and {len(rows) - _HISTOGRAMS} messages that scatter less</p>")
-    return parts or ["<p class='small'>No message with a cycle time came more than once.</p>"]
+        parts.append(f"<p class='small'>and {len(rows) - _HISTOGRAMS} messages with less spread</p>")
+    return parts or ["<p class='small'>No message with a cycle time was received more than once.</p>"]
 
 
 def _spread(histogram: npt.NDArray[np.int64]) -> int:

@@ -1,6 +1,6 @@
-"""All rules over all frames of one log: chunk after chunk, then what can only be said at the end.
+"""Validator of one log: applies all rules to each chunk, then the rules about the whole log.
 
-chunk -> headers (frame_rules) -> by message (stream) -> CRC, counters, time -> payloads by family -> values, motion, drives
+chunk -> headers (frame_rules) -> sort by message (stream) -> CRC, counters, time -> payloads by family -> values, motion, drives
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Iterable
 import numpy as np
 import numpy.typing as npt
 
-from atalante_tools.validate.buses import Homes
+from atalante_tools.validate.buses import ChannelMap
 from atalante_tools.validate.chunk import Chunk
 from atalante_tools.validate.drive_rules import DriveRules
 from atalante_tools.validate.e2e_rules import Counters, CrcRules, Steps
@@ -29,40 +29,40 @@ from atalante_tools.validate.value_rules import Decoded, ValueRules
 _ALL_BITS = 0x1FFF_FFFF
 
 
-class Judge:
-    """Judges one log against one DBC; after `finish`, `findings` has everything."""
+class Validator:
+    """Validator of one log against one DBC; `findings` is complete after `finish`."""
 
     def __init__(
         self, plan: Plan, project: Project | None = None, *, node: str | None = None, keeps_flags: bool = True
     ) -> None:
-        """Get ready.
+        """Create a validator without frames.
 
         Args:
-            plan: of the DBC; several judges may share it.
-            project: thresholds, silences and channels.
-            node: expect the messages of this node alone; the others may be missing.
+            plan: compiled DBC; several validators may share it.
+            project: thresholds, silenced rules and channel names; None: the default thresholds.
+            node: the only node whose messages are expected; None: all nodes.
             keeps_flags: whether the log has the flags of CAN FD frames.
         """
         self.project = project or Project()
         self.plan = plan
         self.node = node
         self.findings = Findings(self.plan)
-        self.homes = Homes(self.plan, self.project.channels)
-        self.frame_rules = FrameRules(self.plan, self.findings, self.homes, keeps_flags=keeps_flags)
+        self.channel_map = ChannelMap(self.plan, self.project.channels)
+        self.frame_rules = FrameRules(self.plan, self.findings, self.channel_map, keeps_flags=keeps_flags)
         self.keeps_flags = keeps_flags
         self._crc = CrcRules(self.plan, self.findings)
         self._counters = Counters(self.plan)
         self.timing = TimingRules(self.plan, self.findings, self.project)
         self.order = OrderRules(self.plan, self.findings, self.project)
-        self.load = LoadRules(self.plan, self.findings, self.project, self.homes)
+        self.load = LoadRules(self.plan, self.findings, self.project, self.channel_map)
         self.values = ValueRules(self.plan, self.findings, self.project)
         self.motion = MotionRules(self.plan, self.findings, self.project)
         self.drives = DriveRules(self.plan, self.findings, self.project)
         self._family_of = {row: family for family in self.plan.families for row in family.rows}
-        self._pending = np.zeros(len(self.plan.layouts), np.int64)  # refused frames since the last good one
+        self._pending = np.zeros(len(self.plan.layouts), np.int64)  # rejected frames since the last valid frame
         self._groups = [row for row, m in enumerate(self.plan.layouts) if m.pgn_mask != _ALL_BITS]
         self._address: dict[int, int] = {}
-        #: Messages that several addresses send, so that nothing can be said about their time.
+        #: Rows of messages that several addresses send; their timing is not checked.
         self.shared: set[int] = set()
         self.frames = 0
         self.counts = np.zeros(len(self.plan.layouts) + len(self.plan.refused), np.int64)
@@ -70,8 +70,13 @@ class Judge:
         self.end = 0
         self.channels: list[str] = []
 
-    def judge(self, chunk: Chunk, channels: list[str]) -> None:
-        """Judge a chunk; `channels` are the names of the log's channels so far."""
+    def check(self, chunk: Chunk, channels: list[str]) -> None:
+        """Check a chunk.
+
+        Args:
+            chunk: next frames of the log.
+            channels: names of the channels of the log so far.
+        """
         if not len(chunk):
             return
         self.channels = channels
@@ -80,72 +85,81 @@ class Judge:
         self.end = max(self.end, int(chunk.stamps[-1]))
         rows = self.frame_rules.rows(chunk)
         self.counts += np.bincount(rows[rows >= 0], minlength=len(self.counts))
-        sorted_out = self.frame_rules.judge(chunk, rows, channels)
-        self.load.judge(chunk, rows)
-        stream = sort(chunk, rows, sorted_out.good)
+        sorted_frames = self.frame_rules.check(chunk, rows, channels)
+        self.load.check(chunk, rows)
+        stream = sort(chunk, rows, sorted_frames.good)
         if len(self._groups):
             self._find_shared(stream)
-        stream, refused = self._judge_crc(stream, sorted_out)
-        explained = self._explain(stream, *refused)
+        stream, refused = self._check_crc(stream, sorted_frames)
+        rejected_before = self._rejected_before(stream, *refused)
         self.timing.arrived(refused[0], chunk.stamps[refused[1]])
         steps = self._counters.steps(stream)
-        self.timing.judge(stream, steps, explained)
-        self.order.judge(stream, steps)
-        self._judge_payloads(stream, steps)
+        self.timing.check(stream, steps, rejected_before)
+        self.order.check(stream, steps)
+        self._check_payloads(stream, steps)
 
-    def _judge_crc(self, stream: Stream, sorted_out: Sorted) -> tuple[Stream, tuple[Rows, npt.NDArray[np.intp]]]:
-        """Only intact frames go on; the damaged ones join those that were refused before."""
-        refused = sorted_out.rejected_rows, sorted_out.rejected_places
-        intact = self._crc.judge(stream)
+    def _check_crc(self, stream: Stream, sorted_frames: Sorted) -> tuple[Stream, tuple[Rows, npt.NDArray[np.intp]]]:
+        """Return the frames with a valid CRC, and the rows and indices of all rejected frames of the chunk."""
+        refused = sorted_frames.rejected_rows, sorted_frames.rejected_indices
+        intact = self._crc.check(stream)
         if intact is not None:
             rows = np.concatenate([refused[0], stream.rows[~intact]])
-            places = np.concatenate([refused[1], stream.places[~intact]])
-            refused, stream = (rows, places), stream.select(intact)
+            indices = np.concatenate([refused[1], stream.indices[~intact]])
+            refused, stream = (rows, indices), stream.select(intact)
         return stream, refused
 
-    def _explain(self, stream: Stream, rows: Rows, places: npt.NDArray[np.intp]) -> Steps | None:
-        """For each good frame, how many refused frames of its message came since the last good one; None: none at all."""
+    def _rejected_before(self, stream: Stream, rows: Rows, indices: npt.NDArray[np.intp]) -> Steps | None:
+        """Count the rejected frames between consecutive valid frames of a message.
+
+        Args:
+            stream: valid frames of the chunk, n of them.
+            rows: row of each rejected frame, shape (k,).
+            indices: index of each rejected frame in the chunk, shape (k,).
+
+        Returns:
+            Number of rejected frames before each valid frame, shape (n,); None: no frame was rejected.
+        """
         if not len(rows) and not bool(self._pending.any()):
             return None
-        explained = np.zeros(len(stream), np.int64)
+        rejected_before = np.zeros(len(stream), np.int64)
         waiting = self._pending[stream.present] > 0
-        explained[stream.starts[waiting]] += self._pending[stream.present[waiting]]
+        rejected_before[stream.starts[waiting]] += self._pending[stream.present[waiting]]
         self._pending[stream.present] = 0
         if len(rows):
-            behind = np.int64(max(int(stream.places.max(initial=0)), int(places.max())) + 1)
-            good = stream.rows.astype(np.int64) * behind + stream.places
-            at = np.searchsorted(good, rows.astype(np.int64) * behind + places)
+            stride = np.int64(max(int(stream.indices.max(initial=0)), int(indices.max())) + 1)
+            valid = stream.rows.astype(np.int64) * stride + stream.indices
+            at = np.searchsorted(valid, rows.astype(np.int64) * stride + indices)
             inside = at < len(stream)
             inside[inside] = stream.rows[at[inside]] == rows[inside]
-            np.add.at(explained, at[inside], 1)
+            np.add.at(rejected_before, at[inside], 1)
             np.add.at(self._pending, rows[~inside], 1)
-        return explained
+        return rejected_before
 
     def _find_shared(self, stream: Stream) -> None:
-        """J1939: one parameter group may come from several addresses, each with its own cycle."""
+        """Exclude J1939 parameter groups with several sender addresses from timing, because each address has its own cycle."""
         for row in self._groups:
             can_ids = np.unique(stream.frames[stream.of(row)]["can_id"]).tolist()
             if can_ids and (len(can_ids) > 1 or self._address.setdefault(row, can_ids[0]) != can_ids[0]):
                 self.shared.add(row)
                 self.timing.exclude(row)
 
-    def _judge_payloads(self, stream: Stream, steps: Steps) -> None:
+    def _check_payloads(self, stream: Stream, steps: Steps) -> None:
         decoded: dict[int, Decoded] = {}
         kept = {self._family_of[row].rows.start for row in self.drives.command_rows} | self.drives.drives.keys()
         for family in self.plan.families:
-            of_family = self.values.judge(family, stream)
+            of_family = self.values.check(family, stream)
             if of_family is not None:
-                self.motion.judge(of_family, stream, steps)
+                self.motion.check(of_family, stream, steps)
                 if family.rows.start in kept:
                     decoded[family.rows.start] = of_family
-        self.drives.judge(decoded, self._family_of, stream, steps)
+        self.drives.check(decoded, self._family_of, stream, steps)
 
     def finish(self, remarks: Iterable[Remark] = (), *, dropped: int = 0) -> None:
-        """The log is over.
+        """Apply the rules about the whole log.
 
         Args:
-            remarks: what is wrong with the log itself.
-            dropped: frames that the receiver says it lost.
+            remarks: defects of the log file.
+            dropped: number of frames that the receiver reported as lost.
         """
         begin = self.begin or 0
         for remark in remarks:
@@ -159,11 +173,11 @@ class Judge:
         self.drives.finish()
 
     def expected(self) -> npt.NDArray[np.bool_]:
-        """Messages that should be in the log: of the node asked for, of the buses that are in it. Shape (rows,)."""
+        """Return which messages must be in the log: those of the expected node and of the recorded buses. Shape (rows,)."""
         count = len(self.plan.layouts)
         wanted = np.ones(count, np.bool_)
         if self.node is not None:
             wanted &= np.array([m.sender == self.node for m in self.plan.layouts], np.bool_)
-        if self.plan.is_ours and self.homes.bus_of_channel and -1 not in self.homes.bus_of_channel:
-            wanted &= np.isin(self.plan.bus_of_row, self.homes.bus_of_channel)
+        if self.plan.has_buses and self.channel_map.bus_of_channel and -1 not in self.channel_map.bus_of_channel:
+            wanted &= np.isin(self.plan.bus_of_row, self.channel_map.bus_of_channel)
         return wanted & bool(self.frames)

@@ -1,7 +1,7 @@
-"""A log as chunks of frames: candump's format by the array parser, every other one through python-can's readers.
+"""Reader of CAN logs in chunks of frames: the array parser for candump logs, the readers of python-can for all other formats.
 
-Memory is bounded by the chunk, whatever the length of the log. What cannot be read becomes a remark, a finding like any other,
-and everything that can be read is delivered.
+The chunk size bounds the memory for a log of any length. Unreadable parts of a log become remarks, which the validator reports
+as findings; all readable frames are returned.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from atalante_tools.validate.chunk import Chunk, LogError
 
 __all__ = ["FORMATS", "Log", "LogError", "Remark", "open_log"]
 
-#: Formats of python-can's LogReader, and whether they keep direction and CAN FD flags.
+#: Suffix of each log format that python-can reads -> (records the direction, records the CAN FD flags).
 FORMATS = {
     ".log": (True, True),
     ".asc": (True, True),
@@ -34,26 +34,26 @@ FORMATS = {
     ".trc": (True, True),
     ".csv": (False, False),
 }
-_PIECE_BYTES = 1 << 21  # text parsed at once: its arrays stay in the processor's cache
-_CHUNK_FRAMES = 120_000
+_PIECE_BYTES = 1 << 21  # text parsed in one call; its arrays fit into the processor cache
+_CHUNK_FRAMES = 120_000  # minimum number of frames in a chunk; only the last chunk is smaller
 
 
 @dataclass(frozen=True)
 class Remark:
-    """Something wrong with the log itself."""
+    """Defect of a log file."""
 
-    rule: str
+    rule: str  # identifier of the rule that reports it
     sentence: str
     count: int
-    stamp: int  # ns, of the first occurrence; -1: not known
+    stamp: int  # stamp of the first occurrence [ns]; -1: unknown
 
 
 @dataclass
 class Log:
-    """A log being read; `remarks` grows while `chunks` is exhausted."""
+    """Log file; `remarks` is complete once `chunks` is exhausted."""
 
     path: Path
-    suffix: str
+    suffix: str  # suffix of the format, lower case, without .gz
     size: int  # bytes
     channels: Channels = field(default_factory=Channels)
     remarks: list[Remark] = field(default_factory=list)
@@ -61,16 +61,16 @@ class Log:
 
     @property
     def keeps_direction(self) -> bool:
-        """Whether the format can say who sent a frame."""
+        """Return whether the format records the direction of a frame."""
         return FORMATS[self.suffix][0]
 
     @property
     def keeps_flags(self) -> bool:
-        """Whether the format keeps the flags of CAN FD frames."""
+        """Return whether the format records the flags of CAN FD frames."""
         return FORMATS[self.suffix][1]
 
     def chunks(self) -> Iterator[Chunk]:
-        """The frames, in order of time within a chunk."""
+        """Yield the frames in chunks, sorted by time within a chunk."""
         frames, last = 0, -1
         backwards, first_backwards, furthest = 0, -1, 0
         for chunk in self._candump() if self.suffix == ".log" else python_can_log.read(self, _CHUNK_FRAMES):
@@ -88,17 +88,24 @@ class Log:
         if backwards:
             self.remark(
                 "log-unsorted",
-                f"{self.path} is not in order of time ({backwards} steps back, the longest {-furthest * 1e-9:.6f} s): sorted "
-                "as far as a chunk of the log reaches",
+                f"{self.path} is not in order of time ({backwards} steps back, the longest {-furthest * 1e-9:.6f} s); the frames "
+                "were sorted within each chunk of the log",
                 backwards,
                 first_backwards,
             )
         if not frames:
-            hint = "; a .log is what `candump -l` writes" if self.suffix == ".log" and self.size else ""
-            self.remark("log-empty", f"{self.path} holds no CAN frame that can be read{hint}", 1, -1)
+            hint = "; a .log file must have the format of `candump -l`" if self.suffix == ".log" and self.size else ""
+            self.remark("log-empty", f"{self.path} has no readable CAN frame{hint}", 1, -1)
 
     def remark(self, rule: str, sentence: str, count: int = 1, stamp: int = -1) -> None:
-        """Note something wrong with the log."""
+        """Add a defect of the log to `remarks`.
+
+        Args:
+            rule: identifier of the rule that reports it.
+            sentence: description for the report.
+            count: number of occurrences.
+            stamp: stamp of the first occurrence [ns]; -1: unknown.
+        """
         self.remarks.append(Remark(rule, sentence, count, stamp))
 
     # -- candump -----------------------------------------------------------------------------------------------------
@@ -116,8 +123,8 @@ class Log:
                 self.position = file.tell() if not self.compressed else self.position
                 end = MARGIN + kept + got
                 if not got:
-                    break  # at the end, or nothing more can be read: `broken` says so again
-                stop = _behind_last_newline(text, end - got, end)
+                    break  # end of the file, or a read error with its reason in `broken`
+                stop = _after_last_newline(text, end - got, end)
                 if not stop:
                     kept += got
                     if kept == _PIECE_BYTES:
@@ -143,24 +150,23 @@ class Log:
         if unreadable:
             self.remark(
                 "log-unreadable",
-                f"{self.path} has {unreadable} lines that are no CAN frame, the first is {_shown(example)}: nothing looked at "
-                "them",
+                f"{self.path} has {unreadable} lines that are no CAN frame and were not checked; the first is {_shown(example)}",
                 unreadable,
                 -1,
             )
         if broken:
-            self.remark("log-truncated", f"{self.path} breaks off: {broken}", 1, -1)
+            self.remark("log-truncated", f"{self.path} is truncated: {broken}", 1, -1)
         elif last_line:
             self.remark(
                 "log-truncated",
-                f"{self.path} ends within a line, {_shown(last_line)}: nothing looked at it",
+                f"{self.path} ends within a line, which was not checked: {_shown(last_line)}",
                 1,
                 -1,
             )
 
     @property
     def compressed(self) -> bool:
-        """Whether the file is compressed with gzip."""
+        """Return whether the file is compressed with gzip."""
         return self.path.suffix.lower() == ".gz"
 
     def _open(self) -> io.RawIOBase | gzip.GzipFile:
@@ -168,20 +174,23 @@ class Log:
 
 
 def open_log(path: Path) -> Log:
-    """A log to read.
+    """Open a log for reading.
+
+    Args:
+        path: file with a suffix of `FORMATS`, or such a suffix and .gz.
 
     Raises:
-        LogError: no such file, or a format that python-can does not read or that does not keep what is judged.
+        LogError: If the file does not exist, cannot be read, or has a suffix that is not supported.
     """
     suffixes = [suffix.lower() for suffix in path.suffixes]
     suffix = suffixes[-2] if len(suffixes) > 1 and suffixes[-1] == ".gz" else path.suffix.lower()
     if suffix not in FORMATS:
         known = ", ".join(FORMATS)
-        raise LogError(f"{path} has no suffix of a CAN log; use one of {known} (.log is candump -l)")
+        raise LogError(f"the suffix of a CAN log must be one of {known} (.log for `candump -l`), got {path}")
     if not path.is_file():
-        raise LogError(f"there is no log {path}")
+        raise LogError(f"the log {path} does not exist")
     if not os.access(path, os.R_OK):
-        raise LogError(f"the log {path} may not be read; check its permissions")
+        raise LogError(f"the log {path} cannot be read; check its permissions")
     if suffix == ".mf4":
         _require_asammdf(path)
     return Log(path, suffix, path.stat().st_size)
@@ -189,7 +198,7 @@ def open_log(path: Path) -> Log:
 
 def _require_asammdf(path: Path) -> None:
     if importlib.util.find_spec("asammdf") is None:
-        raise LogError(f"{path} is an MF4 log, which python-can reads with asammdf: pip install asammdf")
+        raise LogError(f"the MF4 log {path} needs asammdf: type `pip install asammdf`")
 
 
 def _joined(chunks: list[Chunk]) -> Chunk:
@@ -206,7 +215,7 @@ def _joined(chunks: list[Chunk]) -> Chunk:
 
 
 def _fill(file: io.RawIOBase | gzip.GzipFile, memory: memoryview) -> tuple[int, str]:
-    """Read until the memory is full or the file ends; returns the bytes read and, if none could be read any more, why."""
+    """Read until the memory is full or the file ends; return the number of bytes, and the read error if it is 0."""
     if not isinstance(file, gzip.GzipFile):
         return file.readinto(memory) or 0, ""
     total = 0
@@ -221,8 +230,8 @@ def _fill(file: io.RawIOBase | gzip.GzipFile, memory: memoryview) -> tuple[int, 
     return total, ""
 
 
-def _behind_last_newline(text: npt.NDArray[np.uint8], begin: int, end: int) -> int:
-    """Place behind the last newline of `text[begin:end]`, 0 if there is none; it is nearly always in the last few bytes."""
+def _after_last_newline(text: npt.NDArray[np.uint8], begin: int, end: int) -> int:
+    """Return the index after the last newline of `text[begin:end]`, or 0 without one; search the last bytes first."""
     for first in (max(begin, end - 4 * MARGIN), begin):
         newlines = np.flatnonzero(text[first:end] == ord("\n"))
         if len(newlines):

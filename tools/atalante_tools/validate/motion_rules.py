@@ -1,6 +1,6 @@
-"""Plausibility: does the velocity fit the position, has a quaternion length 1, does a value jump, or stand still entirely?
+"""Plausibility rules: velocity against position, norm of quaternions, steps of slow values, and values without noise.
 
-Signals are found by their names (`codec.group_of`); a project's rules file may name others.
+The signals are selected by name (`codec.group_of`). The rules file of a project may set other names.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.codec import group_of
-from atalante_tools.validate.e2e_rules import NO_STEPS, Steps
+from atalante_tools.validate.e2e_rules import REPEATED, Steps
 from atalante_tools.validate.findings import Findings
 from atalante_tools.validate.plan import Family, Plan
 from atalante_tools.validate.project import Project
@@ -19,11 +19,11 @@ from atalante_tools.validate.stream import Stream
 from atalante_tools.validate.value_rules import Decoded
 
 Vector = npt.NDArray[np.float64]
-_ELEMENTS = 4  # of a quaternion
+_ELEMENTS = 4  # elements of a quaternion
 
 
 class MotionRules:
-    """Plausibility of the values of all families."""
+    """Plausibility check of the values of all families."""
 
     def __init__(self, plan: Plan, findings: Findings, project: Project) -> None:
         self._families = {
@@ -40,32 +40,41 @@ class MotionRules:
             for family in plan.families
         }
 
-    def judge(self, decoded: Decoded, stream: Stream, steps: Steps) -> None:
-        """Judge the frames of a family. `steps` of the whole stream, shape (n,)."""
+    def check(self, decoded: Decoded, stream: Stream, steps: Steps) -> None:
+        """Check the frames of a family.
+
+        Args:
+            decoded: decoded frames of the family.
+            stream: frames of the chunk by message, shape (n,).
+            steps: steps of the alive counters of the whole stream, shape (n,).
+        """
         for rule in self._families[decoded.family.rows.start]:
-            rule.judge(decoded, stream, steps)
+            rule.check(decoded, stream, steps)
 
     def finish(self, end: int) -> None:
-        """The log is over at `end` [ns]."""
+        """Apply the rules about the whole log, whose last stamp is `end` [ns]."""
         for rules in self._families.values():
             for rule in rules:
                 if isinstance(rule, _Stuck):
                     rule.finish(end)
 
-    def judged(self, family: Family) -> dict[str, list[str]]:
-        """Rule -> signals of the family that it looks at."""
+    def checked(self, family: Family) -> dict[str, list[str]]:
+        """Return the signals of the family that each rule checks, by rule identifier."""
         return {
-            rule.id: [family.codec.fields[p].name for p in rule.places] for rule in self._families[family.rows.start]
+            rule.id: [family.codec.fields[p].name for p in rule.indices] for rule in self._families[family.rows.start]
         }
 
 
 class _Velocity:
-    """Mean velocity over a window against the change of position in it; the lag of the velocity's filter is allowed for."""
+    """Rule that compares the mean velocity in a window with the change of position.
+
+    The tolerance includes the lag of the velocity filter.
+    """
 
     id = "velocity"
 
-    def __init__(self, places: Sequence[int], findings: Findings, project: Project) -> None:
-        self.places = places
+    def __init__(self, indices: Sequence[int], findings: Findings, project: Project) -> None:
+        self.indices = indices
         self._findings = findings
         number = project.number
         self._window = max(2, int(number(self.id, "window")))
@@ -76,24 +85,24 @@ class _Velocity:
     @classmethod
     def of(cls, family: Family, findings: Findings, project: Project) -> _Velocity | None:
         names = [project.text(cls.id, "position"), project.text(cls.id, "velocity")]
-        places = [p for name in names for p, f in enumerate(family.codec.fields) if f.name == name]
-        return cls(places, findings, project) if len(places) == len(names) else None
+        indices = [p for name in names for p, f in enumerate(family.codec.fields) if f.name == name]
+        return cls(indices, findings, project) if len(indices) == len(names) else None
 
-    def judge(self, decoded: Decoded, stream: Stream, steps: Steps) -> None:
-        fields = [decoded.family.codec.fields[p] for p in self.places]
+    def check(self, decoded: Decoded, stream: Stream, steps: Steps) -> None:
+        fields = [decoded.family.codec.fields[p] for p in self.indices]
         position, velocity = (
-            decoded.codes[p] * float(f.factor) + float(f.offset) for p, f in zip(self.places, fields, strict=True)
+            decoded.codes[p] * float(f.factor) + float(f.offset) for p, f in zip(self.indices, fields, strict=True)
         )
         good = steps[decoded.span] <= 1
-        for place in self.places:
-            if place in decoded.bad:
-                good &= ~decoded.bad[place]
+        for index in self.indices:
+            if index in decoded.bad:
+                good &= ~decoded.bad[index]
         stamps = stream.stamps[decoded.span]
-        for row, first, behind in stream.bounds(decoded.family):
-            part = slice(first, behind)
-            self._judge_row(row, stamps[part], position[part], velocity[part], good[part])
+        for row, first, end in stream.bounds(decoded.family):
+            part = slice(first, end)
+            self._check_row(row, stamps[part], position[part], velocity[part], good[part])
 
-    def _judge_row(
+    def _check_row(
         self, row: int, stamps: npt.NDArray[np.int64], position: Vector, velocity: Vector, good: npt.NDArray[np.bool_]
     ) -> None:
         if row in self._left:
@@ -108,7 +117,7 @@ class _Velocity:
             return
         ends = np.arange(windows + 1) * width
         duration = np.diff(stamps[ends]) * 1e-9
-        # The velocity of a frame says how it moved since the one before: the window's first frame belongs to the last window.
+        # The velocity of a frame is the motion since the previous frame, so the first frame of a window belongs to the last one.
         inside = velocity[1 : whole + 1].reshape(windows, width)
         mean = inside.mean(axis=1)
         moved = np.diff(position[ends]) / np.where(duration > 0, duration, np.inf)
@@ -121,34 +130,34 @@ class _Velocity:
 
 
 class _Quaternion:
-    """Length of each quaternion."""
+    """Rule for the norm of quaternions."""
 
     id = "quaternion-norm"
 
-    def __init__(self, places: Sequence[int], findings: Findings, project: Project) -> None:
-        self.places = places
+    def __init__(self, indices: Sequence[int], findings: Findings, project: Project) -> None:
+        self.indices = indices
         self._findings = findings
         self._tolerance = project.number(self.id, "tolerance")
 
     @classmethod
     def of(cls, family: Family, findings: Findings, project: Project) -> _Quaternion | None:
         wanted = project.text(cls.id, "group")
-        places = [p for p, f in enumerate(family.codec.fields) if group_of(f.name) == wanted and f.kind != "float"]
-        return cls(places, findings, project) if len(places) == _ELEMENTS else None
+        indices = [p for p, f in enumerate(family.codec.fields) if group_of(f.name) == wanted and f.kind != "float"]
+        return cls(indices, findings, project) if len(indices) == _ELEMENTS else None
 
-    def judge(self, decoded: Decoded, stream: Stream, steps: Steps) -> None:
+    def check(self, decoded: Decoded, stream: Stream, steps: Steps) -> None:
         squares: Vector = np.zeros(decoded.raw.shape[1])
-        for place in self.places:
-            element = decoded.codes[place] * float(decoded.family.codec.fields[place].factor)
+        for index in self.indices:
+            element = decoded.codes[index] * float(decoded.family.codec.fields[index].factor)
             element *= element
             squares += element
         low, high = max(0.0, 1.0 - self._tolerance) ** 2, (1.0 + self._tolerance) ** 2
         if float(squares.min()) >= low and float(squares.max()) <= high:
             return
         wrong = (squares < low) | (squares > high)
-        for place in self.places:
-            if place in decoded.bad:
-                wrong &= ~decoded.bad[place]
+        for index in self.indices:
+            if index in decoded.bad:
+                wrong &= ~decoded.bad[index]
         if bool(wrong.any()):
             norm = np.sqrt(squares[wrong])
             rows, stamps = stream.rows[decoded.span][wrong], stream.stamps[decoded.span][wrong]
@@ -156,48 +165,53 @@ class _Quaternion:
 
 
 class _Columns:
-    """Columns of a family beside the same columns one frame earlier, over the boundaries of messages and chunks."""
+    """Columns of a family with the values of the previous frame of the same message, across chunks."""
 
-    def __init__(self, family: Family, places: Sequence[int]) -> None:
-        self._places = np.array(places, np.intp)
-        self._last = np.zeros((len(places), len(family.rows)), np.int64)
+    def __init__(self, family: Family, indices: Sequence[int]) -> None:
+        self._indices = np.array(indices, np.intp)
+        self._last = np.zeros((len(indices), len(family.rows)), np.int64)
         self._seen = np.zeros(len(family.rows), np.bool_)
         self._first_row = family.rows.start
 
     def with_before(
         self, decoded: Decoded, stream: Stream
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], list[int]]:
-        """The codes, those of the frame before, shape (fields, n) each, and the frames that have none before them."""
-        codes = decoded.codes[self._places]
+        """Pair the codes of each frame with those of the previous frame.
+
+        Returns:
+            The codes, the codes of the previous frame, shape (fields, n) each, and the indices of the frames without a previous
+            frame.
+        """
+        codes = decoded.codes[self._indices]
         before = np.empty_like(codes)
         before[:, 1:] = codes[:, :-1]
         new = []
-        for row, first, behind in stream.bounds(decoded.family):
+        for row, first, end in stream.bounds(decoded.family):
             number = row - self._first_row
             if self._seen[number]:
                 before[:, first] = self._last[:, number]
             else:
                 before[:, first] = codes[:, first]
                 new.append(first)
-            self._last[:, number] = codes[:, behind - 1]
+            self._last[:, number] = codes[:, end - 1]
             self._seen[number] = True
         return codes, before, new
 
 
 class _Steps:
-    """Values that move slowly, and then jump."""
+    """Rule for values that change slowly: the step from one frame to the next is limited."""
 
     id = "step"
 
     def __init__(self, family: Family, limits: dict[int, float], findings: Findings) -> None:
-        self.places = list(limits)
+        self.indices = list(limits)
         self._findings = findings
-        self._columns = _Columns(family, self.places)
-        fields = [family.codec.fields[p] for p in self.places]
+        self._columns = _Columns(family, self.indices)
+        fields = [family.codec.fields[p] for p in self.indices]
         self._limits = np.array([limit / abs(f.factor) for limit, f in zip(limits.values(), fields, strict=True)])
         self._first_row = family.rows.start
-        #: Whether the last value was found wrong, by (field, row): then the next one may jump back.
-        self._was_bad = np.zeros((len(self.places), len(family.rows)), np.bool_)
+        #: Whether the last value was invalid, shape (fields, rows); the step back to a valid value is then no finding.
+        self._was_bad = np.zeros((len(self.indices), len(family.rows)), np.bool_)
 
     @classmethod
     def of(cls, family: Family, findings: Findings, project: Project) -> _Steps | None:
@@ -209,28 +223,31 @@ class _Steps:
         }
         return cls(family, limits, findings) if limits else None
 
-    def judge(self, decoded: Decoded, stream: Stream, steps: Steps) -> None:
+    def check(self, decoded: Decoded, stream: Stream, steps: Steps) -> None:
         codes, before, _ = self._columns.with_before(decoded, stream)
         moved = np.abs(codes - before)
-        for row, first, behind in stream.bounds(decoded.family):
+        for row, first, end in stream.bounds(decoded.family):
             moved[self._was_bad[:, row - self._first_row], first] = 0
-            for at, place in enumerate(self.places):
-                bad = decoded.bad.get(place)
-                self._was_bad[at, row - self._first_row] = bad is not None and bool(bad[behind - 1])
+            for at, index in enumerate(self.indices):
+                bad = decoded.bad.get(index)
+                self._was_bad[at, row - self._first_row] = bad is not None and bool(bad[end - 1])
         for at in np.flatnonzero(moved.max(axis=1) > self._limits).tolist():
-            self._judge_column(decoded, stream, steps, at, moved[at])
+            self._check_column(decoded, stream, steps, at, moved[at])
 
-    def _judge_column(
+    def _check_column(
         self, decoded: Decoded, stream: Stream, steps: Steps, at: int, moved: npt.NDArray[np.int64]
     ) -> None:
-        """Nothing is said about the frame behind a gap, nor about a value found wrong and the one that follows it."""
-        place = self.places[at]
+        """Check one column.
+
+        Frames after lost frames, invalid values and values directly after an invalid value are not checked.
+        """
+        index = self.indices[at]
         wrong = (moved > self._limits[at]) & (steps[decoded.span] <= 1)
-        if (bad := decoded.bad.get(place)) is not None:
+        if (bad := decoded.bad.get(index)) is not None:
             wrong &= ~bad
             wrong[1:] &= ~bad[:-1]
         if bool(wrong.any()):
-            limits = decoded.family.codec.fields[place]
+            limits = decoded.family.codec.fields[index]
             self._findings.add_rows(
                 self.id,
                 stream.rows[decoded.span][wrong],
@@ -242,38 +259,39 @@ class _Steps:
 
 
 class _Stuck:
-    """Measured values have noise: one that is the same to the last bit for long is not measured any more."""
+    """Rule for measured values: a value without noise, constant to the last bit, is reported as stuck."""
 
     id = "stuck"
 
-    def __init__(self, family: Family, places: Sequence[int], findings: Findings, frames: int) -> None:
-        self.places = list(places)
+    def __init__(self, family: Family, indices: Sequence[int], findings: Findings, frames: int) -> None:
+        self.indices = list(indices)
         self._family, self._findings, self._frames = family, findings, frames
-        self._columns = _Columns(family, places)
-        #: Frames in a row without a change so far, by (field, row); and the last stamp.
-        self._run = np.zeros((len(self.places), len(family.rows)), np.int64)
+        self._columns = _Columns(family, indices)
+        #: Consecutive frames without a change so far, shape (fields, rows).
+        self._run = np.zeros((len(self.indices), len(family.rows)), np.int64)
+        #: Last stamp of each row [ns].
         self._stamp = np.zeros(len(family.rows), np.int64)
 
     @classmethod
     def of(cls, family: Family, findings: Findings, project: Project) -> _Stuck | None:
         groups = project.names(cls.id, "groups")
-        places = [p for p, f in enumerate(family.codec.fields) if group_of(f.name) in groups and not f.selectors]
-        return cls(family, places, findings, int(project.number(cls.id, "frames"))) if places else None
+        indices = [p for p, f in enumerate(family.codec.fields) if group_of(f.name) in groups and not f.selectors]
+        return cls(family, indices, findings, int(project.number(cls.id, "frames"))) if indices else None
 
-    def judge(self, decoded: Decoded, stream: Stream, steps: Steps) -> None:
+    def check(self, decoded: Decoded, stream: Stream, steps: Steps) -> None:
         codes, before, _ = self._columns.with_before(decoded, stream)
-        repeated = steps[decoded.span] == NO_STEPS  # a repeated frame says nothing new
+        repeated = steps[decoded.span] == REPEATED  # a repeated frame has no new value
         still = codes == before
-        for row, first, behind in stream.bounds(decoded.family):
+        for row, first, end in stream.bounds(decoded.family):
             number = row - self._family.rows.start
-            stamps = stream.stamps[decoded.span][first:behind]
-            fresh = np.flatnonzero(~repeated[first:behind]) if bool(repeated[first:behind].any()) else None
-            for at in range(len(self.places)):
-                part = still[at, first:behind]
-                self._judge_column(at, number, part if fresh is None else part[fresh], stamps)
+            stamps = stream.stamps[decoded.span][first:end]
+            fresh = np.flatnonzero(~repeated[first:end]) if bool(repeated[first:end].any()) else None
+            for at in range(len(self.indices)):
+                part = still[at, first:end]
+                self._check_column(at, number, part if fresh is None else part[fresh], stamps)
             self._stamp[number] = stamps[-1]
 
-    def _judge_column(self, at: int, number: int, still: npt.NDArray[np.bool_], stamps: npt.NDArray[np.int64]) -> None:
+    def _check_column(self, at: int, number: int, still: npt.NDArray[np.bool_], stamps: npt.NDArray[np.int64]) -> None:
         moves = np.flatnonzero(~still)
         if not len(moves):
             self._run[at, number] += len(still)
@@ -285,7 +303,7 @@ class _Stuck:
         self._run[at, number] = len(still) - 1 - int(moves[-1])
 
     def finish(self, end: int) -> None:
-        """Values that were still not moving when the log ended."""
+        """Report the values that are constant at the end of the log, whose last stamp is `end` [ns]."""
         for at, number in np.argwhere(self._run >= self._frames).tolist():
             stamp = min(end, int(self._stamp[number]))
             self._report(at, number, np.array([stamp], np.int64), self._run[at, number : number + 1])
@@ -295,6 +313,6 @@ class _Stuck:
             self.id,
             np.full(len(stamps), self._family.rows.start + number),
             stamps,
-            signal=self._family.codec.fields[self.places[at]].name,
+            signal=self._family.codec.fields[self.indices[at]].name,
             shown=runs,
         )

@@ -1,4 +1,4 @@
-"""Order within the cycle: SYNC first, then every state of its bus, before the deadline."""
+"""Rules for the order within a cycle: SYNC first, then every state of its bus before the deadline."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from atalante_tools.validate.plan import UNKNOWN, Plan
 from atalante_tools.validate.project import Project
 from atalante_tools.validate.stream import Stream
 
-Places = npt.NDArray[np.intp]
+Indices = npt.NDArray[np.intp]
 
-#: A message of this name, and of the cycle of the states, begins the cycle of its bus.
+#: Prefix of the name of the message that starts the cycle of its bus.
 SYNC = "SYNC"
 
 
 @dataclass
 class _Bus:
-    """One bus with a SYNC, and what the chunks before left behind."""
+    """One bus with a SYNC message, and its state at the end of the last chunk."""
 
-    sync: int  # row
-    states: list[int]  # rows
+    sync: int  # row of the SYNC message
+    states: list[int]  # rows of the state messages
     cycle_ns: float
-    count: int = 0  # SYNCs so far
-    stamp: int = 0  # of the last one
-    cycle_of: dict[int, int] = field(default_factory=dict)  # row -> cycle of its last state
-    jump_of: dict[int, int] = field(default_factory=dict)  # row -> how far that was from the one before
-    doubtful: dict[int, int] = field(default_factory=dict)  # row -> stamp of a second state in its cycle
+    count: int = 0  # SYNC frames so far
+    stamp: int = 0  # stamp of the last SYNC frame [ns]
+    cycle_of: dict[int, int] = field(default_factory=dict)  # row -> cycle of the last state frame
+    jump_of: dict[int, int] = field(default_factory=dict)  # row -> cycles between the last two state frames
+    doubtful: dict[int, int] = field(default_factory=dict)  # row -> stamp of a second state frame in one cycle [ns]
 
 
 class OrderRules:
-    """Counts the SYNCs of each bus and asks in which cycle, and how long after its SYNC, each state came."""
+    """Rules for the cycle of each state frame and for its delay after the SYNC frame."""
 
     def __init__(self, plan: Plan, findings: Findings, project: Project) -> None:
         self._findings = findings
@@ -50,30 +50,35 @@ class OrderRules:
             self.buses.append(_Bus(row, states, float(plan.cycle_ns[row])))
 
     @property
-    def judged(self) -> set[int]:
-        """Rows that are judged."""
+    def checked(self) -> set[int]:
+        """Return the rows that are checked."""
         return {row for bus in self.buses for row in (bus.sync, *bus.states)}
 
-    def judge(self, stream: Stream, steps: Steps) -> None:
-        """Judge a chunk. `steps` of the alive counters, shape (n,)."""
+    def check(self, stream: Stream, steps: Steps) -> None:
+        """Check a chunk.
+
+        Args:
+            stream: frames of the chunk by message, shape (n,).
+            steps: steps of the alive counters, shape (n,).
+        """
         for bus in self.buses:
             span = stream.of(bus.sync)
-            places, stamps = stream.places[span], stream.stamps[span]
+            indices, stamps = stream.indices[span], stream.stamps[span]
             begins = np.concatenate([[bus.stamp], stamps])
             for row in bus.states:
                 of = stream.of(row)
                 if of.start != of.stop:
-                    number = _cycles(places, stream.places[of])
-                    self._judge_lateness(bus, row, stream.stamps[of], begins[number], number)
-                    self._judge_order(bus, row, stream.stamps[of], steps[of], number + bus.count, begins)
+                    number = _cycles(indices, stream.indices[of])
+                    self._check_lateness(bus, row, stream.stamps[of], begins[number], number)
+                    self._check_order(bus, row, stream.stamps[of], steps[of], number + bus.count, begins)
             if len(stamps):
                 bus.count += len(stamps)
                 bus.stamp = int(stamps[-1])
 
-    def _judge_lateness(
-        self, bus: _Bus, row: int, stamps: npt.NDArray[np.int64], begins: npt.NDArray[np.int64], number: Places
+    def _check_lateness(
+        self, bus: _Bus, row: int, stamps: npt.NDArray[np.int64], begins: npt.NDArray[np.int64], number: Indices
     ) -> None:
-        """Within the cycle; what comes even later is in the next cycle, see `_judge_order`."""
+        """Report states after the deadline of their cycle; `_check_order` reports states in the next cycle."""
         after = stamps - begins
         late = (after > self._deadline * bus.cycle_ns) & (after < bus.cycle_ns)
         if not bus.count:
@@ -81,18 +86,28 @@ class OrderRules:
         if bool(late.any()):
             self._report("state-late", row, stamps[late], after[late])
 
-    def _judge_order(
+    def _check_order(
         self,
         bus: _Bus,
         row: int,
         stamps: npt.NDArray[np.int64],
         steps: Steps,
-        cycles: Places,
+        cycles: Indices,
         begins: npt.NDArray[np.int64],
     ) -> None:
-        """Two states in one cycle and none in the next: the second came before its SYNC. None, then two: the first was late.
+        """Report states in the wrong cycle.
 
-        A SYNC that is missing from the log makes two in one cycle as well, but then the cycle after it has its one.
+        If a cycle has two states and the next cycle has none, the second state came before its SYNC. If a cycle has none and the
+        next cycle has two, the first state was late. A SYNC that is missing in the log also gives two states in one cycle, but
+        then the next cycle has one state.
+
+        Args:
+            bus: bus of the state message.
+            row: row of the state message.
+            stamps: stamp of each state [ns], shape (n,).
+            steps: step of the alive counter of each state, shape (n,).
+            cycles: number of the cycle of each state, shape (n,).
+            begins: stamp of the last SYNC of the previous chunk, then of each SYNC of the chunk [ns], shape (m + 1,).
         """
         first = bus.cycle_of.get(row)
         jumps = np.diff(cycles, prepend=cycles[0] - 1 if first is None else first)
@@ -121,8 +136,13 @@ class OrderRules:
         self._findings.add_rows(rule, np.full(len(stamps), row), stamps, shown=shown)
 
 
-def _cycles(syncs: Places, states: Places) -> Places:
-    """How many SYNCs of the chunk came before each state. Places in the log, shapes (m,) and (n,)."""
+def _cycles(syncs: Indices, states: Indices) -> Indices:
+    """Return the number of SYNC frames before each state frame, shape (n,).
+
+    Args:
+        syncs: indices of the SYNC frames in the chunk, ascending, shape (m,).
+        states: indices of the state frames in the chunk, ascending, shape (n,).
+    """
     if len(syncs) == len(states) and bool((syncs < states).all()) and bool((states[:-1] < syncs[1:]).all()):
         return np.arange(1, len(states) + 1)
     return np.searchsorted(syncs, states)

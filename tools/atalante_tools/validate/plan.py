@@ -1,4 +1,4 @@
-"""The DBC compiled for judging: one row a message, rows of equal layout side by side, and the row of an identifier."""
+"""DBC compiled for the validator: one row per message, contiguous rows for equal layouts, and the row of each identifier."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from atalante_dbc.foreign import Catalogue, Layout, Refused
 from atalante_hal.bulk import BulkCodec, crc_of_zeros
 from atalante_hal.frame import FLAG_BRS, FLAG_FDF, ID_EXTENDED, header_word
 
-#: Row of an identifier that no message has.
+#: Row of an identifier that is not in the DBC.
 UNKNOWN = -1
 _STANDARD = 1 << 11
 _ALL_BITS = 0x1FFF_FFFF
@@ -22,37 +22,38 @@ Rows = npt.NDArray[np.int16]
 
 @dataclass(frozen=True)
 class Family:
-    """Messages whose fields are the same: one plan decodes the frames of all of them."""
+    """Messages with equal fields, which are decoded together."""
 
     rows: range
     codec: BulkCodec
 
     @property
     def length(self) -> int:
-        """Bytes."""
+        """Return the length of the messages, bytes."""
         return self.codec.layout.length
 
 
 class Plan:
-    """Rows are ordered by length, then by layout, so that what can be computed together lies together.
+    """Arrays of message properties, indexed by row.
 
-    A message that the DBC loader refused has a row as well, behind the others: its frames are counted, nothing looks inside.
+    The rows are ordered by length, then by layout, so that messages which are processed together are contiguous. The messages
+    with an unsupported layout have the last rows. Their frames are counted but not decoded.
     """
 
     def __init__(self, catalogue: Catalogue) -> None:
         self.catalogue = catalogue
         keys = [_shape(layout) for layout in catalogue.layouts]
-        first = {key: place for place, key in reversed(list(enumerate(keys)))}
-        order = sorted(range(len(keys)), key=lambda place: (catalogue.layouts[place].length, first[keys[place]], place))
-        self.layouts: tuple[Layout, ...] = tuple(catalogue.layouts[place] for place in order)
+        first = {key: index for index, key in reversed(list(enumerate(keys)))}
+        order = sorted(range(len(keys)), key=lambda index: (catalogue.layouts[index].length, first[keys[index]], index))
+        self.layouts: tuple[Layout, ...] = tuple(catalogue.layouts[index] for index in order)
         self.refused: tuple[Refused, ...] = catalogue.refused
         self.row_of = {layout.name: row for row, layout in enumerate(self.layouts)}
-        self.families = _families(self.layouts, [keys[place] for place in order])
+        self.families = _families(self.layouts, [keys[index] for index in order])
         self._index_identifiers()
         count = len(self.layouts)
         headers = [header_word(_can_id(m), m.length, _flags(m)) for m in self.layouts]
-        #: First word of a frame of each row as it should be; a refused message's never is.
-        self.headers = np.array([*headers, *([0] * len(self.refused)), 0], np.uint64)  # the last is that of `UNKNOWN`
+        #: Expected first word of a frame of each row; 0 for unsupported messages, whose frames are not compared.
+        self.headers = np.array([*headers, *([0] * len(self.refused)), 0], np.uint64)  # the last one is for `UNKNOWN`
         self.lengths = np.array([m.length for m in self.layouts], np.int64)
         self.cycle_ns = np.array([1e6 * (m.cycle_ms or 0.0) if m.cyclic else 0.0 for m in self.layouts])
         self.timeout_ns = np.array([1e6 * (m.timeout_ms or 0.0) for m in self.layouts])
@@ -72,17 +73,17 @@ class Plan:
         assert len(self.row_of) == count
 
     @property
-    def is_ours(self) -> bool:
-        """Whether the DBC says which bus a message belongs to."""
+    def has_buses(self) -> bool:
+        """Return whether the DBC assigns messages to buses."""
         return bool(self.catalogue.buses)
 
     def name(self, row: int) -> str:
-        """Message of a row."""
+        """Return the name of the message of a row."""
         count = len(self.layouts)
         return self.layouts[row].name if row < count else self.refused[row - count].name
 
     def sender(self, row: int) -> str:
-        """Sending node of a row, empty where the DBC names none."""
+        """Return the sending node of a row; empty if the DBC names none."""
         return self.layouts[row].sender or "" if row < len(self.layouts) else ""
 
     # -- identifiers -------------------------------------------------------------------------------------------------
@@ -99,7 +100,7 @@ class Plan:
                 continue
             extended[frame_id] = row
             if mask != _ALL_BITS:
-                # Two messages of one parameter group can be told apart by their whole identifier only.
+                # Only the whole identifier distinguishes two messages of one parameter group.
                 known = groups.setdefault(mask, {})
                 known[frame_id & mask] = UNKNOWN if frame_id & mask in known else row
         self._standard = standard
@@ -107,14 +108,14 @@ class Plan:
         self._groups = [(np.uint32(mask), _Table(rows)) for mask, rows in groups.items()]
 
     def rows(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
-        """Row of each identifier (with its flags), `UNKNOWN` where there is none. Shape (n,)."""
+        """Return the row of each identifier with flags; `UNKNOWN` for identifiers that are not in the DBC. Shape (n,)."""
         if int(can_ids.max(initial=0)) < _STANDARD:
             return self._standard[can_ids]
         is_standard = can_ids < _STANDARD
         rows = self._standard[np.where(is_standard, can_ids, 0)]
         rows[~is_standard] = UNKNOWN
-        places = np.flatnonzero((can_ids & np.uint32(0xE0000000)) == ID_EXTENDED)
-        rows[places] = self._rows_extended(can_ids[places] & np.uint32(_ALL_BITS))
+        indices = np.flatnonzero((can_ids & np.uint32(0xE0000000)) == ID_EXTENDED)
+        rows[indices] = self._rows_extended(can_ids[indices] & np.uint32(_ALL_BITS))
         return rows
 
     def _rows_extended(self, numbers: npt.NDArray[np.uint32]) -> Rows:
@@ -127,7 +128,7 @@ class Plan:
         return rows
 
     def rows_in_other_format(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
-        """Rows that have the same number with the other identifier length, `UNKNOWN` where none has. Shape (n,)."""
+        """Return the row of the same identifier in the other format (11 or 29 bits), otherwise `UNKNOWN`. Shape (n,)."""
         numbers = can_ids & np.uint32(_ALL_BITS)
         short = self._standard[np.where(numbers < _STANDARD, numbers, 0)]
         short[numbers >= _STANDARD] = UNKNOWN
@@ -136,7 +137,7 @@ class Plan:
 
 
 class _Table:
-    """Numbers and their rows, looked up by bisection."""
+    """Rows of identifiers, found by bisection."""
 
     def __init__(self, rows: dict[int, int]) -> None:
         self._numbers = np.array(sorted(rows), np.uint32)
@@ -160,7 +161,7 @@ def _flags(layout: Layout) -> int:
 
 
 def _shape(layout: Layout) -> tuple[object, ...]:
-    """What must be equal for two messages to be decoded and judged together."""
+    """Return the properties that are equal for all messages of a family."""
     fields = tuple(
         (
             *(f.name, f.start, f.length, f.big_endian, f.kind, f.factor, f.offset, f.minimum, f.maximum, f.invalid_raw),

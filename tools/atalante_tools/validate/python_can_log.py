@@ -1,7 +1,7 @@
-"""Logs that python-can reads (.asc, .blf, .mf4, .trc, .csv) as chunks of frames, and what its readers do not tell.
+"""Reader of the logs of python-can (.asc, .blf, .mf4, .trc, .csv) in chunks of frames.
 
-They drop what they do not understand with a line in Python's log, take a record that breaks off for a shorter one, and leave
-files open: all of that is made up for here.
+The readers of python-can skip entries that they cannot parse and only log a warning. They return a truncated record as a shorter
+frame, and they leave files open. This module counts the skipped entries, detects truncated records and closes the files.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ import numpy as np
 
 from atalante_hal.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, FRAME_BYTES, ID_ERROR, ID_EXTENDED, ID_REMOTE, new_frames
 from atalante_tools.validate.candump import Channels
-from atalante_tools.validate.chunk import NOT_SAID, RECEIVED, SENT, Chunk, LogError
+from atalante_tools.validate.chunk import NO_DIRECTION, RECEIVED, SENT, Chunk, LogError
 
 if TYPE_CHECKING:
     from atalante_tools.validate.log import Log
 
-#: One frame a line: a file that does not end in a newline breaks off within a frame.
+#: Formats with one frame per line; a file without a newline at its end is truncated within a frame.
 _LINE_FORMATS = (".asc", ".trc", ".csv")
 _BLF_HEADER = struct.Struct("<4sLBBBBBBBBQQ")
 #: First bytes of an MDF file.
@@ -36,13 +36,21 @@ _RECORD = struct.Struct("<IBB2x64s")
 
 
 def read(log: Log, chunk_frames: int) -> Iterator[Chunk]:
-    """The frames of a log in chunks of `chunk_frames`; raises `LogError` if it is no log of its format at all."""
+    """Yield the frames of a log in chunks.
+
+    Args:
+        log: log to read; channels, position and remarks are updated.
+        chunk_frames: number of frames in each chunk but the last.
+
+    Raises:
+        LogError: If the file has no readable frame of its format.
+    """
     from atalante_hal.bus.replay import UNREADABLE
 
     batch, count, broken = _Batch(chunk_frames), 0, ""
-    complaints = _Complaints()
+    warnings = _Warnings()
     ends_within = log.suffix in _LINE_FORMATS and not log.compressed and _last_byte(log.path) not in b"\r\n"
-    with _quiet_asammdf(), complaints.heard():
+    with _quiet_asammdf(), warnings.captured():
         try:
             with _messages(log) as (messages, position):
                 held = next(messages, None)
@@ -58,17 +66,18 @@ def read(log: Log, chunk_frames: int) -> Iterator[Chunk]:
         except (*UNREADABLE, _mdf_error()) as error:
             broken = " ".join(str(error).split()) or type(error).__name__
         if broken and log.suffix == ".mf4":
-            gc.collect()  # the half-opened file, while its complaint is not heard
+            gc.collect()  # delete the half-opened file while `_quiet_asammdf` suppresses its error
     if batch.count:
         yield batch.take()
-    _remark(log, count, broken, ends_within, complaints)
+    _remark(log, count, broken, ends_within, warnings)
 
 
 @contextmanager
 def _messages(log: Log) -> Iterator[tuple[Iterator[Any], Callable[[], int]]]:
-    """The messages of the log, and how to ask how far the file is read.
+    """Provide the messages of the log, and a function that returns the bytes read so far.
 
-    python-can does not close a file that its reader refuses: it is opened here, but for .mf4, which asammdf opens.
+    python-can does not close a file that its reader rejects. Therefore this function opens the file, except for .mf4, which
+    asammdf opens.
     """
     import can
     from can.io.generic import BinaryIOMessageReader
@@ -76,7 +85,7 @@ def _messages(log: Log) -> Iterator[tuple[Iterator[Any], Callable[[], int]]]:
     reader_type = can.io.player.MESSAGE_READERS[log.suffix]
     if log.suffix == ".mf4":
         if (kind := _first_bytes(log.path, len(_MDF))) != _MDF:
-            raise ValueError(f"the file begins with {kind!r}, not with {_MDF!r}")
+            raise ValueError(f"the first bytes must be {_MDF!r}, got {kind!r}")
         with reader_type(log.path) as reader:
             yield iter(reader), lambda: 0
         return
@@ -87,32 +96,32 @@ def _messages(log: Log) -> Iterator[tuple[Iterator[Any], Callable[[], int]]]:
         yield iter(stack.enter_context(reader_type(file))), raw.tell
 
 
-def _remark(log: Log, count: int, broken: str, ends_within: bool, complaints: _Complaints) -> None:
+def _remark(log: Log, count: int, broken: str, ends_within: bool, warnings: _Warnings) -> None:
     if broken and not count:
         raise LogError(f"{log.path} cannot be read as a {log.suffix} log: {broken}")
     if broken:
-        log.remark("log-truncated", f"{log.path} cannot be read beyond frame {count}: {broken}", 1, -1)
+        log.remark("log-truncated", f"{log.path} cannot be read after frame {count}: {broken}", 1, -1)
     elif ends_within:
-        log.remark("log-truncated", f"{log.path} ends within a line: nothing looked at its last frame", 1, -1)
+        log.remark("log-truncated", f"{log.path} ends within a line; its last frame was not checked", 1, -1)
     elif log.suffix == ".blf" and (missing := _missing_bytes(log.path)):
         log.remark(
             "log-truncated",
-            f"{log.path} breaks off: its header speaks of {missing} bytes more; {count} frames could be read",
+            f"{log.path} is truncated: according to its header {missing} bytes are missing; {count} frames were read",
             1,
             -1,
         )
-    if complaints.count:
+    if warnings.count:
         log.remark(
             "log-unreadable",
-            f"{log.path} has {complaints.count} entries that python-can cannot read ({complaints.first}): nothing looked "
-            "at them",
-            complaints.count,
+            f"{log.path} has {warnings.count} entries that python-can cannot read and that were not checked; first "
+            f"warning: {warnings.first}",
+            warnings.count,
             -1,
         )
 
 
 class _Batch:
-    """Frames of python-can messages, gathered until there are enough."""
+    """Buffer of frames, filled from python-can messages."""
 
     def __init__(self, capacity: int) -> None:
         self._frames = new_frames(capacity)
@@ -132,14 +141,14 @@ class _Batch:
             can_id |= ID_ERROR
         elif message.is_extended_id:
             can_id |= ID_EXTENDED
-        if message.is_remote_frame and not message.is_fd:  # the .asc reader calls an empty FD frame remote
+        if message.is_remote_frame and not message.is_fd:  # the .asc reader marks an empty FD frame as remote
             can_id, length = can_id | ID_REMOTE, message.dlc
         if message.is_fd:
             flags = FLAG_FDF | bool(message.bitrate_switch) * FLAG_BRS | bool(message.error_state_indicator) * FLAG_ESI
         _RECORD.pack_into(self._memory, self.count * FRAME_BYTES, can_id, min(length, 255), flags, data[:64])
         self._stamps.append(round(message.timestamp * 1e9))
         self._channels.append(channels.index("" if message.channel is None else str(message.channel)))
-        self._sent.append((RECEIVED if message.is_rx else SENT) if keeps_direction else NOT_SAID)
+        self._sent.append((RECEIVED if message.is_rx else SENT) if keeps_direction else NO_DIRECTION)
 
     def take(self) -> Chunk:
         count = self.count
@@ -155,8 +164,8 @@ class _Batch:
         return chunk
 
 
-class _Complaints(logging.Handler):
-    """python-can's readers drop what they do not understand and say so in a log message."""
+class _Warnings(logging.Handler):
+    """Counter of the warnings that the python-can readers log for skipped entries."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -164,8 +173,8 @@ class _Complaints(logging.Handler):
         self.first = ""
 
     @contextmanager
-    def heard(self) -> Iterator[None]:
-        """Listen to python-can."""
+    def captured(self) -> Iterator[None]:
+        """Count the warnings of python-can inside the `with` block."""
         logging.getLogger("can").addHandler(self)
         try:
             yield
@@ -179,7 +188,10 @@ class _Complaints(logging.Handler):
 
 @contextmanager
 def _quiet_asammdf() -> Iterator[None]:
-    """asammdf's file object cannot be deleted when opening it failed, and Python would print a traceback about that."""
+    """Suppress the traceback of a file object of asammdf that failed to open.
+
+    Its destructor raises an exception, which Python prints.
+    """
     before = sys.unraisablehook
 
     def hook(failure: sys.UnraisableHookArgs) -> None:
@@ -194,7 +206,7 @@ def _quiet_asammdf() -> Iterator[None]:
 
 
 def _mdf_error() -> type[Exception]:
-    """What asammdf raises on a damaged file, or nothing that could be raised here without it."""
+    """Return the exception type that asammdf raises for a damaged file; `EOFError` if asammdf is not installed."""
     try:
         from asammdf.blocks.utils import MdfException
     except ImportError:
@@ -218,7 +230,7 @@ def _last_byte(path: Path) -> bytes:
 
 
 def _missing_bytes(path: Path) -> int:
-    """Bytes a .blf file says it has and has not."""
+    """Return the number of bytes that a .blf file lacks according to its header."""
     with path.open("rb") as file:
         header = file.read(_BLF_HEADER.size)
     if len(header) < _BLF_HEADER.size:

@@ -1,4 +1,4 @@
-"""What a judged log comes to: for people at the terminal, for a machine (JSON lines), for a CI server (JUnit XML)."""
+"""Report of one log: text for the terminal, JUnit XML for a CI server, and the list of all rules."""
 
 from __future__ import annotations
 
@@ -8,54 +8,61 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from atalante_tools.terminal import table
-from atalante_tools.validate.coverage import Unjudged, unjudged
+from atalante_tools.validate.coverage import Unchecked, unchecked
 from atalante_tools.validate.findings import Finding
-from atalante_tools.validate.judge import Judge
+from atalante_tools.validate.judge import Validator
 from atalante_tools.validate.project import Silence
 from atalante_tools.validate.rules import RULE_OF, RULES
 
-#: Names listed at the terminal for one reason; the HTML report has all of them.
+#: Maximum number of names per reason in the text report; the HTML report lists all names.
 _NAMES = 12
 
 
 @dataclass(frozen=True)
 class Report:
-    """One judged log."""
+    """Result of one log or live bus."""
 
-    name: str  # of the log or the bus
-    judge: Judge
+    name: str  # name of the log or the bus
+    validator: Validator
     findings: tuple[Finding, ...]
     silenced: tuple[tuple[Finding, Silence], ...]
-    unjudged: tuple[Unjudged, ...]
+    unchecked: tuple[Unchecked, ...]
 
     @property
     def duration_s(self) -> float:
-        """From the first frame to the last [s]."""
-        return 0.0 if self.judge.begin is None else (self.judge.end - self.judge.begin) * 1e-9
+        """Return the time from the first frame to the last [s]."""
+        return 0.0 if self.validator.begin is None else (self.validator.end - self.validator.begin) * 1e-9
 
 
-def report(name: str, judge: Judge, *, live: bool = False) -> Report:
-    """Conclude a log whose judge has finished."""
+def report(name: str, validator: Validator, *, live: bool = False) -> Report:
+    """Separate the findings of a finished validator from the silenced ones.
+
+    Args:
+        name: name of the log or of the bus.
+        validator: validator after `finish`.
+        live: whether the frames came from a live bus.
+    """
     findings, silenced = [], []
-    for finding in judge.findings.all():
-        silence = judge.project.silence(finding.rule, finding.message)
+    for finding in validator.findings.all():
+        silence = validator.project.silence(finding.rule, finding.message)
         if silence is None:
             findings.append(finding)
         else:
             silenced.append((finding, silence))
-    return Report(name, judge, tuple(findings), tuple(silenced), tuple(unjudged(judge, live=live)))
+    return Report(name, validator, tuple(findings), tuple(silenced), tuple(unchecked(validator, live=live)))
 
 
-# -- people ----------------------------------------------------------------------------------------------------------------
+# -- text ---------------------------------------------------------------------------------------------------------------
 
 
 def text(result: Report) -> str:
-    """The report as text: what was judged, what was found, what was silenced, what was not judged."""
-    judge = result.judge
-    channels = ", ".join(name or "without a name" for name in judge.channels) or "none"
+    """Return the report as text: the log, the findings, the silenced findings and the items that were not checked."""
+    validator = result.validator
+    channels = ", ".join(name or "without a name" for name in validator.channels) or "none"
     lines = [
-        f"{result.name}: {judge.frames} frames in {result.duration_s:.3f} s on {len(judge.channels)} channels ({channels}), "
-        f"judged by {len(RULES)} rules with {judge.plan.catalogue.path.name} ({judge.plan.catalogue.hash32:08X})"
+        f"{result.name}: {validator.frames} frames in {result.duration_s:.3f} s on {len(validator.channels)} channels "
+        f"({channels}), "
+        f"checked by {len(RULES)} rules against {validator.plan.catalogue.path.name} ({validator.plan.catalogue.hash32:08X})"
     ]
     if result.findings:
         lines += ["", _table(result.findings), ""]
@@ -64,22 +71,22 @@ def text(result: Report) -> str:
     if result.silenced:
         lines += ["", "Silenced by the project:"]
         lines += [f"  {f.rule} {_where(f)}, {f.count} times: {silence.reason}" for f, silence in result.silenced]
-    if result.unjudged:
-        lines += ["", "Not judged:", *(f"  {_short(item)}" for item in result.unjudged)]
+    if result.unchecked:
+        lines += ["", "Not checked:", *(f"  {_short(item)}" for item in result.unchecked)]
     lines += ["", verdict(result)]
     return "\n".join(lines)
 
 
 def verdict(result: Report) -> str:
-    """One sentence at the end."""
+    """Return the result in one line."""
     if result.findings:
         count = sum(finding.count for finding in result.findings)
         findings = "1 finding" if len(result.findings) == 1 else f"{len(result.findings)} findings"
         return f"{findings} ({count} {'occurrence' if count == 1 else 'occurrences'})"
-    if not result.judge.frames:
-        return "nothing was judged"
+    if not result.validator.frames:
+        return "no frame was checked"
     silenced = f", {len(result.silenced)} silenced" if result.silenced else ""
-    return f"no findings{silenced}; what is listed as not judged was not looked at"
+    return f"no findings{silenced}; see above for the items that were not checked"
 
 
 def _table(findings: Sequence[Finding]) -> str:
@@ -95,18 +102,21 @@ def _where(finding: Finding) -> str:
     return f"{finding.message}.{finding.signal}" if finding.signal else finding.message or "log"
 
 
-def _short(item: Unjudged) -> str:
-    if len(item.what) <= _NAMES:
+def _short(item: Unchecked) -> str:
+    if len(item.items) <= _NAMES:
         return str(item)
-    shown = Unjudged(item.rules, (*item.what[:_NAMES], "..."), item.why)
-    return str(shown).replace(f"({len(shown.what)})", f"({len(item.what)})")
+    shown = Unchecked(item.rules, (*item.items[:_NAMES], "..."), item.reason)
+    return str(shown).replace(f"({len(shown.items)})", f"({len(item.items)})")
 
 
 # -- JUnit -----------------------------------------------------------------------------------------------------------------
 
 
 def write_junit(results: Sequence[Report], path: Path) -> None:
-    """One test suite a log, one test case a rule: failed, passed, or skipped where it was silenced or could not judge."""
+    """Write JUnit XML with one test suite per log and one test case per rule.
+
+    A test case is skipped if the rule is silenced or was not checked.
+    """
     suites = ET.Element("testsuites", name="atalante validate")
     for result in results:
         suite = ET.SubElement(
@@ -115,19 +125,19 @@ def write_junit(results: Sequence[Report], path: Path) -> None:
         failures = skipped = 0
         for rule in RULES:
             case = ET.SubElement(suite, "testcase", classname="atalante.validate", name=rule.id)
-            mine = [finding for finding in result.findings if finding.rule == rule.id]
-            why = _skipped(result, rule.id)
-            if mine:
+            of_rule = [finding for finding in result.findings if finding.rule == rule.id]
+            reason = _skipped(result, rule.id)
+            if of_rule:
                 failures += 1
                 failure = ET.SubElement(case, "failure", message=f"{rule.meaning} [{rule.source}]")
                 failure.text = "\n".join(
                     f"{_where(f)} ({f.node or 'no sender'}): {f.count} times, first {f.first_s:.6f} s, last {f.last_s:.6f} s, "
                     f"worst {f.worst or '-'}"
-                    for f in mine
+                    for f in of_rule
                 )
-            elif why:
+            elif reason:
                 skipped += 1
-                ET.SubElement(case, "skipped", message=why)
+                ET.SubElement(case, "skipped", message=reason)
         suite.set("failures", str(failures))
         suite.set("skipped", str(skipped))
     ET.indent(suites)
@@ -135,14 +145,14 @@ def write_junit(results: Sequence[Report], path: Path) -> None:
 
 
 def _skipped(result: Report, rule: str) -> str:
-    """Why a rule found nothing, if that is not because all is well."""
+    """Return why a rule was silenced or not checked; empty if it was checked."""
     reasons = [f"silenced for {_where(f)}: {s.reason}" for f, s in result.silenced if f.rule == rule]
-    reasons += [f"not judged: {item.why}" for item in result.unjudged if rule in item.rules and not item.what]
+    reasons += [f"not checked: {item.reason}" for item in result.unchecked if rule in item.rules and not item.items]
     return "; ".join(reasons)
 
 
 def rules_text() -> str:
-    """Every rule with its thresholds, for `--list-rules`."""
+    """Return every rule with its thresholds as a table, for `--list-rules`."""
     rows = [("rule", "meaning", "source", "thresholds")]
     for rule in RULE_OF.values():
         thresholds = ", ".join(f"{name} = {_toml(value)}" for name, value in rule.thresholds.items())
@@ -151,7 +161,7 @@ def rules_text() -> str:
 
 
 def rules_json() -> list[dict[str, object]]:
-    """The same for scripts."""
+    """Return every rule with its thresholds as JSON objects, for `--list-rules --json`."""
     return [
         {"rule": rule.id, "meaning": rule.meaning, "source": rule.source, "thresholds": dict(rule.thresholds)}
         for rule in RULE_OF.values()

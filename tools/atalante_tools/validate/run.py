@@ -1,4 +1,4 @@
-"""From a log or a live bus to a report: the loop that feeds the judge."""
+"""Loops that pass the frames of a log or a live bus to the validator and return the report."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ import numpy as np
 
 from atalante_hal.bus import Bus, BusError, open_bus
 from atalante_hal.frame import WORDS, new_frames
-from atalante_tools.validate.chunk import NOT_SAID, Chunk
-from atalante_tools.validate.judge import Judge
+from atalante_tools.validate.chunk import NO_DIRECTION, Chunk
+from atalante_tools.validate.judge import Validator
 from atalante_tools.validate.log import Log, open_log
 from atalante_tools.validate.plan import Plan
 from atalante_tools.validate.project import Project
 from atalante_tools.validate.report import Report, report
 
-#: A live bus is judged this often [s], and looked at this often while nothing comes.
-_JUDGE_EVERY, _LOOK_UP = 0.5, 0.02
-_LIVE_FRAMES = 4096
+#: Period of the checks of a live bus, and longest wait for a frame [s].
+_CHECK_PERIOD, _RECEIVE_TIMEOUT = 0.5, 0.02
+_LIVE_FRAMES = 4096  # size of the receive buffer
 
 
-def judge_log(
+def validate_log(
     path: Path,
     plan: Plan,
     project: Project,
@@ -32,25 +32,32 @@ def judge_log(
     node: str | None = None,
     progress: Callable[[float, int], None] = lambda share, frames: None,
 ) -> Report:
-    """Judge one log.
+    """Check one log.
 
     Args:
-        progress: told the share of the log that has been read, and the frames so far.
+        path: file of the log.
+        plan: compiled DBC.
+        project: thresholds, silenced rules and channel names.
+        node: the only node whose messages are expected; None: all nodes.
+        progress: called after each chunk with the share of the log that has been read, 0 to 1, and the frames so far.
 
     Raises:
-        LogError: it cannot be opened as a log at all.
+        LogError: If the file cannot be opened as a log.
     """
     log = open_log(path)
-    judge = Judge(plan, project, node=node, keeps_flags=log.keeps_flags)
-    for chunk, share in _ahead(log):
-        judge.judge(chunk, log.channels.names)
-        progress(share, judge.frames)
-    judge.finish(log.remarks)
-    return report(str(path), judge)
+    validator = Validator(plan, project, node=node, keeps_flags=log.keeps_flags)
+    for chunk, share in _read_ahead(log):
+        validator.check(chunk, log.channels.names)
+        progress(share, validator.frames)
+    validator.finish(log.remarks)
+    return report(str(path), validator)
 
 
-def _ahead(log: Log) -> Iterator[tuple[Chunk, float]]:
-    """The chunks of a log, one of them read while the one before is judged: numpy lets both go on at once."""
+def _read_ahead(log: Log) -> Iterator[tuple[Chunk, float]]:
+    """Yield the chunks of a log, each with the share of the log that has been read, 0 to 1.
+
+    A thread reads the next chunk while the caller checks the current one. numpy releases the interpreter lock in both.
+    """
     ready: queue.Queue[tuple[Chunk, float] | BaseException | None] = queue.Queue(maxsize=1)
     abandoned = threading.Event()
 
@@ -68,7 +75,7 @@ def _ahead(log: Log) -> Iterator[tuple[Chunk, float]]:
                 offer((chunk, log.position / max(1, log.size)))
                 if abandoned.is_set():
                     return
-        except BaseException as error:  # noqa: BLE001 - raised again in the thread that judges
+        except BaseException as error:  # noqa: BLE001 - raised again in the thread of the caller
             offer(error)
         else:
             offer(None)
@@ -91,50 +98,55 @@ def listen(
     project: Project,
     *,
     name: str,
-    over: Callable[[], bool],
+    stopped: Callable[[], bool],
     node: str | None = None,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> Report:
-    """Judge what comes over one or more open buses until `over()`. Sends nothing.
+    """Check the frames of one or more open buses until `stopped()` or a bus error. Nothing is sent.
 
     Args:
-        buses: channel name -> bus.
-        progress: told the frames so far.
+        buses: channel name -> open bus.
+        plan: compiled DBC.
+        project: thresholds, silenced rules and channel names.
+        name: name of the report.
+        stopped: called in every iteration; True ends the loop.
+        node: the only node whose messages are expected; None: all nodes.
+        progress: called after each check with the frames so far.
     """
-    judge = Judge(plan, project, node=node)
+    validator = Validator(plan, project, node=node)
     names, scratch = list(buses), new_frames(_LIVE_FRAMES)
     pieces: list[Chunk] = []
-    next_time = time.monotonic() + _JUDGE_EVERY
+    next_time = time.monotonic() + _CHECK_PERIOD
     failure = ""
-    while not over() and not failure:
+    while not stopped() and not failure:
         for channel, bus in enumerate(buses.values()):
             try:
-                count = bus.receive(scratch, _LOOK_UP if len(buses) == 1 else 0.0)
+                count = bus.receive(scratch, _RECEIVE_TIMEOUT if len(buses) == 1 else 0.0)
             except BusError as error:
                 failure = str(error)
                 break
             if count:
                 pieces.append(_piece(bus, scratch[:count], channel))
         if len(buses) > 1 and not pieces:
-            time.sleep(_LOOK_UP / 10)
+            time.sleep(_RECEIVE_TIMEOUT / 10)
         if time.monotonic() >= next_time:
-            next_time += _JUDGE_EVERY
-            _judge(judge, pieces, names)
-            progress(judge.frames)
-    _judge(judge, pieces, names)
-    judge.finish((), dropped=sum(bus.dropped for bus in buses.values()))
+            next_time += _CHECK_PERIOD
+            _check_pieces(validator, pieces, names)
+            progress(validator.frames)
+    _check_pieces(validator, pieces, names)
+    validator.finish((), dropped=sum(bus.dropped for bus in buses.values()))
     if failure:
-        judge.findings.add_log("log-truncated", judge.end, 1, f"listening ended early: {failure}")
-    return report(name, judge, live=True)
+        validator.findings.add_log("log-truncated", validator.end, 1, f"listening ended with a bus error: {failure}")
+    return report(name, validator, live=True)
 
 
 def _piece(bus: Bus, frames: np.ndarray, channel: int) -> Chunk:
     count = len(frames)
     stamps = bus.stamps[:count].copy()
-    return Chunk(frames.copy(), stamps, np.full(count, channel, np.uint8), np.full(count, NOT_SAID, np.int8))
+    return Chunk(frames.copy(), stamps, np.full(count, channel, np.uint8), np.full(count, NO_DIRECTION, np.int8))
 
 
-def _judge(judge: Judge, pieces: list[Chunk], names: list[str]) -> None:
+def _check_pieces(validator: Validator, pieces: list[Chunk], names: list[str]) -> None:
     if not pieces:
         return
     frames = new_frames(sum(map(len, pieces)))
@@ -147,14 +159,21 @@ def _judge(judge: Judge, pieces: list[Chunk], names: list[str]) -> None:
         np.concatenate([piece.sent for piece in pieces]),
     )
     pieces.clear()
-    judge.judge(chunk.select(np.argsort(chunk.stamps, kind="stable")), names)
+    validator.check(chunk.select(np.argsort(chunk.stamps, kind="stable")), names)
 
 
 def open_channels(interface: str, channels: str) -> dict[str, Bus]:
-    """Buses of `can0`, or of `left_leg=can0,right_leg=can1` by the names given.
+    """Open one or more channels of a CAN interface.
+
+    Args:
+        interface: interface of python-can.
+        channels: one channel, `can0`, or several with names, `left_leg=can0,right_leg=can1`.
+
+    Returns:
+        Open buses by the name of the channel.
 
     Raises:
-        BusAbsent: one cannot be opened; those already open are closed.
+        BusAbsent: If a channel cannot be opened; the channels that are already open are closed.
     """
     opened: dict[str, Bus] = {}
     try:

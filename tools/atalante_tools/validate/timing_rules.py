@@ -1,7 +1,7 @@
-"""When frames come, and what the alive counter says about those that do not: cycle time, gaps, timeouts, events too often.
+"""Rules for the time of frames and for lost frames: cycle time, gaps, timeouts, inhibit time, alive counter.
 
-Interval and counter are judged together, because one explains the other: a frame that is missing (counter-lost) is not late as
-well, and a node that was silent beyond its timeout may begin its counter anew.
+Intervals and alive counters are checked together. A lost frame (counter-lost) is not also reported as late, and a node may
+restart its counter after a timeout.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from atalante_tools.validate.e2e_rules import NO_STEPS, Steps
+from atalante_tools.validate.e2e_rules import REPEATED, Steps
 from atalante_tools.validate.findings import Findings
 from atalante_tools.validate.plan import Plan, Rows
 from atalante_tools.validate.project import Project
@@ -17,16 +17,16 @@ from atalante_tools.validate.stream import Stream
 
 Vector = npt.NDArray[np.float64]
 
-#: Histogram of intervals: bins a cycle, and cycles it reaches; the last bin takes what is longer.
+#: Histogram of intervals: bins per cycle, and range in cycles; the last bin counts all longer intervals.
 BINS_A_CYCLE, CYCLES = 100, 4
 BINS = BINS_A_CYCLE * CYCLES + 1
 _NEVER = -(1 << 62)
-#: Gaps kept for the plot of the report.
-_MOST_GAPS = 20_000
+#: Maximum number of gaps that are kept for the plot of the report.
+_MAX_GAPS = 20_000
 
 
 class TimingRules:
-    """Intervals and counters of all messages; remembers the last frame of each."""
+    """Rules for the intervals and alive counters of all messages; keeps the last frame of each message."""
 
     def __init__(self, plan: Plan, findings: Findings, project: Project) -> None:
         self._plan, self._findings, self._project = plan, findings, project
@@ -35,42 +35,48 @@ class TimingRules:
         self._inhibit = plan.inhibit_ns * project.number("inhibit", "share")
         default = project.number("timeout", "default_cycles") * plan.cycle_ns
         self._timeout = np.where(plan.cycle_ns > 0, np.where(plan.timeout_ns > 0, plan.timeout_ns, default), 0.0)
-        self._last = np.full(count, _NEVER, np.int64)  # stamp of the last frame that could be decoded
-        self._arrived = np.full(count, _NEVER, np.int64)  # of the last frame at all, damaged or not
+        self._last = np.full(count, _NEVER, np.int64)  # stamp of the last valid frame [ns]
+        self._arrived = np.full(count, _NEVER, np.int64)  # stamp of the last frame, valid or rejected [ns]
         self._first = np.full(count, _NEVER, np.int64)
         self._last_share = np.full(count, np.inf)
         self._last_steps = np.zeros(count, np.int64)
-        #: Intervals without anything missing: histogram, number and sum [ns] by row.
+        #: Histogram, number and sum [ns] of the intervals without lost frames, by row.
         self.histogram = np.zeros((count, BINS), np.int64)
         self.intervals = np.zeros(count, np.int64)
         self._sum = np.zeros(count)
-        #: Frames missing before a frame, for the plot: stamp, row, number.
+        #: Lost frames for the plot: (stamp of the next frame [ns], row, number of lost frames).
         self.gaps: list[tuple[int, int, int]] = []
 
     def exclude(self, row: int) -> None:
-        """Never judge this message's time: it comes from several senders."""
+        """Exclude a message from timing, because it has several senders."""
         self._cycle[row] = self._timeout[row] = self._inhibit[row] = 0.0
 
     @property
-    def judged(self) -> npt.NDArray[np.bool_]:
-        """Messages whose time is judged at all. Shape (rows,)."""
-        judged: npt.NDArray[np.bool_] = (self._cycle > 0) | (self._inhibit > 0)
-        return judged
+    def checked(self) -> npt.NDArray[np.bool_]:
+        """Return which messages have a cycle time or inhibit time. Shape (rows,)."""
+        checked: npt.NDArray[np.bool_] = (self._cycle > 0) | (self._inhibit > 0)
+        return checked
 
     def seen(self, row: int) -> bool:
-        """Whether any frame of the message came, damaged or not."""
+        """Return whether a frame of the message was received, valid or rejected."""
         return bool(self._arrived[row] != _NEVER)
 
     def arrived(self, rows: Rows, stamps: npt.NDArray[np.int64]) -> None:
-        """Frames that came and could not be decoded."""
-        np.maximum.at(self._arrived, rows, stamps)
-
-    def judge(self, stream: Stream, steps: Steps, explained: Steps | None) -> None:
-        """Judge a chunk.
+        """Register rejected frames.
 
         Args:
-            steps: of `e2e_rules.Counters.steps`, shape (n,).
-            explained: frames before each that came and were refused, shape (n,); None: there were none.
+            rows: row of each frame, shape (k,).
+            stamps: stamp of each frame [ns], shape (k,).
+        """
+        np.maximum.at(self._arrived, rows, stamps)
+
+    def check(self, stream: Stream, steps: Steps, rejected_before: Steps | None) -> None:
+        """Check a chunk.
+
+        Args:
+            stream: valid frames of the chunk by message, shape (n,).
+            steps: result of `e2e_rules.Counters.steps`, shape (n,).
+            rejected_before: number of rejected frames before each valid frame, shape (n,); None: no frame was rejected.
         """
         if not len(stream):
             return
@@ -82,51 +88,51 @@ class TimingRules:
         counts = stream.stops - stream.starts
         share = intervals * per_row.repeat(counts)
         share[new] = np.inf
-        odd = np.flatnonzero((steps != 1) if explained is None else (steps != 1) | (explained > 0))
-        silent = self._silences(stream, intervals, share, explained)
-        self._judge_counters(stream, steps, explained, odd, silent)
-        self._judge_cycle(stream, intervals, share, steps, explained, silent)
-        self._count(stream, intervals, share, odd, silent, steps, explained)
-        self._judge_events(stream, intervals, steps)
+        odd = np.flatnonzero((steps != 1) if rejected_before is None else (steps != 1) | (rejected_before > 0))
+        timed_out = self._check_timeouts(stream, intervals, share, rejected_before)
+        self._check_counters(stream, steps, rejected_before, odd, timed_out)
+        self._check_cycle(stream, intervals, share, steps, rejected_before, timed_out)
+        self._count(stream, intervals, share, odd, timed_out, steps, rejected_before)
+        self._check_events(stream, intervals, steps)
         stream.last(stream.stamps, self._last)
         stream.last(share, self._last_share)
         stream.last(steps, self._last_steps)
         self._arrived[stream.present] = np.maximum(self._arrived[stream.present], stream.stamps[stream.stops - 1])
 
-    def _silences(
-        self, stream: Stream, intervals: Steps, share: Vector, explained: Steps | None
+    def _check_timeouts(
+        self, stream: Stream, intervals: Steps, share: Vector, rejected_before: Steps | None
     ) -> npt.NDArray[np.intp]:
-        """Frames that came after their message had timed out."""
+        """Report the frames after a timeout of their message; return their indices."""
         timeout = self._timeout[stream.present]
         shortest = float(timeout[timeout > 0].min(initial=np.inf))
-        places = np.flatnonzero(intervals > shortest)
-        limit = self._timeout[stream.rows[places]]
-        silent = (limit > 0) & (intervals[places] > limit) & np.isfinite(share[places])
-        if explained is not None:
-            silent &= explained[places] == 0
-        places = places[silent]
-        if len(places):
+        indices = np.flatnonzero(intervals > shortest)
+        limit = self._timeout[stream.rows[indices]]
+        timed_out = (limit > 0) & (intervals[indices] > limit) & np.isfinite(share[indices])
+        if rejected_before is not None:
+            timed_out &= rejected_before[indices] == 0
+        indices = indices[timed_out]
+        if len(indices):
             self._findings.add_rows(
-                "recovered", stream.rows[places], stream.stamps[places], shown=intervals[places] * 1e-6
+                "recovered", stream.rows[indices], stream.stamps[indices], shown=intervals[indices] * 1e-6
             )
-        return places
+        return indices
 
-    def _judge_counters(
+    def _check_counters(
         self,
         stream: Stream,
         steps: Steps,
-        explained: Steps | None,
+        rejected_before: Steps | None,
         odd: npt.NDArray[np.intp],
-        silent: npt.NDArray[np.intp],
+        timed_out: npt.NDArray[np.intp],
     ) -> None:
-        places = odd[steps[odd] >= NO_STEPS]
-        places = np.setdiff1d(places, silent, assume_unique=True)
-        if not len(places):
+        indices = odd[steps[odd] >= REPEATED]
+        indices = np.setdiff1d(indices, timed_out, assume_unique=True)
+        if not len(indices):
             return
-        moved = steps[places]
-        lost = moved - 1 if explained is None else moved - 1 - explained[places]
+        moved = steps[indices]
+        lost = moved - 1 if rejected_before is None else moved - 1 - rejected_before[indices]
         most = self._project.number("counter-lost", "max_lost")
-        rows, stamps = stream.rows[places], stream.stamps[places]
+        rows, stamps = stream.rows[indices], stream.stamps[indices]
         for rule, where, shown in (
             ("counter-repeated", moved == 0, np.ones(len(moved))),
             ("counter-lost", (lost >= 1) & (lost <= most), lost),
@@ -134,26 +140,26 @@ class TimingRules:
         ):
             if bool(where.any()):
                 self._findings.add_rows(rule, rows[where], stamps[where], shown=shown[where])
-        missing = np.flatnonzero((lost >= 1) & (moved > 0))[: _MOST_GAPS - len(self.gaps)]
+        missing = np.flatnonzero((lost >= 1) & (moved > 0))[: _MAX_GAPS - len(self.gaps)]
         self.gaps += zip(stamps[missing].tolist(), rows[missing].tolist(), lost[missing].tolist(), strict=True)
 
-    def _judge_cycle(
+    def _check_cycle(
         self,
         stream: Stream,
         intervals: Steps,
         share: Vector,
         steps: Steps,
-        explained: Steps | None,
-        silent: npt.NDArray[np.intp],
+        rejected_before: Steps | None,
+        timed_out: npt.NDArray[np.intp],
     ) -> None:
         limit = self._project.number("cycle-gap", "cycles")
-        places = np.flatnonzero((share > limit) & np.isfinite(share))
-        if len(places):
-            places = np.setdiff1d(places, silent, assume_unique=True)
-            missing = np.maximum(steps[places] - 1, 0)
-            if explained is not None:
-                missing = np.maximum(missing, explained[places])
-            late = places[share[places] - missing > limit]
+        indices = np.flatnonzero((share > limit) & np.isfinite(share))
+        if len(indices):
+            indices = np.setdiff1d(indices, timed_out, assume_unique=True)
+            missing = np.maximum(steps[indices] - 1, 0)
+            if rejected_before is not None:
+                missing = np.maximum(missing, rejected_before[indices])
+            late = indices[share[indices] - missing > limit]
             if len(late):
                 self._findings.add_rows(
                     "cycle-gap", stream.rows[late], stream.stamps[late], shown=intervals[late] * 1e-6
@@ -177,18 +183,20 @@ class TimingRules:
         intervals: Steps,
         share: Vector,
         odd: npt.NDArray[np.intp],
-        silent: npt.NDArray[np.intp],
+        timed_out: npt.NDArray[np.intp],
         steps: Steps,
-        explained: Steps | None,
+        rejected_before: Steps | None,
     ) -> None:
-        """Add the intervals between which nothing is missing to histogram and mean."""
+        """Add the intervals without lost frames to histogram, number and sum."""
         bins = np.minimum(np.maximum(share * BINS_A_CYCLE, 0.0), float(BINS - 1)).astype(np.int64)
         bins += (np.arange(len(stream.present)) * BINS).repeat(stream.stops - stream.starts)
-        # A message without a counter has no steps (-1) and counts all the same, unless nothing came before it.
+        # A message without a counter has `NO_STEP`, but its interval counts, unless the frame is the first one.
         incomplete = (
-            odd[steps[odd] >= NO_STEPS] if explained is None else odd[(steps[odd] >= NO_STEPS) | (explained[odd] > 0)]
+            odd[steps[odd] >= REPEATED]
+            if rejected_before is None
+            else odd[(steps[odd] >= REPEATED) | (rejected_before[odd] > 0)]
         )
-        left_out = np.unique(np.concatenate([incomplete, silent, np.flatnonzero(np.isinf(share))]))
+        left_out = np.unique(np.concatenate([incomplete, timed_out, np.flatnonzero(np.isinf(share))]))
         dump = len(stream.present) * BINS
         sums = np.add.reduceat(intervals, stream.starts)
         numbers = stream.stops - stream.starts
@@ -202,7 +210,7 @@ class TimingRules:
         self.intervals[stream.present] += numbers
         self._sum[stream.present] += sums
 
-    def _judge_events(self, stream: Stream, intervals: Steps, steps: Steps) -> None:
+    def _check_events(self, stream: Stream, intervals: Steps, steps: Steps) -> None:
         limits = self._inhibit[stream.present]
         for at in np.flatnonzero(limits > 0).tolist():
             span = slice(int(stream.starts[at]), int(stream.stops[at]))
@@ -217,17 +225,18 @@ class TimingRules:
 
     # -- the end of the log ------------------------------------------------------------------------------------------
 
-    def finish(self, begin: int, end: int, wanted: npt.NDArray[np.bool_]) -> None:
-        """What can be said about the whole log.
+    def finish(self, begin: int, end: int, expected: npt.NDArray[np.bool_]) -> None:
+        """Apply the rules about the whole log.
 
         Args:
-            begin: first stamp of the log [ns]; `end`: the last.
-            wanted: messages that should be in the log, shape (rows,).
+            begin: first stamp of the log [ns].
+            end: last stamp of the log [ns].
+            expected: whether a message must be in the log, shape (rows,).
         """
         for row in np.flatnonzero(self._cycle > 0).tolist():
             if self.seen(row):
                 self._finish_seen(row, end)
-            elif wanted[row] and end - begin > 2 * max(self._timeout[row], self._cycle[row]):
+            elif expected[row] and end - begin > 2 * max(self._timeout[row], self._cycle[row]):
                 self._findings.add_whole("never-seen", row, begin, end, shown=(end - begin) * 1e-6)
         for row in np.flatnonzero(self.intervals > 0).tolist():
             self._finish_statistics(row)
@@ -245,7 +254,7 @@ class TimingRules:
         mean = self._sum[row] / count
         if count >= self._project.number("cycle-mean", "min_intervals"):
             tolerance = self._project.number("cycle-mean", "tolerance")
-            # One long gap moves the mean and is reported as what it is; a wrong cycle moves the median as well.
+            # A long gap changes only the mean and is reported as a gap; a wrong cycle time also changes the median.
             if abs(mean / cycle - 1.0) > tolerance and abs(median(self.histogram[row]) - 1.0) > 0.5 * tolerance:
                 self._findings.add_whole("cycle-mean", row, first, last, shown=mean * 1e-6, count=count)
         if count >= self._project.number("cycle-jitter", "min_intervals"):
@@ -254,18 +263,18 @@ class TimingRules:
                 self._findings.add_whole("cycle-jitter", row, first, last, shown=jitter * cycle * 1e-6, count=count)
 
     def mean_ms(self, row: int) -> float:
-        """Mean interval of a message [ms]."""
+        """Return the mean interval of a message [ms]."""
         return float(self._sum[row] / max(1, self.intervals[row]) * 1e-6)
 
 
 def median(histogram: npt.NDArray[np.int64]) -> float:
-    """Median interval, in cycles. Shape (BINS,)."""
+    """Return the median interval of a histogram of shape (BINS,), in cycles."""
     half = (int(histogram.sum()) + 1) // 2
     return (int(np.searchsorted(np.cumsum(histogram), half)) + 0.5) / BINS_A_CYCLE
 
 
 def jitter_p99(histogram: npt.NDArray[np.int64]) -> float:
-    """Distance from the median that 99 % of the intervals keep, in cycles. Shape (BINS,)."""
+    """Return the 99 % quantile of the distance to the median interval, in cycles, of a histogram of shape (BINS,)."""
     total = int(histogram.sum())
     distance = np.abs(np.arange(len(histogram)) - int(median(histogram) * BINS_A_CYCLE))
     order = np.argsort(distance, kind="stable")

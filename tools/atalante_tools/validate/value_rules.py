@@ -1,7 +1,7 @@
-"""What is in a frame: ranges, codes for "no value", value tables, reserved bits, multiplexers. A family of messages at once.
+"""Rules for payloads: ranges, codes for "no value", value tables, reserved bits, multiplexers.
 
-The common case costs two reductions a field (its least and its greatest raw code); only a column that fails is looked at value
-by value.
+The messages of a family are checked together. Each field costs two reductions (smallest and largest raw code). Only a column that
+fails is checked value by value.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from atalante_tools.validate.plan import Family, Plan
 from atalante_tools.validate.project import Project
 from atalante_tools.validate.stream import Stream
 
-#: Fields of up to this many bits get a table of their named values.
+#: Longest field with a lookup table of its named values, bits.
 _TABLE_BITS = 16
 _WORD = 64
 _HASH_BITS = 32
@@ -28,21 +28,21 @@ _HASH_BITS = 32
 
 @dataclass
 class Decoded:
-    """The raw codes of a family's frames, and which of them were found wrong."""
+    """Raw codes of the frames of a family, with marks for invalid values."""
 
     family: Family
-    span: slice  # of the stream
+    span: slice  # frames of the family in the stream
     raw: Words  # shape (fields, n)
-    bad: dict[int, Mask] = field(default_factory=dict)  # place of a field -> where its value means nothing
+    bad: dict[int, Mask] = field(default_factory=dict)  # index of a field -> frames with an invalid value
 
     @property
     def codes(self) -> npt.NDArray[np.int64]:
-        """Raw codes as signed integers. Shape (fields, n)."""
+        """Return the raw codes as signed integers. Shape (fields, n)."""
         return self.raw.view(np.int64)
 
 
 class ValueRules:
-    """Judges the payloads of one family after the other."""
+    """Rules for the payloads of each family."""
 
     def __init__(self, plan: Plan, findings: Findings, project: Project) -> None:
         self._findings = findings
@@ -53,23 +53,23 @@ class ValueRules:
             family.rows.start: _FamilyChecks(family.codec, pattern, self.hash_signal) for family in plan.families
         }
 
-    def judge(self, family: Family, stream: Stream) -> Decoded | None:
-        """Decode and judge the frames of a family; None if there are none."""
+    def check(self, family: Family, stream: Stream) -> Decoded | None:
+        """Decode and check the frames of a family; return None if the chunk has none."""
         span = stream.span(family.rows)
         if span.start == span.stop or not family.codec.fields:
             return None
         words = payload_words(stream.frames[span], family.length)
         decoded = Decoded(family, span, family.codec.extract(words))
         checks = self._checks[family.rows.start]
-        self._judge_multiplexers(decoded, stream)
-        self._judge_limits(checks, decoded, stream)
-        self._judge_tables(checks, decoded, stream)
-        self._judge_reserved(checks, words, decoded, stream)
-        for place in checks.hashes:
-            stranger = decoded.codes[place] != self._hash
-            if bool(stranger.any()):
-                hashes = np.array([f"{code:08X}" for code in decoded.codes[place].tolist()], object)
-                self._report("dbc-hash", decoded, stream, stranger, place, hashes, np.zeros(len(hashes)))
+        self._check_multiplexers(decoded, stream)
+        self._check_limits(checks, decoded, stream)
+        self._check_tables(checks, decoded, stream)
+        self._check_reserved(checks, words, decoded, stream)
+        for index in checks.hashes:
+            wrong = decoded.codes[index] != self._hash
+            if bool(wrong.any()):
+                hashes = np.array([f"{code:08X}" for code in decoded.codes[index].tolist()], object)
+                self._report("dbc-hash", decoded, stream, wrong, index, shown=hashes, badness=np.zeros(len(hashes)))
         return decoded
 
     def _report(
@@ -78,7 +78,8 @@ class ValueRules:
         decoded: Decoded,
         stream: Stream,
         wrong: Mask,
-        place: int,
+        index: int,
+        *,
         shown: npt.NDArray[np.generic],
         badness: npt.NDArray[np.generic] | None = None,
         unit: str | None = None,
@@ -87,93 +88,101 @@ class ValueRules:
             rule,
             stream.rows[decoded.span][wrong],
             stream.stamps[decoded.span][wrong],
-            signal=decoded.family.codec.fields[place].name,
+            signal=decoded.family.codec.fields[index].name,
             shown=shown[wrong],
             badness=None if badness is None else badness[wrong],
             unit=unit,
         )
-        known = decoded.bad.get(place)
-        decoded.bad[place] = wrong if known is None else known | wrong
+        known = decoded.bad.get(index)
+        decoded.bad[index] = wrong if known is None else known | wrong
 
-    def _judge_multiplexers(self, decoded: Decoded, stream: Stream) -> None:
+    def _check_multiplexers(self, decoded: Decoded, stream: Stream) -> None:
         codec = decoded.family.codec
         for name in codec.layout.multiplexers:
             undefined = codec.undefined(decoded.raw, name)
             if bool(undefined.any()):
-                place = codec.place(name)
-                self._report("multiplexer", decoded, stream, undefined, place, decoded.codes[place])
+                index = codec.index(name)
+                self._report("multiplexer", decoded, stream, undefined, index, shown=decoded.codes[index])
 
-    def _judge_limits(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream) -> None:
+    def _check_limits(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream) -> None:
         if len(checks.limited):
             codes = decoded.codes[checks.limited] if len(checks.limited) < len(decoded.raw) else decoded.codes
             outside = (codes.min(axis=1) < checks.low) | (codes.max(axis=1) > checks.high)
             for at in np.flatnonzero(outside).tolist():
-                self._judge_limit(checks, decoded, stream, int(checks.limited[at]))
-        for place in checks.special:
-            self._judge_special(decoded, stream, place)
-        for place, code in checks.coded.items():
-            outside = decoded.codes[place] == code
+                self._check_limit(checks, decoded, stream, int(checks.limited[at]))
+        for index in checks.special:
+            self._check_special(decoded, stream, index)
+        for index, code in checks.coded.items():
+            outside = decoded.codes[index] == code
             if bool(outside.any()):
-                self._judge_outside(decoded, stream, place, outside, decoded.codes[place].astype(np.float64))
+                self._check_outside(decoded, stream, index, outside, decoded.codes[index].astype(np.float64))
 
-    def _judge_limit(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream, place: int) -> None:
-        """A column in which some code is outside: the code for "no value", a named special value, or really wrong."""
-        codec, codes = decoded.family.codec, decoded.codes[place]
-        low, high = checks.bounds[place]
+    def _check_limit(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream, index: int) -> None:
+        """Check a column in which at least one code is outside the range."""
+        codec, codes = decoded.family.codec, decoded.codes[index]
+        low, high = checks.bounds[index]
         outside = (codes < low) | (codes > high)
-        self._judge_outside(decoded, stream, place, outside, codec.values(decoded.raw, place).astype(np.float64))
+        self._check_outside(decoded, stream, index, outside, codec.values(decoded.raw, index).astype(np.float64))
 
-    def _judge_special(self, decoded: Decoded, stream: Stream, place: int) -> None:
-        """Floats and 64-bit fields are compared by their physical value."""
-        values = decoded.family.codec.values(decoded.raw, place).astype(np.float64)
-        limits = decoded.family.codec.fields[place]
+    def _check_special(self, decoded: Decoded, stream: Stream, index: int) -> None:
+        """Check a float or 64-bit field by its physical value, because its raw codes are not ordered as int64."""
+        values = decoded.family.codec.values(decoded.raw, index).astype(np.float64)
+        limits = decoded.family.codec.fields[index]
         low = -math.inf if limits.minimum is None else limits.minimum
         high = math.inf if limits.maximum is None else limits.maximum
         margin = 1e-9 * max(abs(x) for x in (low, high, 1.0) if math.isfinite(x))
         outside = ~((values >= low - margin) & (values <= high + margin))
-        self._judge_outside(decoded, stream, place, outside, values)
+        self._check_outside(decoded, stream, index, outside, values)
 
-    def _judge_outside(
-        self, decoded: Decoded, stream: Stream, place: int, outside: Mask, values: npt.NDArray[np.float64]
+    def _check_outside(
+        self, decoded: Decoded, stream: Stream, index: int, outside: Mask, values: npt.NDArray[np.float64]
     ) -> None:
-        codec, codes = decoded.family.codec, decoded.codes[place]
-        limits = codec.fields[place]
-        there = codec.present(decoded.raw, place)
-        if there is not None:
-            outside = outside & there
+        """Report the values outside the range as "no value" or out of range; named special values are valid.
+
+        Args:
+            decoded: decoded frames of the family; invalid values are marked.
+            stream: frames of the chunk by message.
+            index: index of the field.
+            outside: frames whose value is outside the range, shape (n,).
+            values: physical values of the field, shape (n,).
+        """
+        codec, codes = decoded.family.codec, decoded.codes[index]
+        limits = codec.fields[index]
+        present = codec.present(decoded.raw, index)
+        if present is not None:
+            outside = outside & present
         invalid = np.zeros(len(codes), np.bool_)
         if limits.invalid_raw is not None:
             invalid = outside & (codes == _as_signed(limits, limits.invalid_raw))
             if bool(invalid.any()):
-                self._report("invalid-code", decoded, stream, invalid, place, codes)
+                self._report("invalid-code", decoded, stream, invalid, index, shown=codes)
         wrong = outside & ~invalid
         if limits.choices and bool(wrong.any()):
             wrong &= ~np.isin(codes, list(limits.choices))
         if bool(wrong.any()):
             low, high = limits.minimum or 0.0, limits.maximum or 0.0
             distance = np.maximum(low - values, values - high)
-            self._report(
-                "range", decoded, stream, wrong, place, values, np.nan_to_num(distance, nan=np.inf), limits.unit
-            )
+            distance = np.nan_to_num(distance, nan=np.inf)
+            self._report("range", decoded, stream, wrong, index, shown=values, badness=distance, unit=limits.unit)
 
-    def _judge_tables(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream) -> None:
-        for place, table in checks.tables.items():
-            codes = decoded.codes[place]
-            limits = decoded.family.codec.fields[place]
+    def _check_tables(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream) -> None:
+        for index, table in checks.tables.items():
+            codes = decoded.codes[index]
+            limits = decoded.family.codec.fields[index]
             known = table.take(codes & len(table) - 1) if isinstance(table, np.ndarray) else np.isin(codes, table)
             if bool(known.all()):
                 continue
             wrong = ~known
-            if (there := decoded.family.codec.present(decoded.raw, place)) is not None:
-                wrong &= there
-            if (bad := decoded.bad.get(place)) is not None:
+            if (present := decoded.family.codec.present(decoded.raw, index)) is not None:
+                wrong &= present
+            if (bad := decoded.bad.get(index)) is not None:
                 wrong &= ~bad
             if limits.invalid_raw is not None:
                 wrong &= codes != _as_signed(limits, limits.invalid_raw)
             if bool(wrong.any()):
-                self._report("value-table", decoded, stream, wrong, place, codes)
+                self._report("value-table", decoded, stream, wrong, index, shown=codes)
 
-    def _judge_reserved(self, checks: _FamilyChecks, words: Words, decoded: Decoded, stream: Stream) -> None:
+    def _check_reserved(self, checks: _FamilyChecks, words: Words, decoded: Decoded, stream: Stream) -> None:
         set_bits = np.zeros(0, np.uint64)
         for word, mask in checks.reserved.items():
             column = (words[word] ^ checks.pattern) & mask
@@ -191,7 +200,7 @@ class ValueRules:
 
 
 class _FamilyChecks:
-    """What can be wrong in the payloads of a family, compiled."""
+    """Compiled checks of the payloads of a family."""
 
     def __init__(self, codec: BulkCodec, pattern: float, hash_signal: str) -> None:
         fields = list(enumerate(codec.fields))
@@ -201,7 +210,7 @@ class _FamilyChecks:
         self.limited = np.array(list(self.bounds), np.intp)
         self.low = np.array([low for low, _ in self.bounds.values()], np.int64)
         self.high = np.array([high for _, high in self.bounds.values()], np.int64)
-        #: Codes for "no value" of fields that have no range they could be outside of.
+        #: Codes for "no value" of fields without a range.
         self.coded = {
             p: _as_signed(f, f.invalid_raw) for p, f in fields if f.invalid_raw is not None and (p, f) not in ranged
         }
@@ -217,13 +226,13 @@ class _FamilyChecks:
 
 
 def reserved_bits(layout: Layout) -> list[int]:
-    """Bits of the payload that no signal has, numbered from the least significant bit of byte 0."""
+    """Return the payload bits without a signal, numbered from the least significant bit of byte 0."""
     used = {bit for f in layout.fields for bit in f.bits}
     return [bit for bit in range(8 * layout.length) if bit not in used]
 
 
 def is_limited(limits: Field) -> bool:
-    """Whether some raw code of the field is outside its range: otherwise there is nothing to judge."""
+    """Return whether a raw code of the field can be outside its range."""
     if limits.minimum is None or limits.maximum is None or limits.factor == 0:
         return False
     if limits.kind == "float":
@@ -234,7 +243,7 @@ def is_limited(limits: Field) -> bool:
 
 
 def raw_bounds(limits: Field) -> tuple[int, int]:
-    """Least and greatest raw code inside the range; the decimals of a DBC are rounded."""
+    """Return the smallest and largest raw code inside the range, with a tolerance for rounded decimals in the DBC."""
     assert limits.minimum is not None
     assert limits.maximum is not None
     raw = sorted((x - limits.offset) / limits.factor for x in (limits.minimum, limits.maximum))
@@ -244,21 +253,22 @@ def raw_bounds(limits: Field) -> tuple[int, int]:
 
 
 def is_enumeration(named: Field) -> bool:
-    """Whether the value table names the values a field can have, and not just a few special ones of a number.
+    """Return whether the value table lists all valid values of the field, not only a few special values of a number.
 
-    A table that names both ends of the range does; without a range, one that begins at 0 and has two names.
+    With a range, the table must have names for both ends of the range. Without a range, it must have at least two names, one of
+    them for 0. A table with a name for every code returns False, because no value can be wrong.
     """
     if len(named.choices) < 2 or named.kind == "float" or named.factor != 1 or named.offset != 0:
         return False
     if all(code in named.choices for code in raw_range(named)[: len(named.choices) + 1]):
-        return False  # every code has a name: nothing can be wrong
+        return False
     if named.minimum is None or named.maximum is None:
         return 0 in named.choices
     return int(named.minimum) in named.choices and int(named.maximum) in named.choices
 
 
 def is_hash(field: Field, signal: str) -> bool:
-    """Whether a node says in this signal which DBC it speaks."""
+    """Return whether a node reports the hash of its DBC in this field; `signal` is the name of such fields."""
     return field.name == signal and field.length == _HASH_BITS and field.kind == "unsigned"
 
 
@@ -273,7 +283,7 @@ def _table(named: Field) -> npt.NDArray[np.bool_] | Sequence[int]:
 
 
 def _as_signed(limits: Field, raw: int) -> int:
-    """A raw code, given as unsigned bits, the way `Decoded.codes` has it."""
+    """Convert a raw code from unsigned bits to the signed integer in `Decoded.codes`."""
     if limits.kind == "signed" and raw >> limits.length - 1:
         return raw - (1 << limits.length)
     return raw - (1 << _WORD) if raw >= 1 << _WORD - 1 else raw
