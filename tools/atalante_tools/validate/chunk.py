@@ -25,7 +25,7 @@ class Chunk:
     frames: Frames  # `FRAME` records
     stamps: npt.NDArray[np.int64]  # ns
     channels: npt.NDArray[np.uint8]  # index in the channel names of the log
-    sent: npt.NDArray[np.int8]  # SENT, RECEIVED or NOT_SAID
+    sent: npt.NDArray[np.int8]  # direction: SENT, RECEIVED or NO_DIRECTION
 
     def __len__(self) -> int:
         return len(self.frames)
