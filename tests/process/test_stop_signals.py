@@ -119,7 +119,10 @@ class Run:
 
     def end(self) -> tuple[int, str, str, list[Cycle]]:
         """Exit code, stdout, stderr, cycles."""
-        out, err = self._process.communicate(timeout=120)
+        try:
+            out, err = self._process.communicate(timeout=120)
+        finally:
+            self._process.kill()  # nothing if it has ended
         lines = self._log.read_text().splitlines() if self._log.exists() else []
         return self._process.returncode, out, err, [Cycle(*json.loads(line)) for line in lines]
 
