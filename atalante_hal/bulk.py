@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc.foreign import Field, Layout
-from atalante_hal.e2e import CRC_BYTES, crc, data_id_bytes
-from atalante_hal.frame import FRAME_BYTES, Frames, as_words
+from atalante_hal.wire.e2e import CRC_BYTES, crc, data_id_bytes
+from atalante_hal.wire.frame import FRAME_BYTES, Frames, as_words
 
 Words = npt.NDArray[np.uint64]
 Mask = npt.NDArray[np.bool_]

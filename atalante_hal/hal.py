@@ -1,6 +1,6 @@
 """The hardware abstraction layer: `read()` a state, `write()` a command, once a cycle each.
 
-    bus -> process image -> E2E + plausibility -> state -> supervision -> [controller] -> limiter -> process image -> bus
+    bus -> process image -> E2E + plausibility -> state -> safety monitor -> [controller] -> limiter -> process image -> bus
 
 The emulator and the robot differ in the bus handed to the constructor, in nothing else.
 """
@@ -14,20 +14,20 @@ import numpy as np
 
 from atalante_dbc import Network
 from atalante_hal.bus import Bus
-from atalante_hal.cia402 import Controlword, DriveState, controlword_towards_operation
-from atalante_hal.codec import Vector
 from atalante_hal.commands import Commands, StatusReport
-from atalante_hal.diagnostics import Dtc, number_of
-from atalante_hal.image import NEVER, ReceiveImage
-from atalante_hal.limiter import Limiter
-from atalante_hal.plausibility import Plausibility
 from atalante_hal.record import Record
 from atalante_hal.robot import JOINTS, Robot
-from atalante_hal.start import powered
-from atalante_hal.supervision import DRIVE_NODES, Supervision
-from atalante_hal.supervisor import Conditions
+from atalante_hal.safety.diagnostics import Dtc, number_of
+from atalante_hal.safety.limiter import Limiter
+from atalante_hal.safety.plausibility import Plausibility
+from atalante_hal.safety.safety_monitor import DRIVE_NODES, SafetyMonitor
+from atalante_hal.safety.start import powered
+from atalante_hal.safety.state_machine import Conditions
 from atalante_hal.transceiver import FrameTap, Transceiver
 from atalante_hal.types import Command, State, SupervisorState
+from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_towards_operation
+from atalante_hal.wire.codec import Vector
+from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 PERIOD = 1e-3  # s, the SYNC period
 #: Cycles in a row with a torque the limiter cuts, after which the controller is helped.
@@ -79,7 +79,7 @@ class Hal:
         self.state.torque_sent = self._limiter.last
         self._commands = Commands(network, self._transceiver, self._parts, self._limiter.limit)
         self._status = StatusReport(network, self._transceiver, robot.hash32, gait_hash)
-        self._supervision = Supervision(
+        self._safety_monitor = SafetyMonitor(
             network,
             robot,
             PERIOD,
@@ -92,7 +92,7 @@ class Hal:
             self._commands,
         )
         #: What went wrong or changed, once, when it began.
-        self.events = self._supervision.memory.events
+        self.events = self._safety_monitor.memory.events
 
     # -- construction ------------------------------------------------------------------------------------------------
 
@@ -139,11 +139,11 @@ class Hal:
         if foreign:
             in_row = isinstance(foreign, range)
             places = slice(foreign[0], foreign[-1] + 1) if in_row else list(foreign)
-            self._supervision.accept(transceiver.scratch[places])
+            self._safety_monitor.accept(transceiver.scratch[places])
         self._plausibility.check()
         parts = self._parts
         np.multiply(parts.motor_side, self._to_joint, parts.joint_side)
-        self._supervision.judge()
+        self._safety_monitor.judge()
         header = self._header
         header[0], header[1] = cycle, state.time
         header[7] += count
@@ -156,63 +156,65 @@ class Hal:
         Returns:
             The torques really sent, after the limits. Shape (12,) [Nm], valid until the next call.
         """
-        supervision = self._supervision
-        if not supervision.moving:
+        safety_monitor = self._safety_monitor
+        if not safety_monitor.moving:
             return self.hold()
         limited = self._limiter.apply(command.torque, self._parts.motion)
         if not limited.finite:
-            supervision.report(Dtc.CMD_NONFINITE, "the controller asked for a torque that is not finite")
+            safety_monitor.report(Dtc.CMD_NONFINITE, "the controller asked for a torque that is not finite")
             return self._commands.send_prepared_hold(self.state.cycle)
         if limited.clamped:
             cycles = self._limiter.saturated
-            supervision.report(Dtc.TORQUE_SATURATED, "the limiter cuts the torque", cycles > SATURATED_CYCLES, cycles)
-        supervision.step = command.step
+            safety_monitor.report(
+                Dtc.TORQUE_SATURATED, "the limiter cuts the torque", cycles > SATURATED_CYCLES, cycles
+            )
+        safety_monitor.step = command.step
         if command.outside:
-            supervision.report(Dtc.GUIDE_OUTSIDE, "a joint is outside the virtual guide")
+            safety_monitor.report(Dtc.GUIDE_OUTSIDE, "a joint is outside the virtual guide")
         self._commands.drive(self._limiter.last, command.vibration)
         return self._send_command()
 
     def hold(self) -> Vector:
         """Send HOLD; drives being enabled for a start get the next step of their state machine instead."""
         self._commands.hold()
-        state, control, supervision = self.state, self._commands.control, self._supervision
-        if supervision.lowered:
-            control[[node in supervision.lowered for node in DRIVE_NODES]] = Controlword.DISABLE_VOLTAGE
-        if supervision.start_wanted and state.supervisor in (_S.LOWER, _S.FAULT):
+        state, control, safety_monitor = self.state, self._commands.control, self._safety_monitor
+        if safety_monitor.lowered:
+            control[[node in safety_monitor.lowered for node in DRIVE_NODES]] = Controlword.DISABLE_VOLTAGE
+        if safety_monitor.start_wanted and state.supervisor in (_S.LOWER, _S.FAULT):
             # The operator acknowledged: clear the drives that have a fault, the others go on holding.
             control[state.drive_state == DriveState.FAULT] = Controlword.FAULT_RESET
-        elif supervision.start_wanted and state.supervisor in (_S.READY, _S.HOLD) and not supervision.hindered:
+        elif safety_monitor.start_wanted and state.supervisor in (_S.READY, _S.HOLD) and not safety_monitor.hindered:
             control[:] = [controlword_towards_operation(int(s)) for s in state.drive_state.tolist()]
             # What the drive holds with now, so that nothing sags between its hold and the controller's first torque.
             self._follow_drives()
             self._commands.torque[:] = self._limiter.last
         else:
-            supervision.enabling = False
+            safety_monitor.enabling = False
         return self._send_command()
 
     def _follow_drives(self) -> None:
         """Command what the drives hold with, within all limits from the second cycle on; a drive that is off makes no torque."""
         torque = np.where(powered(self.state.drive_state), self.state.torque, 0.0)
-        if self._supervision.enabling:
+        if self._safety_monitor.enabling:
             self._limiter.apply(torque, self._parts.motion)
         else:
             self._limiter.restart(torque)
-            self._supervision.enabling = True
+            self._safety_monitor.enabling = True
 
     def fail(self, error: Exception) -> Vector:
         """The controller, or what was done with its command, raised: HOLD in this same cycle."""
-        self._supervision.report(Dtc.CONTROLLER_ERROR, f"the controller raised {type(error).__name__}: {error}")
+        self._safety_monitor.report(Dtc.CONTROLLER_ERROR, f"the controller raised {type(error).__name__}: {error}")
         return self._commands.send_prepared_hold(self.state.cycle)
 
     def report(self, dtc: Dtc, text: str, *, confirmed: bool = True, value: float = 0.0) -> None:
         """The loop noticed a fault of timing at the start of a cycle; judged in its `read`."""
-        self._supervision.report(dtc, text, confirmed, value, cycle=self.state.cycle + 1)
+        self._safety_monitor.report(dtc, text, confirmed, value, cycle=self.state.cycle + 1)
         if dtc is Dtc.CYCLE_GAP and confirmed:
             self._transceiver.discard()
 
     def end(self) -> None:
         """HOLD from the next cycle on, and no START any more. A signal handler may call it at any time."""
-        self._supervision.end()
+        self._safety_monitor.end()
 
     def stop(self, cycles: int = 10) -> None:
         """HOLD, and stay long enough for every drive to have followed. Call at the end, before closing the bus."""
@@ -227,17 +229,17 @@ class Hal:
     @property
     def moving(self) -> bool:
         """The controller's torques are used."""
-        return self._supervision.moving
+        return self._safety_monitor.moving
 
     @property
     def reason(self) -> str:
         """Why the robot is in the state it is in, one sentence."""
-        return self._supervision.reason
+        return self._safety_monitor.reason
 
     @property
     def conditions(self) -> Conditions:
         """What the supervisor judged last."""
-        return self._supervision.conditions
+        return self._safety_monitor.conditions
 
     @property
     def bus(self) -> Bus:
@@ -260,7 +262,7 @@ class Hal:
     @property
     def crc_errors(self) -> int:
         """Frames refused for their CRC so far."""
-        return self._supervision.crc_errors
+        return self._safety_monitor.crc_errors
 
     @property
     def silent(self) -> bool:
@@ -269,14 +271,14 @@ class Hal:
 
     def missing(self) -> list[str]:
         """Nodes that keep the robot out of READY: not heard in time or not trusted yet, no status, another DBC. For people."""
-        names = self._supervision.missing()
+        names = self._safety_monitor.missing()
         return [node.name for node in self.network.nodes if node.name in names]
 
     def _send_command(self) -> Vector:
-        state, supervision = self.state, self._supervision
+        state, safety_monitor = self.state, self._safety_monitor
         sent = self._commands.send(state.cycle)
         if state.cycle % self._status.cycles == 0:
-            worst_one, overruns = number_of(supervision.memory.bits), self._header[6]
-            self._status.send(state.supervisor, state.assistance_factor, overruns, worst_one, supervision.step)
-            supervision.look_for_heartbeats()
+            worst_one, overruns = number_of(safety_monitor.memory.bits), self._header[6]
+            self._status.send(state.supervisor, state.assistance_factor, overruns, worst_one, safety_monitor.step)
+            safety_monitor.look_for_heartbeats()
         return sent

@@ -13,8 +13,8 @@ from typing import Protocol
 
 import numpy as np
 
-from atalante_hal.diagnostics import Dtc
 from atalante_hal.hal import PERIOD, Hal
+from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.types import Controller, State
 
 #: Late cycles in a row, and longest gap between two cycles [s], that end in HOLD: the drives' own watchdog is as long.

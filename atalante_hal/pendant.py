@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from atalante_hal.codec import Vector
-from atalante_hal.image import ReceiveImage
+from atalante_hal.wire.codec import Vector
+from atalante_hal.wire.process_image import ReceiveImage
 
 #: Values of `PENDANT_STATE.Request`.
 _NONE, _START = 0, 1

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from atalante_dbc import Message
-from atalante_hal.codec import Codec, group_of
+from atalante_hal.record_layout import Layout
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, MOTORS
-from atalante_hal.telemetry.layout import Layout
 from atalante_hal.types import State, SupervisorState
+from atalante_hal.wire.codec import Codec, group_of
 
 #: One number each at the head of the record; "diagnostics" are bits of `diagnostics.Dtc`.
 HEADER_FIELDS = (

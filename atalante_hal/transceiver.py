@@ -12,10 +12,10 @@ from typing import Protocol
 
 from atalante_dbc import Message, Network
 from atalante_hal.bus import Bus, BusError, BusFull
-from atalante_hal.diagnostics import Dtc
-from atalante_hal.fault_memory import FaultMemory
-from atalante_hal.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, Frames, as_words, header_word, new_frames
-from atalante_hal.image import ReceiveImage
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.fault_memory import FaultMemory
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, Frames, as_words, header_word, new_frames
+from atalante_hal.wire.process_image import ReceiveImage
 
 #: Frames one cycle can take; the cyclic set is about 20.
 RECEIVE_BUDGET = 128
@@ -75,7 +75,7 @@ class Transceiver:
         self._most = cyclic + surplus
         #: Receive buffer, always the same array.
         self.scratch = new_frames(RECEIVE_BUDGET)
-        #: Found since the last judgement: code, whether confirmed, value, sentence.
+        #: Found since the last `judge`: code, whether confirmed, value, sentence.
         self._found: list[tuple[Dtc, bool, float, str]] = []
         self._refused = 0  # batches in a row for which the transmit queue had no room
         self._full_this_cycle = False
@@ -131,7 +131,7 @@ class Transceiver:
         try:
             count += self.bus.receive(scratch[first:] if first else scratch)
             if cycle is not None and (first or not cycle.begins(scratch, count)):
-                count = self._receive_rest(first, count, cycle.awaited(), patience)
+                count = self._receive_rest(first, count, cycle.expected_ids(), patience)
         except BusError as error:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} fails: {error}")
             count = first
@@ -183,7 +183,7 @@ class Transceiver:
         self._bus_off = 0
 
     def judge(self, cycle: int, memory: FaultMemory) -> None:
-        """Raise what was found since the last judgement, and a bus-off that nobody has acknowledged."""
+        """Raise what was found since the last `judge`, and a bus-off that nobody has acknowledged."""
         self._refused = self._refused + 1 if self._full_this_cycle else 0
         self._full_this_cycle = False
         self._floods = self._floods + 1 if any(dtc is Dtc.BUS_FLOOD for dtc, *_ in self._found) else 0

@@ -26,10 +26,10 @@ from atalante_emulator.pendant import Operator
 from atalante_hal.bus import Bus
 from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.bus.wrapped import WrappedBus
-from atalante_hal.frame import Frames
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot, load_robot
 from atalante_hal.types import Command, State, SupervisorState
+from atalante_hal.wire.frame import Frames
 
 # How long an example takes says nothing: the first one may compile.
 settings.register_profile("any time", deadline=None)

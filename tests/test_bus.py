@@ -26,7 +26,7 @@ from atalante_hal.bus.python_can import PythonCanBus, message_of
 from atalante_hal.bus.replay import LogUnreadable, ReplayBus
 from atalante_hal.bus.shared import shared_pair
 from atalante_hal.bus.wrapped import WrappedBus
-from atalante_hal.frame import (
+from atalante_hal.wire.frame import (
     FD_LENGTHS,
     FLAG_BRS,
     FLAG_ESI,

@@ -11,7 +11,11 @@ import numpy as np
 import pytest
 
 import atalante_dbc
-from atalante_hal.frame import (
+from atalante_hal.telemetry.can_log import FORMATS, CanLog, check_format
+from atalante_hal.telemetry.frames import FRAME_RECORD, FRAMES_PER_RECORD, RingTap, batches
+from atalante_hal.telemetry.ring import RingReader, RingWriter
+from atalante_hal.telemetry.sink import SinkError
+from atalante_hal.wire.frame import (
     FD_LENGTHS,
     FLAG_BRS,
     FLAG_ESI,
@@ -22,10 +26,6 @@ from atalante_hal.frame import (
     Frames,
     new_frames,
 )
-from atalante_hal.telemetry.can_log import FORMATS, CanLog, check_format
-from atalante_hal.telemetry.frames import FRAME_RECORD, FRAMES_PER_RECORD, RingTap, batches
-from atalante_hal.telemetry.ring import RingReader, RingWriter
-from atalante_hal.telemetry.sink import SinkError
 
 
 def random_frames(network: atalante_dbc.Network, count: int, seed: int = 0) -> Frames:

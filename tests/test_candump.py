@@ -8,7 +8,7 @@ import can
 import numpy as np
 import pytest
 
-from atalante_hal.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE
 from atalante_tools.validate import log as log_module
 from atalante_tools.validate.candump import MARGIN, Channels, Parsed, parse
 from atalante_tools.validate.chunk import NO_DIRECTION, RECEIVED, SENT, Chunk

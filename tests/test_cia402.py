@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from atalante_hal.cia402 import Controlword, DriveState, controlword_towards_operation, next_state
+from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_towards_operation, next_state
 
 S, C = DriveState, Controlword
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from atalante_dbc import DBC_FILE, load
-from atalante_hal.codec import INSIDE, OUTSIDE, SAYS_INVALID, Codec, group_of, read_row, scale_row
-from atalante_hal.frame import WORDS
 from atalante_hal.robot import JOINTS
+from atalante_hal.wire.codec import INSIDE, OUTSIDE, SAYS_INVALID, Codec, group_of, read_row, scale_row
+from atalante_hal.wire.frame import WORDS
 
 NETWORK = load()
 MESSAGES = NETWORK.messages

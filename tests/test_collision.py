@@ -5,8 +5,8 @@ import pytest
 
 from atalante_dbc import Network
 from atalante_emulator.collision import Senders
-from atalante_hal.frame import Frames, new_frames
-from atalante_hal.image import TransmitImage
+from atalante_hal.wire.frame import Frames, new_frames
+from atalante_hal.wire.process_image import TransmitImage
 
 NAME = "COMMAND_LEFT_LEG"
 

@@ -14,11 +14,11 @@ import pytest
 from command_limits import FD, RECORD, CommandLimits, main
 
 from atalante_dbc import load
-from atalante_hal.cia402 import Controlword
-from atalante_hal.image import TransmitImage
-from atalante_hal.limiter import Limiter
 from atalante_hal.robot import load_robot
+from atalante_hal.safety.limiter import Limiter
 from atalante_hal.types import Command, SupervisorState
+from atalante_hal.wire.cia402 import Controlword
+from atalante_hal.wire.process_image import TransmitImage
 
 NETWORK, ROBOT = load(), load_robot()
 LIMIT = ROBOT.torque_max.copy()

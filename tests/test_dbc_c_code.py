@@ -15,7 +15,7 @@ import pytest
 from click.testing import CliRunner
 
 from atalante_dbc import DBC_FILE, load
-from atalante_hal.codec import Codec
+from atalante_hal.wire.codec import Codec
 from atalante_tools.cli import cli
 from atalante_tools.dbc.c_code import Build, write
 from atalante_tools.dbc.e2e_c import crc_table

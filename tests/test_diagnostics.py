@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from atalante_hal.diagnostics import (
+from atalante_hal.safety.diagnostics import (
     Dtc,
     Reaction,
     Severity,
@@ -15,7 +15,7 @@ from atalante_hal.diagnostics import (
     number_of,
     worst,
 )
-from atalante_hal.telemetry.events import SEVERITIES
+from atalante_hal.safety.events import SEVERITIES
 
 R = Reaction
 

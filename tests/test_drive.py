@@ -13,8 +13,8 @@ from atalante_emulator.drive import NODES, SLOW_CYCLES, WATCHDOG, DriveParameter
 from atalante_emulator.emergency import Emergency
 from atalante_emulator.encoder import COUNTS
 from atalante_emulator.motor import MotorParameters
-from atalante_hal.cia402 import Controlword, DriveState, controlword_towards_operation
 from atalante_hal.robot import Robot, load_robot
+from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_towards_operation
 
 ROBOT = load_robot()
 SMOOTH_MOTOR = MotorParameters(coulomb=(0.0,) * 6, viscous=(0.0,) * 6)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from atalante_dbc import load
-from atalante_hal.e2e import (
+from atalante_hal.wire.e2e import (
     FULL,
     MAX_DELTA,
     REQUALIFY,
@@ -28,8 +28,8 @@ from atalante_hal.e2e import (
     qualify,
     suspect,
 )
-from atalante_hal.frame import FRAME_BYTES, new_frames
-from atalante_hal.image import ReceiveImage, TransmitImage
+from atalante_hal.wire.frame import FRAME_BYTES, new_frames
+from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 
 NETWORK = load()
 CYCLIC = [m for m in NETWORK.received_by("HAL") if m.cycle_ms == 1]

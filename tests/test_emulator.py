@@ -13,11 +13,11 @@ from atalante_emulator.pendant import Operator
 from atalante_hal.bus import Bus
 from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.pair import lockstep_pair
-from atalante_hal.cia402 import Controlword, DriveState, controlword_towards_operation
-from atalante_hal.e2e import crc, data_id_bytes
-from atalante_hal.frame import Frames, new_frames
-from atalante_hal.image import ReceiveImage, TransmitImage
 from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_towards_operation
+from atalante_hal.wire.e2e import crc, data_id_bytes
+from atalante_hal.wire.frame import Frames, new_frames
+from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 
 CROUCHED = [0.0, 0.0, -0.4, 0.7, -0.1, 0.0] * 2
 

@@ -12,10 +12,10 @@ from atalante_control.model import ExoskeletonParameters, Patient, urdf
 from atalante_dbc import Network
 from atalante_hal.bus import BusDown
 from atalante_hal.bus.pair import PairBus, lockstep_pair
-from atalante_hal.frame import Frames, new_frames
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
 from atalante_hal.types import SupervisorState
+from atalante_hal.wire.frame import Frames, new_frames
 from atalante_tools import body as body_module
 from atalante_tools import emulator as emulator_module
 from atalante_tools import rig as rig_module

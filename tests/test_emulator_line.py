@@ -12,11 +12,11 @@ from atalante_emulator.pendant import Operator
 from atalante_hal.bus import BusDown
 from atalante_hal.bus.pair import PairBus, lockstep_pair
 from atalante_hal.bus.wrapped import WrappedBus
-from atalante_hal.cia402 import DriveState
-from atalante_hal.frame import FRAME, Frames, new_frames
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
 from atalante_hal.types import Command, SupervisorState
+from atalante_hal.wire.cia402 import DriveState
+from atalante_hal.wire.frame import FRAME, Frames, new_frames
 from atalante_tools import emulator_line
 from atalante_tools.emulator import status_line
 from atalante_tools.emulator_line import Line

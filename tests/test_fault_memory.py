@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from atalante_hal.diagnostics import Dtc
-from atalante_hal.fault_memory import EVENTS_KEPT, QUIET_CONFIRMED, QUIET_PENDING, EventLog, FaultMemory
-from atalante_hal.telemetry.events import Event
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.events import Event
+from atalante_hal.safety.fault_memory import EVENTS_KEPT, QUIET_CONFIRMED, QUIET_PENDING, EventLog, FaultMemory
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ import pytest
 
 from atalante_dbc import Network
 from atalante_hal.bus.pair import PairBus, lockstep_pair
-from atalante_hal.frame import Frames, new_frames
-from atalante_hal.image import TransmitImage
+from atalante_hal.wire.frame import Frames, new_frames
+from atalante_hal.wire.process_image import TransmitImage
 from atalante_tools.frame_filter import FrameFilter
 
 STATES = ("LEFT_FH_STATE", "LEFT_SK_STATE", "FOOT_LEFT_STATE")

@@ -11,11 +11,11 @@ from frame_fuzzer import RECEIVE_BUDGET, SWEEP, Finding, Fuzzer, Oracle, fuzz_im
 
 import atalante_dbc
 from atalante_emulator.drive import Drives
-from atalante_hal.e2e import CRC_BYTES, Check, crc, data_id_bytes
-from atalante_hal.frame import Frames, as_words, new_frames
-from atalante_hal.image import ReceiveImage, TransmitImage
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import SupervisorState
+from atalante_hal.wire.e2e import CRC_BYTES, Check, crc, data_id_bytes
+from atalante_hal.wire.frame import Frames, as_words, new_frames
+from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 
 NETWORK = atalante_dbc.load()
 IMAGES = {name: messages for name, (messages, _) in images(NETWORK).items()}

@@ -9,11 +9,11 @@ import pytest
 from command_limits import database
 
 from atalante_hal.bus import BusDown, BusFull
-from atalante_hal.cia402 import Controlword, DriveState
-from atalante_hal.diagnostics import Dtc, dtcs_of, number_of
 from atalante_hal.hal import Hal
 from atalante_hal.robot import JOINTS
+from atalante_hal.safety.diagnostics import Dtc, dtcs_of, number_of
 from atalante_hal.types import Command, SupervisorState
+from atalante_hal.wire.cia402 import Controlword, DriveState
 
 S = SupervisorState
 

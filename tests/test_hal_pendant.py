@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from atalante_dbc import load
-from atalante_hal.image import ReceiveImage
 from atalante_hal.pendant import Demand, Pendant, demand_of, safest
+from atalante_hal.wire.process_image import ReceiveImage
 
 NETWORK = load()
 START, STOP, HOLD = 1, 2, 3

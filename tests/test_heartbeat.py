@@ -5,7 +5,7 @@ import pytest
 
 from atalante_dbc import Network
 from atalante_emulator.heartbeat import BOOTUP, OPERATIONAL, Heartbeats
-from atalante_hal.codec import Codec
+from atalante_hal.wire.codec import Codec
 
 NODES = ("LEFT_SK", "IMU_TORSO", "PENDANT")
 

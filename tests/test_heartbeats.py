@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from atalante_dbc import load
-from atalante_hal.diagnostics import Dtc
-from atalante_hal.fault_memory import FaultMemory
-from atalante_hal.frame import Frames, new_frames
-from atalante_hal.heartbeats import Heartbeats
-from atalante_hal.image import TransmitImage
 from atalante_hal.robot import load_robot
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.fault_memory import FaultMemory
+from atalante_hal.safety.heartbeats import Heartbeats
+from atalante_hal.wire.frame import Frames, new_frames
+from atalante_hal.wire.process_image import TransmitImage
 
 NETWORK, THRESHOLDS = load(), load_robot().thresholds
 LOW, UNDER = THRESHOLDS.supply_low, THRESHOLDS.supply_under

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from atalante_dbc import Message, load
-from atalante_hal.e2e import Check
-from atalante_hal.frame import new_frames
-from atalante_hal.image import NEVER, ReceiveImage, TransmitImage
+from atalante_hal.wire.e2e import Check
+from atalante_hal.wire.frame import new_frames
+from atalante_hal.wire.process_image import NEVER, ReceiveImage, TransmitImage
 
 NETWORK = load()
 #: A few of the cyclic messages, of every kind; the whole cycle is judged in test_e2e.
@@ -522,18 +522,18 @@ def test_a_cycle_is_complete_when_all_messages_stand_first_and_in_order():
     assert rx.begins(other, ROWS)
 
 
-def test_who_was_heard_within_the_timeout_is_awaited():
+def test_who_was_heard_within_the_timeout_is_expected():
     tx, rx, buffer = pair()
-    assert rx.awaited() == set()
+    assert rx.expected_ids() == set()
     deliver(tx, rx, buffer)
     everybody = {m.frame_id for m in CYCLIC}
-    assert rx.awaited() == everybody
+    assert rx.expected_ids() == everybody
     timeout = CYCLIC[3].timeout_ms
     for _ in range(timeout):
         deliver(tx, rx, buffer, [r for r in range(ROWS) if r != 3])
-    assert rx.awaited() == everybody
+    assert rx.expected_ids() == everybody
     deliver(tx, rx, buffer, [r for r in range(ROWS) if r != 3])
-    assert rx.awaited() == everybody - {CYCLIC[3].frame_id}
+    assert rx.expected_ids() == everybody - {CYCLIC[3].frame_id}
 
 
 def test_a_sender_goes_on_after_another():

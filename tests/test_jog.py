@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from atalante_hal.cia402 import DriveState
 from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.wire.cia402 import DriveState
 from atalante_tools import rig as rig_module
 from atalante_tools.cli import cli
 from atalante_tools.pose_hold import PEAK, minimum_jerk

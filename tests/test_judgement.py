@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from atalante_dbc import load
-from atalante_hal.diagnostics import Dtc
-from atalante_hal.e2e import COUNTER_BYTE, SETTLED, Check, crc, data_id_bytes
-from atalante_hal.fault_memory import FaultMemory
-from atalante_hal.frame import Frames, new_frames
-from atalante_hal.image import ReceiveImage, TransmitImage
-from atalante_hal.judgement import Judgement
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.fault_memory import FaultMemory
+from atalante_hal.safety.message_monitor import MessageMonitor
+from atalante_hal.wire.e2e import COUNTER_BYTE, SETTLED, Check, crc, data_id_bytes
+from atalante_hal.wire.frame import Frames, new_frames
+from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 
 NETWORK = load()
 MESSAGES = [
@@ -25,11 +25,11 @@ Change = Callable[[Frames], Frames]
 
 
 class Bench:
-    """Nodes and the HAL's judgement; a cycle may lose, change or delay frames."""
+    """Nodes and the HAL's message monitor; a cycle may lose, change or delay frames."""
 
     def __init__(self) -> None:
         self.tx, self.image = TransmitImage(MESSAGES), ReceiveImage(MESSAGES)
-        self.judgement, self.memory = Judgement(NETWORK, self.image), FaultMemory()
+        self.message_monitor, self.memory = MessageMonitor(NETWORK, self.image), FaultMemory()
         self.buffer, self.number = new_frames(64), 0
         self.swing: int | None = None
 
@@ -39,7 +39,7 @@ class Bench:
             frames = change(self.tx.seal(self.number & 0xFF).copy())
             self.buffer[: len(frames)] = frames
             self.image.accept(self.buffer, len(frames), self.number & 0xFF)
-            self.judgement.judge(self.number, self.memory, self.swing)
+            self.message_monitor.judge(self.number, self.memory, self.swing)
             self.memory.close_cycle(self.number)
         return self
 
@@ -69,26 +69,26 @@ def flip(row: int) -> Change:
 
 
 def test_a_sender_is_trusted_after_sixteen_good_cycles(bench: Bench):
-    assert not bench.cycle(times=15).judgement.nodes_well
-    assert not bench.judgement.valid.any()
-    assert bench.judgement.missing() == {"LEFT_SK", "RIGHT_SK", "IMU_PELVIS", "FOOT_LEFT"}
-    assert not bench.judgement.settled
+    assert not bench.cycle(times=15).message_monitor.nodes_well
+    assert not bench.message_monitor.valid.any()
+    assert bench.message_monitor.missing() == {"LEFT_SK", "RIGHT_SK", "IMU_PELVIS", "FOOT_LEFT"}
+    assert not bench.message_monitor.settled
     bench.cycle()
-    assert bench.judgement.nodes_well
-    assert bench.judgement.trusts(KNEE)
-    assert bench.judgement.valid.all()
-    assert bench.judgement.joints_valid
-    assert bench.judgement.missing() == set()
-    assert bench.judgement.settled
+    assert bench.message_monitor.nodes_well
+    assert bench.message_monitor.trusts(KNEE)
+    assert bench.message_monitor.valid.all()
+    assert bench.message_monitor.joints_valid
+    assert bench.message_monitor.missing() == set()
+    assert bench.message_monitor.settled
     assert bench.active == {}
 
 
 def test_who_was_never_heard_has_no_timeout(bench: Bench):
     bench.cycle(lose(IMU), times=40)
     assert bench.active == {}
-    assert not bench.judgement.nodes_well
-    assert bench.judgement.missing() == {"IMU_PELVIS"}
-    assert bench.judgement.joints_valid
+    assert not bench.message_monitor.nodes_well
+    assert bench.message_monitor.missing() == {"IMU_PELVIS"}
+    assert bench.message_monitor.joints_valid
 
 
 @pytest.mark.parametrize(
@@ -97,12 +97,12 @@ def test_who_was_never_heard_has_no_timeout(bench: Bench):
 def test_a_silent_node_times_out_at_its_timeout_exactly(bench: Bench, row: int, node: str, timeout: int):
     bench.well().cycle(lose(row), times=timeout - 1)
     assert bench.active == {}
-    assert bench.judgement.nodes_well
-    assert not bench.judgement.valid[row]
-    assert bench.judgement.joints_valid is (row != KNEE)
+    assert bench.message_monitor.nodes_well
+    assert not bench.message_monitor.valid[row]
+    assert bench.message_monitor.joints_valid is (row != KNEE)
     bench.cycle(lose(row))
     assert bench.active == {("NODE_TIMEOUT", node): True}
-    assert not bench.judgement.nodes_well
+    assert not bench.message_monitor.nodes_well
     event = bench.memory.events[-1]
     assert (event.code, event.node, event.value, event.cycle) == ("NODE_TIMEOUT", node, timeout, 16 + timeout)
     assert event.text == f"{node}: a node is silent; its data is {timeout} cycles old"
@@ -111,24 +111,24 @@ def test_a_silent_node_times_out_at_its_timeout_exactly(bench: Bench, row: int, 
 def test_a_frame_after_lost_ones_is_used_and_told(bench: Bench):
     bench.well().cycle(lose(KNEE), times=4).cycle()
     assert bench.active == {("E2E_SOME_LOST", "LEFT_SK"): False}
-    assert bench.judgement.valid.all()
-    assert not bench.judgement.settled
+    assert bench.message_monitor.valid.all()
+    assert not bench.message_monitor.settled
     bench.cycle()
     assert bench.active == {}
-    assert not bench.judgement.settled
+    assert not bench.message_monitor.settled
     bench.cycle(times=14)
-    assert bench.judgement.settled
+    assert bench.message_monitor.settled
 
 
 def test_after_a_timeout_trust_takes_sixteen_good_cycles(bench: Bench):
     bench.well().cycle(lose(KNEE), times=5).cycle()
     assert bench.active == {("E2E_SEQUENCE", "LEFT_SK"): True}  # more than four are missing
     bench.cycle(times=15)
-    assert not bench.judgement.nodes_well
-    assert not bench.judgement.valid[KNEE]
-    assert bench.judgement.valid[OTHER_KNEE]
+    assert not bench.message_monitor.nodes_well
+    assert not bench.message_monitor.valid[KNEE]
+    assert bench.message_monitor.valid[OTHER_KNEE]
     bench.cycle(times=2)
-    assert bench.judgement.nodes_well
+    assert bench.message_monitor.nodes_well
 
 
 def repeat(frames: Frames) -> Frames:
@@ -139,7 +139,7 @@ def test_a_repeated_frame_is_told_and_changes_nothing(bench: Bench):
     bench.well().cycle(repeat)
     assert bench.active == {("E2E_REPEATED", "LEFT_SK"): False}
     assert bench.image.age[KNEE] == 0
-    assert bench.judgement.valid.all()
+    assert bench.message_monitor.valid.all()
 
 
 def frozen(bench: Bench) -> Change:
@@ -193,7 +193,7 @@ def test_an_invalid_code_is_the_imus_own_diagnostic(row, message, signal, value,
     timeout, node = MESSAGES[row].timeout_ms, MESSAGES[row].sender
     bench.cycle(times=timeout - 1)
     assert bench.active == {(code, node): False}
-    assert not bench.judgement.valid[row]
+    assert not bench.message_monitor.valid[row]
     bench.cycle()
     assert bench.active == {(code, node): True}
 
@@ -207,7 +207,7 @@ def test_what_a_right_frame_says_does_not_fill_the_bucket(bench: Bench):
         bench.tx.values[place] = 0.0
         bench.cycle()
     assert not any(event.code == "E2E_LOSS_RATE" for event in bench.memory.events)
-    assert bench.judgement.nodes_well
+    assert bench.message_monitor.nodes_well
 
 
 def late(bench: Bench, row: int, by: int) -> Change:
@@ -228,8 +228,8 @@ def test_a_late_answer_is_used_with_its_age(bench: Bench, by: int):
     assert bench.active == {("NODE_LATE", "LEFT_SK"): False}
     assert bench.memory.active[Dtc.NODE_LATE, "LEFT_SK"].value == by
     assert bench.image.age[KNEE] == by
-    assert bench.judgement.valid[KNEE]
-    assert bench.judgement.nodes_well
+    assert bench.message_monitor.valid[KNEE]
+    assert bench.message_monitor.nodes_well
 
 
 @pytest.mark.parametrize("by", [5, 6])
@@ -243,7 +243,7 @@ def test_an_answer_later_than_the_timeout_is_no_answer(bench: Bench, by: int):
         bench.cycle(change, times=10)
     assert bench.memory.active[Dtc.NODE_LATE, "LEFT_SK"].confirmed
     assert bench.memory.active[Dtc.NODE_LATE, "LEFT_SK"].value == by
-    assert not bench.judgement.nodes_well
+    assert not bench.message_monitor.nodes_well
 
 
 def test_steady_loss_trips_the_bucket_and_the_pendants_is_not_the_nodes(bench: Bench):
@@ -252,19 +252,19 @@ def test_steady_loss_trips_the_bucket_and_the_pendants_is_not_the_nodes(bench: B
     for _ in range(5):
         bench.cycle(loss, times=3).cycle()  # 55 in the bucket in the end
     bench.cycle(loss, times=2)
-    assert bench.judgement.trusts(KNEE)
+    assert bench.message_monitor.trusts(KNEE)
     bench.cycle(loss)
     assert bench.active == {("E2E_LOSS_RATE", "LEFT_SK"): True}
     assert bench.memory.active[Dtc.E2E_LOSS_RATE, "LEFT_SK"].value == 64
-    assert not bench.judgement.nodes_well
-    assert not bench.judgement.trusts(PENDANT)
+    assert not bench.message_monitor.nodes_well
+    assert not bench.message_monitor.trusts(PENDANT)
 
 
 def test_a_lost_pendant_is_no_lost_node(bench: Bench):
     bench.well().cycle(lose(PENDANT), times=20)
     assert bench.active == {}
-    assert bench.judgement.nodes_well
-    assert not bench.judgement.trusts(PENDANT)
+    assert bench.message_monitor.nodes_well
+    assert not bench.message_monitor.trusts(PENDANT)
 
 
 def test_what_is_implausible_is_not_valid_and_is_told_by_who_found_it(bench: Bench):
@@ -275,12 +275,12 @@ def test_what_is_implausible_is_not_valid_and_is_told_by_who_found_it(bench: Ben
         bench.buffer[: len(frames)] = frames
         bench.image.accept(bench.buffer, len(frames), bench.number & 0xFF)
         bench.image.refuse(KNEE)
-        bench.judgement.judge(bench.number, bench.memory)
+        bench.message_monitor.judge(bench.number, bench.memory)
         bench.memory.close_cycle(bench.number)
         assert bench.image.check[KNEE] == Check.IMPLAUSIBLE
         assert bench.image.age[KNEE] == age
-        assert not bench.judgement.valid[KNEE]
-        assert bench.judgement.trusts(KNEE) is (age < 5)
+        assert not bench.message_monitor.valid[KNEE]
+        assert bench.message_monitor.trusts(KNEE) is (age < 5)
     assert bench.active == {}
 
 
@@ -290,7 +290,7 @@ def test_a_replayed_answer_does_not_disturb_the_next_one(bench: Bench):
     bench.cycle(times=30)
     bench.cycle(lambda frames: np.concatenate([old, frames]))
     assert bench.active == {("E2E_SEQUENCE", "LEFT_SK"): False}
-    assert bench.judgement.valid[KNEE]
+    assert bench.message_monitor.valid[KNEE]
     assert old["data"][0, COUNTER_BYTE] == 16
 
 
@@ -302,13 +302,13 @@ def test_values_of_what_was_never_committed_have_no_age(bench: Bench):
 
 
 def test_before_the_first_cycle_nothing_may_be_used(bench: Bench) -> None:
-    judgement = bench.judgement
-    assert judgement.valid.tolist() == [False] * len(MESSAGES)
-    assert judgement.valid.dtype == np.bool_
-    assert judgement.joints_valid is False
-    assert judgement.settled is False
-    assert not judgement.nodes_well
-    assert not any(judgement.trusts(row) for row in range(len(MESSAGES)))
+    message_monitor = bench.message_monitor
+    assert message_monitor.valid.tolist() == [False] * len(MESSAGES)
+    assert message_monitor.valid.dtype == np.bool_
+    assert message_monitor.joints_valid is False
+    assert message_monitor.settled is False
+    assert not message_monitor.nodes_well
+    assert not any(message_monitor.trusts(row) for row in range(len(MESSAGES)))
 
 
 def test_what_says_the_impossible_came_well_and_fills_no_bucket(bench: Bench) -> None:
@@ -325,7 +325,7 @@ def test_what_says_the_impossible_came_well_and_fills_no_bucket(bench: Bench) ->
     for _ in range(20):
         bench.cycle(impossible)
         assert bench.image.check[KNEE] == Check.RANGE
-        assert bench.judgement.qualification[KNEE] is SETTLED
+        assert bench.message_monitor.qualification[KNEE] is SETTLED
         bench.cycle()
 
 
@@ -405,40 +405,40 @@ class TestTwoSenders:
         node = MESSAGES[row].sender
         bench.well().cycle(self.rival(row, first=first), times=3)
         assert bench.active == {("NODE_DUPLICATE", node): False}
-        assert bench.judgement.trusts(row)
-        assert bench.judgement.valid[row]
-        assert not bench.judgement.settled
+        assert bench.message_monitor.trusts(row)
+        assert bench.message_monitor.valid[row]
+        assert not bench.message_monitor.settled
         bench.cycle(self.rival(row, first=first))
         assert bench.active == {("NODE_DUPLICATE", node): True}
         assert bench.memory.active[Dtc.NODE_DUPLICATE, node].value == 64
-        assert not bench.judgement.trusts(row)
+        assert not bench.message_monitor.trusts(row)
         text = f"{node}: two senders of one message, {MESSAGES[row].name}: switch one of them off"
         assert bench.memory.events[-1].text == text
         bench.cycle(self.rival(row, first=first), times=100)
         assert bench.active == {("NODE_DUPLICATE", node): True}
-        assert not bench.judgement.trusts(row)
+        assert not bench.message_monitor.trusts(row)
         told = [event for event in bench.memory.events if event.code == "NODE_DUPLICATE"]
         assert [event.severity for event in told] == ["warning", "error"]
 
     def test_trust_comes_back_after_sixteen_clean_cycles_and_one_more_rival_takes_it_again(self, bench: Bench):
         bench.well().cycle(self.rival(KNEE), times=4).cycle(times=15)
         assert bench.active == {}
-        assert not bench.judgement.nodes_well
+        assert not bench.message_monitor.nodes_well
         bench.cycle()
-        assert bench.judgement.nodes_well
-        assert not bench.judgement.settled
+        assert bench.message_monitor.nodes_well
+        assert not bench.message_monitor.settled
         bench.cycle(self.rival(KNEE))
         assert bench.active == {("NODE_DUPLICATE", "LEFT_SK"): True}
         bench.cycle(times=63)
-        assert not bench.judgement.settled
+        assert not bench.message_monitor.settled
         bench.cycle()
-        assert bench.judgement.settled
+        assert bench.message_monitor.settled
 
     def test_a_node_of_two_senders_is_never_trusted_and_the_reason_is_raised(self, bench: Bench):
         bench.cycle()
         for _ in range(10):
             bench.cycle(self.rival(IMU)).cycle(times=5)
-        assert bench.judgement.missing() == {"IMU_PELVIS"}
+        assert bench.message_monitor.missing() == {"IMU_PELVIS"}
         assert any(e.code == "NODE_DUPLICATE" and e.severity == "error" for e in bench.memory.events)
 
     @pytest.mark.parametrize("ahead", [-2, 2, 30])
@@ -470,10 +470,10 @@ class TestTwoSenders:
         assert bench.active == {("E2E_REPEATED", "LEFT_SK"): False, ("E2E_FROZEN", "LEFT_SK"): True}
 
     def test_what_is_heard_is_younger_than_its_timeout(self, bench: Bench):
-        assert not bench.judgement.hears(PENDANT)
+        assert not bench.message_monitor.hears(PENDANT)
         bench.cycle()
-        assert bench.judgement.hears(PENDANT)
+        assert bench.message_monitor.hears(PENDANT)
         bench.cycle(lose(PENDANT), times=4)
-        assert bench.judgement.hears(PENDANT)
+        assert bench.message_monitor.hears(PENDANT)
         bench.cycle(lose(PENDANT))
-        assert not bench.judgement.hears(PENDANT)
+        assert not bench.message_monitor.hears(PENDANT)

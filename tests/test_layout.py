@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from atalante_hal.telemetry.layout import Layout
+from atalante_hal.record_layout import Layout
 
 FIELDS = st.lists(
     st.tuples(st.text("abc.", min_size=1, max_size=4), st.integers(1, 40)),

@@ -10,8 +10,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from atalante_hal.limiter import Limited, Limiter
 from atalante_hal.robot import JOINTS, load_robot
+from atalante_hal.safety.limiter import Limited, Limiter
 
 ROBOT = load_robot()
 PERIOD = 1e-3

@@ -9,9 +9,9 @@ from atalante_dbc import Network
 from atalante_emulator.faults import Fault, FaultError
 from atalante_emulator.link import BUS_OFF, FaultyBus
 from atalante_hal.bus.pair import lockstep_pair
-from atalante_hal.e2e import Check
-from atalante_hal.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, Frames, new_frames
-from atalante_hal.image import ReceiveImage, TransmitImage
+from atalante_hal.wire.e2e import Check
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, Frames, new_frames
+from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 
 KNEE, HIP, COMMAND, SYNC = "LEFT_SK_STATE", "LEFT_SH_STATE", "COMMAND_LEFT_LEG", "SYNC_LEFT_LEG"
 FOREVER = None

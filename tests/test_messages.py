@@ -16,14 +16,14 @@ from google.protobuf import descriptor_pb2
 import atalante_dbc
 from atalante_control.controller import HangController
 from atalante_hal.bus.pair import lockstep_pair
-from atalante_hal.cia402 import DriveState
 from atalante_hal.hal import Hal
+from atalante_hal.record_layout import Layout
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, MOTORS, Robot
+from atalante_hal.safety.events import SEVERITIES, Event, pack, unpack
 from atalante_hal.telemetry import schema
-from atalante_hal.telemetry.events import SEVERITIES, Event, pack, unpack
-from atalante_hal.telemetry.layout import Layout
 from atalante_hal.telemetry.messages import Encoder
 from atalante_hal.types import SupervisorState
+from atalante_hal.wire.cia402 import DriveState
 
 NANOSECONDS = 1_000_000_000
 

@@ -19,9 +19,9 @@ from atalante_emulator.emulator import Emulator
 from atalante_emulator.faults import Fault
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus.pair import lockstep_pair
-from atalante_hal.frame import FLAG_BRS, FLAG_FDF, new_frames
-from atalante_hal.image import TransmitImage
 from atalante_hal.robot import Robot
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, new_frames
+from atalante_hal.wire.process_image import TransmitImage
 
 NODES = [node.name for node in atalante_dbc.load().nodes if node.kind != "master"]
 CYCLES = 260

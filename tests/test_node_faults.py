@@ -12,10 +12,10 @@ from atalante_emulator.emulator import Emulator
 from atalante_emulator.faults import Fault, FaultError
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus.pair import PairBus, lockstep_pair
-from atalante_hal.cia402 import DriveState, controlword_towards_operation
-from atalante_hal.frame import Frames, new_frames
-from atalante_hal.image import ReceiveImage, TransmitImage
 from atalante_hal.robot import Robot
+from atalante_hal.wire.cia402 import DriveState, controlword_towards_operation
+from atalante_hal.wire.frame import Frames, new_frames
+from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 
 CROUCHED = [0.0, 0.0, -0.4, 0.7, -0.1, 0.0] * 2
 KNEE, HENKE = 3, 5  # of the left leg

@@ -11,8 +11,8 @@ from atalante_emulator.drive import DriveParameters, Drives, DriveSignals
 from atalante_emulator.foot import Feet, FootParameters
 from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
 from atalante_emulator.noise import NOISE_CYCLES, SensorNoise
-from atalante_hal.codec import Codec
 from atalante_hal.robot import Robot
+from atalante_hal.wire.codec import Codec
 
 Make = Callable[..., tuple[SensorNoise, Codec]]
 

@@ -15,11 +15,11 @@ from atalante_emulator.body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus import BusDown
-from atalante_hal.cia402 import DriveState
-from atalante_hal.frame import FRAME, FRAME_BYTES, Frames
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
 from atalante_hal.types import Command, SupervisorState
+from atalante_hal.wire.cia402 import DriveState
+from atalante_hal.wire.frame import FRAME, FRAME_BYTES, Frames
 from atalante_tools import pendant, pendant_session
 from atalante_tools.cli import cli
 from atalante_tools.emulator_line import Line

@@ -16,19 +16,19 @@ from hypothesis import strategies as st
 
 import atalante_dbc
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
-from atalante_hal.codec import Codec
-from atalante_hal.diagnostics import Dtc
-from atalante_hal.e2e import Check
-from atalante_hal.image import NEVER, ReceiveImage
-from atalante_hal.plausibility import Finding, Plausibility
-from atalante_hal.plausibility.encoders import Encoders
-from atalante_hal.plausibility.feet import Feet
-from atalante_hal.plausibility.finding import Ages, Signals, measured, signals_of
-from atalante_hal.plausibility.imus import Imus
-from atalante_hal.plausibility.legs import Legs, _Contradiction, _forgotten, hip_angles
-from atalante_hal.plausibility.stillness import Stillness
-from atalante_hal.plausibility.unchecked import Unchecked
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, load_robot
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.plausibility import Finding, Plausibility
+from atalante_hal.safety.plausibility.encoders import Encoders
+from atalante_hal.safety.plausibility.feet import Feet
+from atalante_hal.safety.plausibility.finding import Ages, Signals, measured, signals_of
+from atalante_hal.safety.plausibility.imus import Imus
+from atalante_hal.safety.plausibility.legs import Legs, _Contradiction, _forgotten, hip_angles
+from atalante_hal.safety.plausibility.stillness import Stillness
+from atalante_hal.safety.plausibility.unchecked import Unchecked
+from atalante_hal.wire.codec import Codec
+from atalante_hal.wire.e2e import Check
+from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 NETWORK = atalante_dbc.load()
 ROBOT = load_robot()

@@ -144,7 +144,7 @@ import pytest
 
 @pytest.mark.hil
 def test_of_the_robot(bus):
-    from atalante_hal.frame import new_frames
+    from atalante_hal.wire.frame import new_frames
     assert bus.receive(new_frames(1), 5.0) == 1
 """
 

@@ -26,8 +26,8 @@ import atalante_hal.robot
 from atalante_control.gait import HANG_GAIT, GaitError, check_gait, load_gait
 from atalante_control.generation.library import Library, LibraryError
 from atalante_dbc import DBC_FILE, DbcError
-from atalante_hal.image import ReceiveImage, TransmitImage
 from atalante_hal.robot import JOINTS, LEG_JOINTS, ROBOT_FILE, RobotError, load_robot
+from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 from atalante_tools.cli import cli
 from atalante_tools.validate.project import ProjectError, load_project
 

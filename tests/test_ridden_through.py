@@ -19,14 +19,14 @@ import pytest
 
 import atalante_dbc
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
-from atalante_hal.diagnostics import Dtc
-from atalante_hal.e2e import COUNTER_BYTE
-from atalante_hal.frame import Frames, new_frames
-from atalante_hal.image import ReceiveImage, TransmitImage
-from atalante_hal.plausibility import Finding, Plausibility
-from atalante_hal.plausibility.finding import Signals, signals_of
-from atalante_hal.plausibility.unchecked import UNCHECKED_CYCLES
 from atalante_hal.robot import IMUS, JOINTS, load_robot
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.plausibility import Finding, Plausibility
+from atalante_hal.safety.plausibility.finding import Signals, signals_of
+from atalante_hal.safety.plausibility.unchecked import UNCHECKED_CYCLES
+from atalante_hal.wire.e2e import COUNTER_BYTE
+from atalante_hal.wire.frame import Frames, new_frames
+from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 
 NETWORK, ROBOT = atalante_dbc.load(), load_robot()
 _RECEIVED = [m for m in NETWORK.received_by("HAL") if m.cycle_ms == 1]

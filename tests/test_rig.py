@@ -16,10 +16,10 @@ from atalante_emulator.faults import Fault
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus import BusAbsent, BusDown
 from atalante_hal.bus.joined import JoinedBus
-from atalante_hal.cia402 import DriveState
-from atalante_hal.frame import Frames, new_frames
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import Command, State, SupervisorState
+from atalante_hal.wire.cia402 import DriveState
+from atalante_hal.wire.frame import Frames, new_frames
 from atalante_tools.body import open_body
 from atalante_tools.options import Target
 from atalante_tools.outcome import Failed, FaultLatched

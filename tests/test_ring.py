@@ -385,7 +385,7 @@ def _wait_for_the_end(child: subprocess.Popen[str]) -> None:
 def test_the_loop_side_imports_no_network_recording_or_can_library() -> None:
     program = (
         "import sys\n"
-        "import atalante_hal.telemetry.process, atalante_hal.telemetry.ring, atalante_hal.telemetry.layout\n"
+        "import atalante_hal.telemetry.process, atalante_hal.telemetry.ring, atalante_hal.record_layout\n"
         "print(*({'zenoh', 'mcap', 'google.protobuf', 'can', 'socket'} & set(sys.modules)))\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

@@ -14,9 +14,9 @@ import pytest
 import atalante_dbc
 from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.hal import Hal
+from atalante_hal.record_layout import Layout
 from atalante_hal.robot import Robot
-from atalante_hal.telemetry.events import EVENT_BYTES, Event, pack
-from atalante_hal.telemetry.layout import Layout
+from atalante_hal.safety.events import EVENT_BYTES, Event, pack
 from atalante_hal.telemetry.messages import Encoder
 from atalante_hal.telemetry.ring import RingReader, RingWriter
 from atalante_hal.telemetry.schema import message_class

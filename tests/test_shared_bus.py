@@ -18,7 +18,7 @@ import pytest
 
 from atalante_hal.bus import BusDown, BusFull
 from atalante_hal.bus.shared import SharedBus, descriptors, shared_pair
-from atalante_hal.frame import FLAG_BRS, FLAG_FDF, Frames, new_frames
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, Frames, new_frames
 
 #: s; a test that waits this long has failed.
 LONG = 60.0

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from atalante_hal.cia402 import Controlword, DriveState
-from atalante_hal.diagnostics import Dtc
 from atalante_hal.robot import JOINTS, load_robot
-from atalante_hal.start import powered, refusal
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.start import powered, refusal
 from atalante_hal.types import SupervisorState
+from atalante_hal.wire.cia402 import Controlword, DriveState
 
 ROBOT = load_robot()
 IDLE = ROBOT.thresholds.idle_torque
@@ -240,10 +240,10 @@ def test_a_start_refused_by_a_diagnostic_enables_nothing(make_rig):
     rig.operator.hold()
     rig.until(S.HOLD)
     rig.run(10)
-    supervision = rig.hal._supervision
+    safety_monitor = rig.hal._safety_monitor
     rig.operator.start()
     for _ in range(20):
-        supervision.report(Dtc.ENC_STUCK, "an encoder stands still")
+        safety_monitor.report(Dtc.ENC_STUCK, "an encoder stands still")
         rig.run(1)
         assert Controlword.ENABLE_OPERATION not in rig.controlwords()
     assert rig.hal.state.supervisor is not S.ACTIVE

@@ -11,9 +11,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from atalante_dbc import Network, wire_time
-from atalante_hal.cia402 import DriveState
-from atalante_hal.frame import FRAME, Frames, new_frames
 from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.wire.cia402 import DriveState
+from atalante_hal.wire.frame import FRAME, Frames, new_frames
 from atalante_tools import rig as rig_module
 from atalante_tools import status
 from atalante_tools.cli import cli
@@ -113,7 +113,7 @@ def test_everything_the_nodes_say_is_known(network: Network, robot: Robot, traff
 def test_joints_are_in_degrees_on_the_joints_side(network: Network, robot: Robot) -> None:
     from dataclasses import replace
 
-    from atalante_hal.image import TransmitImage
+    from atalante_hal.wire.process_image import TransmitImage
 
     turned = replace(robot, polarity=np.full(12, -1.0))
     image = TransmitImage([network.message(f"{joint.upper()}_STATE") for joint in JOINTS])
@@ -200,7 +200,7 @@ def test_foreign_frames_are_counted(network: Network, robot: Robot) -> None:
 
 
 def test_an_emergency_is_told(network: Network, robot: Robot) -> None:
-    from atalante_hal.image import TransmitImage
+    from atalante_hal.wire.process_image import TransmitImage
 
     image = TransmitImage([network.message("LEFT_SK_EMCY")])
     image.values[image.codec.index("LEFT_SK_EMCY", "ErrorRegister")] = 0x09
@@ -293,7 +293,7 @@ def test_silence_fails_with_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_latched_fault_is_code_4(
     monkeypatch: pytest.MonkeyPatch, network: Network, robot: Robot, traffic: list[Any]
 ) -> None:
-    from atalante_hal.image import TransmitImage
+    from atalante_hal.wire.process_image import TransmitImage
 
     image = TransmitImage([network.message("LEFT_SK_STATE")])
     image.values[image.codec.index("LEFT_SK_STATE", "DriveState")] = DriveState.FAULT

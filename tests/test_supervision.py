@@ -1,4 +1,4 @@
-"""Supervision of a HAL on an embedded bus: the way from OFF to ACTIVE, and every way into a worse state."""
+"""The safety monitor of a HAL on an embedded bus: the way from OFF to ACTIVE, and every way into a worse state."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from atalante_dbc import Message, load
-from atalante_hal.cia402 import Controlword, DriveState
-from atalante_hal.diagnostics import Dtc
-from atalante_hal.e2e import crc, data_id_bytes
-from atalante_hal.frame import Frames
 from atalante_hal.hal import PERIOD, SATURATED_CYCLES
-from atalante_hal.limiter import Limited
-from atalante_hal.supervision import ENABLE_CYCLES, FINISH_STEP_CYCLES
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.limiter import Limited
+from atalante_hal.safety.safety_monitor import ENABLE_CYCLES, FINISH_STEP_CYCLES
 from atalante_hal.types import SupervisorState
+from atalante_hal.wire.cia402 import Controlword, DriveState
+from atalante_hal.wire.e2e import crc, data_id_bytes
+from atalante_hal.wire.frame import Frames
 
 S = SupervisorState
 
@@ -149,7 +149,7 @@ def test_a_torque_that_is_cut_for_long_leads_the_assistance_factor_to_one(make_r
 
 def into_full_assist(rig):
     rig.until(S.ACTIVE)
-    rig.hal._supervision.report(Dtc.FOOT_CELL, "a cell is stuck")
+    rig.hal._safety_monitor.report(Dtc.FOOT_CELL, "a cell is stuck")
     state = rig.walk(1)
     assert state.supervisor is S.FULL_ASSIST
     return state
@@ -188,7 +188,7 @@ def test_the_dial_does_not_widen_the_guide_in_full_assist(make_rig):
 def finishing(rig, step: int | None):
     rig.until(S.ACTIVE)
     rig.walk(5, step=step)
-    rig.hal._supervision.report(Dtc.SUPPLY_LOW, "the battery is nearly empty")
+    rig.hal._safety_monitor.report(Dtc.SUPPLY_LOW, "the battery is nearly empty")
     return rig.walk(1, step=step)
 
 
@@ -213,9 +213,9 @@ def test_finish_step_does_not_go_on_for_ever(rig):
 
 def test_a_joint_that_cannot_hold_is_let_down_and_the_others_hold(rig):
     rig.until(S.ACTIVE)
-    rig.hal._supervision._heartbeats.emergencies["LEFT_SK"] = Dtc.EMCY_ENCODER, 0x7305
-    rig.hal._supervision._heartbeats.quiet = False
-    rig.hal._supervision._steady = False
+    rig.hal._safety_monitor._heartbeats.emergencies["LEFT_SK"] = Dtc.EMCY_ENCODER, 0x7305
+    rig.hal._safety_monitor._heartbeats.quiet = False
+    rig.hal._safety_monitor._steady = False
     assert rig.cycle().supervisor is S.LOWER
     commands = rig.last_commands()
     words = {f"{side}_{k}": v for side, c in commands.items() for k, v in c.items() if k.endswith("Controlword")}
@@ -287,7 +287,7 @@ def test_another_hal_ends_a_running_one_in_hold_and_keeps_a_new_one_off(make_rig
     new.cycle()
     new.bus.to_hal = lambda frames: frames
     assert new.run(500).supervisor is S.OFF
-    assert "another HAL was there first" in new.hal._supervision.memory.text_of(frozenset({Dtc.HAL_DUPLICATE})) or (
+    assert "another HAL was there first" in new.hal._safety_monitor.memory.text_of(frozenset({Dtc.HAL_DUPLICATE})) or (
         "HAL_DUPLICATE" in new.codes()
     )
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from atalante_hal.diagnostics import Dtc, Reaction, worst
-from atalante_hal.supervisor import MOVING, Conditions, next_state
+from atalante_hal.safety.diagnostics import Dtc, Reaction, worst
+from atalante_hal.safety.state_machine import MOVING, Conditions, next_state
 from atalante_hal.types import SupervisorState
 
 S, R = SupervisorState, Reaction

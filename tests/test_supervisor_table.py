@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from atalante_hal.diagnostics import Dtc, Reaction
-from atalante_hal.supervisor import next_state
+from atalante_hal.safety.diagnostics import Dtc, Reaction
+from atalante_hal.safety.state_machine import next_state
 from atalante_hal.types import SupervisorState
 from atalante_tools.supervisor_table import FACTS, a_diagnostic, page
 

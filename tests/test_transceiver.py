@@ -8,11 +8,11 @@ import pytest
 from atalante_dbc import load
 from atalante_hal import transceiver
 from atalante_hal.bus import BusDown, BusError, BusFull
-from atalante_hal.diagnostics import Dtc
-from atalante_hal.fault_memory import FaultMemory
-from atalante_hal.frame import FLAG_FDF, ID_ERROR, ID_EXTENDED, Frames, new_frames
-from atalante_hal.image import ReceiveImage, TransmitImage
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.fault_memory import FaultMemory
 from atalante_hal.transceiver import RECEIVE_BUDGET, HalDuplicate, Transceiver, TransmitDenied
+from atalante_hal.wire.frame import FLAG_FDF, ID_ERROR, ID_EXTENDED, Frames, new_frames
+from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 
 NETWORK = load()
 SURPLUS = 12

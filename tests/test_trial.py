@@ -28,15 +28,15 @@ from atalante_control.guide_shapes import SHAPES
 from atalante_emulator.body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
-from atalante_hal import fault_memory
 from atalante_hal.bus.pair import lockstep_pair
-from atalante_hal.frame import Frames
 from atalante_hal.hal import Hal
 from atalante_hal.loop import LockStep, run
 from atalante_hal.robot import JOINTS, load_robot
+from atalante_hal.safety import fault_memory
 from atalante_hal.telemetry.process import Recording, TelemetryProcess, TelemetrySummary
 from atalante_hal.telemetry.schema import message_class
 from atalante_hal.types import State, SupervisorState
+from atalante_hal.wire.frame import Frames
 from atalante_tools import trial
 from atalante_tools.cli import cli
 from atalante_tools.run_folder import Result, results_table

@@ -17,9 +17,9 @@ from click.testing import CliRunner, Result
 import atalante_dbc
 from atalante_dbc.foreign import catalogue
 from atalante_hal.bus import BusDown
-from atalante_hal.codec import Codec
-from atalante_hal.e2e import crc, data_id_bytes
-from atalante_hal.frame import FRAME, Frames, new_frames
+from atalante_hal.wire.codec import Codec
+from atalante_hal.wire.e2e import crc, data_id_bytes
+from atalante_hal.wire.frame import FRAME, Frames, new_frames
 from atalante_tools.cli import cli
 from atalante_tools.validate.chunk import NO_DIRECTION, Chunk
 from atalante_tools.validate.judge import Validator

@@ -12,10 +12,10 @@ import pytest
 
 import atalante_dbc
 from atalante_dbc.foreign import catalogue
-from atalante_hal.cia402 import Controlword, DriveState
-from atalante_hal.e2e import crc, data_id_bytes
-from atalante_hal.frame import Frames
 from atalante_hal.types import Command, SupervisorState
+from atalante_hal.wire.cia402 import Controlword, DriveState
+from atalante_hal.wire.e2e import crc, data_id_bytes
+from atalante_hal.wire.frame import Frames
 from atalante_tools.options import Target
 from atalante_tools.rig import open_hal
 from atalante_tools.validate.coverage import unchecked, unseen_signals

@@ -6,8 +6,8 @@ from atalante_dbc import Network
 from atalante_dbc.network import wire_time
 from atalante_emulator.body import PERIOD
 from atalante_emulator.wire import Babble, Wire
-from atalante_hal.frame import FLAG_BRS, FLAG_FDF, Frames
-from atalante_hal.image import TransmitImage
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, Frames
+from atalante_hal.wire.process_image import TransmitImage
 
 
 def cyclic(network: Network, bus: str, *, hal: bool) -> list[Frames]:

@@ -6,7 +6,7 @@ import pytest
 from atalante_hal.bus import BusDown
 from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.bus.wrapped import WrappedBus
-from atalante_hal.frame import new_frames
+from atalante_hal.wire.frame import new_frames
 
 
 def test_what_nobody_changes_is_the_bus_itself() -> None:

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.frame import Frames
+from atalante_hal.wire.frame import Frames
 
 Stamps = npt.NDArray[np.int64]
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.frame import (
+from atalante_hal.wire.frame import (
     FD_LENGTHS,
     FLAG_FDF,
     FRAME,

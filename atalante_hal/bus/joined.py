@@ -16,7 +16,7 @@ import numpy as np
 from atalante_dbc import Network
 from atalante_hal.bus import Bus, BusDown, BusError, BusFull, Stamps
 from atalante_hal.bus.batch import REMEMBERED, Batches
-from atalante_hal.frame import Frames, as_words, new_frames
+from atalante_hal.wire.frame import Frames, as_words, new_frames
 
 #: How often a channel without a file descriptor is looked at while waiting [s].
 LOOK_AGAIN: Final = 100e-6

@@ -12,7 +12,7 @@ import numpy as np
 
 from atalante_hal.bus import BusDown, BusFull, Stamps
 from atalante_hal.bus.batch import Batches
-from atalante_hal.frame import FRAME_BYTES, Frames, new_frames
+from atalante_hal.wire.frame import FRAME_BYTES, Frames, new_frames
 
 
 class PairBus:

@@ -15,7 +15,7 @@ import numpy as np
 
 from atalante_hal.bus import BusAbsent, BusDown, BusFull, Stamps
 from atalante_hal.bus.batch import Batches, is_legal
-from atalante_hal.frame import (
+from atalante_hal.wire.frame import (
     FLAG_BRS,
     FLAG_ESI,
     FLAG_FDF,

@@ -21,7 +21,7 @@ from can.io.blf import BLFParseError
 from atalante_hal.bus import BusDown, BusError, Stamps
 from atalante_hal.bus.batch import Batches
 from atalante_hal.bus.python_can import pack
-from atalante_hal.frame import FRAME_BYTES, Frames
+from atalante_hal.wire.frame import FRAME_BYTES, Frames
 
 #: python-can's writers for these do not keep the FD flag, and its .db loses frames.
 WITHOUT_FD = (".csv", ".db")

@@ -25,8 +25,8 @@ import numpy as np
 
 from atalante_hal.bus import BusDown, BusFull, Stamps
 from atalante_hal.bus.batch import Batches
-from atalante_hal.frame import FRAME_BYTES, Frames
 from atalante_hal.memory import anonymous_file
+from atalante_hal.wire.frame import FRAME_BYTES, Frames
 
 #: 64-bit words of an end in the header, a cache line: frames sent and taken so far; steps asked for and made so far; and
 #: what the end is doing.

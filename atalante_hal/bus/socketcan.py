@@ -20,7 +20,7 @@ import numpy as np
 
 from atalante_hal.bus import BusAbsent, BusDown, BusError, BusFull, Stamps
 from atalante_hal.bus.batch import Batches
-from atalante_hal.frame import FLAG_FDF, FRAME_BYTES, Frames, as_words, new_frames
+from atalante_hal.wire.frame import FLAG_FDF, FRAME_BYTES, Frames, as_words, new_frames
 
 CLASSIC_BYTES = 16  # struct can_frame
 CAN_RAW_ERR_FILTER: Final = 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from atalante_hal.bus import Bus, Stamps
-from atalante_hal.frame import Frames
+from atalante_hal.wire.frame import Frames
 
 
 class WrappedBus:

@@ -15,7 +15,7 @@ import signal
 import sys
 from typing import TYPE_CHECKING, Any
 
-from atalante_hal.telemetry.layout import Layout
+from atalante_hal.record_layout import Layout
 from atalante_hal.telemetry.process import CYCLES_PER_SECOND, TelemetryConfig
 from atalante_hal.telemetry.ring import RingReader
 from atalante_hal.telemetry.service import Service

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.closing import Closing
-from atalante_hal.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE, Frames
 from atalante_hal.telemetry.sink import SinkError
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE, Frames
 
 #: Formats of python-can that keep CAN FD frames whole.
 FORMATS = (".log", ".asc", ".blf", ".log.gz", ".asc.gz")

@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.frame import FRAME, FRAME_BYTES, Frames
 from atalante_hal.telemetry.ring import RingWriter
+from atalante_hal.wire.frame import FRAME, FRAME_BYTES, Frames
 
 FRAMES_PER_RECORD = 64
 #: Stamps are counted from `base_ns`.

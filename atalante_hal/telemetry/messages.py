@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from atalante_hal.record_layout import CONTROLLER, Layout
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, MOTORS
-from atalante_hal.telemetry.events import SEVERITIES, Event
-from atalante_hal.telemetry.layout import CONTROLLER, Layout
+from atalante_hal.safety.events import SEVERITIES, Event
 from atalante_hal.telemetry.schema import message_class
 
 #: Assisted joints by stance: sagittal hip and knee of the swing leg. 0: left stance, 1: right stance.

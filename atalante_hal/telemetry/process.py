@@ -25,10 +25,10 @@ from typing import Any, Self
 import numpy as np
 
 from atalante_hal.closing import Closing
+from atalante_hal.record_layout import Layout
+from atalante_hal.safety.events import EVENT_BYTES, EVENT_SLOTS, Event, pack
 from atalante_hal.telemetry.access import Access, AccessError
-from atalante_hal.telemetry.events import EVENT_BYTES, EVENT_SLOTS, Event, pack
 from atalante_hal.telemetry.frames import FRAME_RECORD, RingTap, Stamps
-from atalante_hal.telemetry.layout import Layout
 from atalante_hal.telemetry.ring import RingWriter
 
 CYCLES_PER_SECOND = 1000

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.telemetry.events import Event, unpack
+from atalante_hal.safety.events import Event, unpack
 from atalante_hal.telemetry.frames import batches
 from atalante_hal.telemetry.process import CYCLE_NS
 from atalante_hal.telemetry.ring import RingReader

@@ -8,8 +8,8 @@ hears two senders.
 from __future__ import annotations
 
 from atalante_dbc import Message
-from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
-from atalante_hal.frame import Frames
+from atalante_hal.wire.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
+from atalante_hal.wire.frame import Frames
 
 
 class Senders:

@@ -22,9 +22,9 @@ from atalante_emulator.body import PERIOD
 from atalante_emulator.emergency import Emergency, Errors, Reaction, reaction_to
 from atalante_emulator.encoder import Encoders
 from atalante_emulator.motor import MotorParameters, Motors
-from atalante_hal.cia402 import AUTOMATIC, Controlword, DriveState, next_state
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, LEG_JOINTS, SIDES, Robot
+from atalante_hal.wire.cia402 import AUTOMATIC, Controlword, DriveState, next_state
 
 Vector = npt.NDArray[np.float64]
 

@@ -32,11 +32,11 @@ from atalante_emulator.node_faults import NodeFaults
 from atalante_emulator.noise import NOISE_CYCLES, SensorNoise
 from atalante_emulator.pendant import Operator, PendantNode
 from atalante_hal.bus import Bus, BusFull
-from atalante_hal.codec import Codec
-from atalante_hal.e2e import Check
-from atalante_hal.frame import FRAME_BYTES, Frames, new_frames
-from atalante_hal.image import ReceiveImage, TransmitImage
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, SIDES, Robot
+from atalante_hal.wire.codec import Codec
+from atalante_hal.wire.e2e import Check
+from atalante_hal.wire.frame import FRAME_BYTES, Frames, new_frames
+from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 
 Vector = npt.NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from atalante_dbc import Message, Network
-from atalante_hal.cia402 import DriveState
-from atalante_hal.frame import FD_LENGTHS
 from atalante_hal.robot import CELLS
+from atalante_hal.wire.cia402 import DriveState
+from atalante_hal.wire.frame import FD_LENGTHS
 
 Value = float | int | str
 

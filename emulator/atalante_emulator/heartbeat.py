@@ -8,8 +8,8 @@ from typing import Final
 
 from atalante_dbc import Message, Network
 from atalante_emulator.body import PERIOD
-from atalante_hal.frame import Frames
-from atalante_hal.image import TransmitImage
+from atalante_hal.wire.frame import Frames
+from atalante_hal.wire.process_image import TransmitImage
 
 #: Node states, as CiA 301 heartbeat values.
 BOOTUP: Final = 0

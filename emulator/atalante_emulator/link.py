@@ -18,8 +18,8 @@ from atalante_emulator.faults import LINK_KINDS, Fault, messages_of
 from atalante_emulator.wire import Babble, Wire
 from atalante_hal.bus import Bus
 from atalante_hal.bus.wrapped import WrappedBus
-from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
-from atalante_hal.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, ID_EXTENDED, Frames, joined, new_frames
+from atalante_hal.wire.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, ID_EXTENDED, Frames, joined, new_frames
 
 #: Class bit of an error frame (linux/can/error.h).
 BUS_OFF: Final = 0x40

@@ -18,9 +18,9 @@ from atalante_emulator.emergency import ERROR_RESET, Emergency, register_of
 from atalante_emulator.faults import NODE_KINDS, SENSOR_KINDS, Fault, nodes_of
 from atalante_emulator.heartbeat import Heartbeats
 from atalante_emulator.supply import HoldUp
-from atalante_hal.cia402 import AUTOMATIC, DriveState
-from atalante_hal.codec import Codec
 from atalante_hal.robot import Robot
+from atalante_hal.wire.cia402 import AUTOMATIC, DriveState
+from atalante_hal.wire.codec import Codec
 
 Vector = npt.NDArray[np.float64]
 Nodes = Sequence[str]

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from atalante_emulator.drive import Drives
 from atalante_emulator.foot import Feet
 from atalante_emulator.imu import Imus
-from atalante_hal.codec import Codec
+from atalante_hal.wire.codec import Codec
 
 Vector = npt.NDArray[np.float64]
 

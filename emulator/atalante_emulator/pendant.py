@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.codec import Codec
+from atalante_hal.wire.codec import Codec
 
 Vector = npt.NDArray[np.float64]
 

@@ -22,11 +22,11 @@ from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus import Bus, open_bus
 from atalante_hal.bus.pair import lockstep_pair
-from atalante_hal.cia402 import DriveState
 from atalante_hal.hal import Hal
 from atalante_hal.loop import LockStep, run
 from atalante_hal.robot import Robot
 from atalante_hal.types import SupervisorState
+from atalante_hal.wire.cia402 import DriveState
 
 S = SupervisorState
 #: A short way to the first pose: what these tests want is the steps.

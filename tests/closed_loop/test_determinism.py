@@ -9,7 +9,7 @@ from atalante_control.controller import HangConfig, HangController
 from atalante_control.gait import HANG_GAIT, load_gait
 from atalante_control.guide_shapes import SHAPES
 from atalante_emulator.faults import Fault
-from atalante_hal.frame import Frames
+from atalante_hal.wire.frame import Frames
 from atalante_tools.embedded import EmbeddedRobot
 from atalante_tools.options import Target
 from atalante_tools.rig import open_hal

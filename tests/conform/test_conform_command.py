@@ -13,9 +13,9 @@ from click.testing import CliRunner, Result
 
 from atalante_dbc import DBC_FILE, Network
 from atalante_hal.bus.pair import lockstep_pair
-from atalante_hal.frame import new_frames
-from atalante_hal.image import TransmitImage
 from atalante_hal.robot import Robot
+from atalante_hal.wire.frame import new_frames
+from atalante_hal.wire.process_image import TransmitImage
 from atalante_tools.cli import cli
 from atalante_tools.conform.any_node import answers_every_sync
 from atalante_tools.conform.bench import Bench, NotTested, WallClock

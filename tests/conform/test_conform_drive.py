@@ -12,9 +12,9 @@ from atalante_dbc import Message
 from atalante_emulator import drive as emulated
 from atalante_emulator.drive import DriveParameters, Drives
 from atalante_emulator.emulator import EmulatorParameters
-from atalante_hal.cia402 import Controlword, DriveState, next_state
-from atalante_hal.frame import Frames
 from atalante_hal.robot import Robot
+from atalante_hal.wire.cia402 import Controlword, DriveState, next_state
+from atalante_hal.wire.frame import Frames
 from atalante_tools.conform.axis import LEGAL, ROUTES
 from atalante_tools.conform.requirement import Verdict
 

@@ -12,8 +12,8 @@ import pytest
 from atalante_dbc import Message
 from atalante_emulator.haptics import Haptics
 from atalante_emulator.pendant import Operator
-from atalante_hal.e2e import COUNTER_BYTE
-from atalante_hal.frame import FLAG_FDF, Frames
+from atalante_hal.wire.e2e import COUNTER_BYTE
+from atalante_hal.wire.frame import FLAG_FDF, Frames
 from atalante_tools.conform.requirement import Verdict
 
 from .conftest import (

@@ -9,9 +9,9 @@ import pytest
 
 from atalante_hal.bus import BusDown, BusFull
 from atalante_hal.bus.pair import lockstep_pair
-from atalante_hal.frame import new_frames
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Command
+from atalante_hal.wire.frame import new_frames
 from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, Moment
 from atalante_tools.faults.scenario import Host
 

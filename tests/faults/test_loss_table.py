@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from atalante_hal.e2e import MAX_DELTA, SETTLED, qualify
+from atalante_hal.wire.e2e import MAX_DELTA, SETTLED, qualify
 from atalante_tools.faults.matrix import MATRIX_FILE
 
 SEEDS = 200

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from atalante_hal.diagnostics import Dtc
+from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.types import SupervisorState
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.matrix import COLUMNS, SCENARIO, MatrixError, load_matrix

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from atalante_emulator.faults import Fault
-from atalante_hal.cia402 import Controlword, DriveState
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import SupervisorState
+from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_tools.faults.runner import AGAIN, CONFIG, observe, walk_begins
 from atalante_tools.faults.scenario import Case, Host, Press
 from atalante_tools.faults.verdict import uncontrolled

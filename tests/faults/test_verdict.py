@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from atalante_dbc import Network
-from atalante_hal.cia402 import Controlword
-from atalante_hal.image import TransmitImage
 from atalante_hal.robot import Robot
-from atalante_hal.telemetry.events import Event
+from atalante_hal.safety.events import Event
 from atalante_hal.types import SupervisorState
+from atalante_hal.wire.cia402 import Controlword
+from atalante_hal.wire.process_image import TransmitImage
 from atalante_tools.faults.matrix import Row
 from atalante_tools.faults.observation import Observation
 from atalante_tools.faults.scenario import Case

@@ -8,10 +8,10 @@ import pytest
 
 import atalante_dbc
 from atalante_dbc import Network
-from atalante_hal.cia402 import Controlword
-from atalante_hal.frame import Frames
-from atalante_hal.image import TransmitImage
 from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.wire.cia402 import Controlword
+from atalante_hal.wire.frame import Frames
+from atalante_hal.wire.process_image import TransmitImage
 from atalante_tools.faults.witness import Commands, Witness
 
 KNEE = JOINTS.index("left_SK")

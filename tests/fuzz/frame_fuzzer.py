@@ -30,11 +30,11 @@ from atalante_emulator.pendant import Operator
 from atalante_hal.bus import Bus
 from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.bus.wrapped import WrappedBus
-from atalante_hal.frame import FLAG_FDF, FRAME_BYTES, Frames, as_words, header_word, new_frames
 from atalante_hal.hal import Hal
-from atalante_hal.image import ReceiveImage, TransmitImage
 from atalante_hal.robot import Robot, load_robot
 from atalante_hal.types import Command, SupervisorState
+from atalante_hal.wire.frame import FLAG_FDF, FRAME_BYTES, Frames, as_words, header_word, new_frames
+from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 from atalante_tools.terminal import Progress, say
 
 SWEEP = 2048 * 65 * 8  # identifiers, lengths, flags (BRS, ESI, FDF)

@@ -30,11 +30,11 @@ from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus import BusDown
 from atalante_hal.bus.shared import SharedBus, descriptors
-from atalante_hal.cia402 import DriveState
 from atalante_hal.loop import GAP_TO_HOLD, WallClock, run
 from atalante_hal.memory import anonymous_file
 from atalante_hal.robot import Robot
 from atalante_hal.types import Command, State, SupervisorState
+from atalante_hal.wire.cia402 import DriveState
 
 #: Loads everything once; for each line `memory bell`, a child drives that bus until it is told to end, and says how it went.
 DRIVER = """

@@ -8,9 +8,9 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from atalante_hal.frame import Frames
 from atalante_hal.telemetry.process import TelemetryConfig, TelemetryProcess
 from atalante_hal.types import SupervisorState
+from atalante_hal.wire.frame import Frames
 
 PUTS = 100_000
 CYCLES = 3000  # at least; more while the stranger is still at it

@@ -20,10 +20,10 @@ from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 
-from atalante_hal.frame import Frames
 from atalante_hal.telemetry import process as process_module
 from atalante_hal.telemetry.process import TelemetryConfig, TelemetryProcess
 from atalante_hal.types import SupervisorState
+from atalante_hal.wire.frame import Frames
 from tests.process.test_telemetry_process import free_endpoint, pid_of, recorded, subscribe
 
 CYCLES = 1500

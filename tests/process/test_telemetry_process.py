@@ -23,8 +23,8 @@ from mcap_protobuf.decoder import DecoderFactory
 import atalante_dbc
 from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.hal import Hal
+from atalante_hal.record_layout import Layout
 from atalante_hal.robot import Robot
-from atalante_hal.telemetry.layout import Layout
 from atalante_hal.telemetry.process import Recording, TelemetryConfig, TelemetryError, TelemetryProcess
 from atalante_hal.telemetry.schema import DESCRIPTORS
 
@@ -306,7 +306,7 @@ class TestDeath:
             "import json, os, signal, sys\n"
             "import numpy as np\n"
             "from pathlib import Path\n"
-            "from atalante_hal.telemetry.layout import Layout\n"
+            "from atalante_hal.record_layout import Layout\n"
             "from atalante_hal.telemetry.process import TelemetryConfig, TelemetryProcess\n"
             "layout = Layout.from_json(sys.argv[1])\n"
             "config = TelemetryConfig(recording=Path(sys.argv[2]), record_rate=1000, listen=sys.argv[3])\n"

@@ -19,8 +19,8 @@ from atalante_emulator.body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus import Bus, open_bus
-from atalante_hal.cia402 import DriveState
 from atalante_hal.robot import Robot
+from atalante_hal.wire.cia402 import DriveState
 from tests.closed_loop.test_closed_loop import ClosedLoop
 from tests.vcan.conftest import PATIENCE, Candump
 

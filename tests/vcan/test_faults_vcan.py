@@ -19,12 +19,12 @@ from atalante_emulator.pendant import Operator
 from atalante_hal.bus import BusDown
 from atalante_hal.bus.socketcan import SocketCanBus
 from atalante_hal.bus.wrapped import WrappedBus
-from atalante_hal.cia402 import DriveState
-from atalante_hal.frame import Frames, new_frames
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
 from atalante_hal.transceiver import RECEIVE_BUDGET
 from atalante_hal.types import SupervisorState
+from atalante_hal.wire.cia402 import DriveState
+from atalante_hal.wire.frame import Frames, new_frames
 from tests.vcan.conftest import PATIENCE, Loop, as_root, repeated
 
 S = SupervisorState

@@ -9,10 +9,10 @@ from atalante_dbc import Network
 from atalante_emulator.body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_hal.bus.socketcan import SocketCanBus
-from atalante_hal.frame import new_frames
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
 from atalante_hal.types import SupervisorState
+from atalante_hal.wire.frame import new_frames
 from atalante_tools.observer import Observer
 from atalante_tools.pendant_node import PendantNode, Request
 from tests.vcan.conftest import PATIENCE, Loop, repeated

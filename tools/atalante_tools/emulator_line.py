@@ -6,7 +6,7 @@ import time
 
 from atalante_hal.bus import Bus, BusDown
 from atalante_hal.bus.wrapped import WrappedBus
-from atalante_hal.frame import Frames
+from atalante_hal.wire.frame import Frames
 
 
 class Line(WrappedBus):

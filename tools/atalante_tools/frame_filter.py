@@ -18,8 +18,8 @@ import numpy as np
 from atalante_dbc import Network
 from atalante_hal.bus import Bus
 from atalante_hal.bus.wrapped import WrappedBus
-from atalante_hal.frame import Frames, as_words
 from atalante_hal.transceiver import FrameTap
+from atalante_hal.wire.frame import Frames, as_words
 
 #: Frames of one batch that can be held back and come later together.
 _ROOM: Final = 128

@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 from atalante_dbc import Message, Network, Node, wire_time
-from atalante_hal.diagnostics import by_number
-from atalante_hal.frame import Frames
-from atalante_hal.image import NEVER, ReceiveImage
 from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.safety.diagnostics import by_number
+from atalante_hal.wire.frame import Frames
+from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Signals that hold a node's own state, in the order in which they tell more.
 _STATES: Final = ("HalState", "DriveState", "ImuState", "FootState", "NodeState")

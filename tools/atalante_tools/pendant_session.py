@@ -8,9 +8,9 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from atalante_hal.e2e import REQUALIFY
 from atalante_hal.hal import PERIOD
 from atalante_hal.types import SupervisorState
+from atalante_hal.wire.e2e import REQUALIFY
 from atalante_tools.options import Target
 from atalante_tools.outcome import Failed
 from atalante_tools.pendant_node import PendantNode, Request

@@ -72,7 +72,7 @@ def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
 
 def listen(bus: Bus, listener: Observer, seconds: float, stop: StopRequest) -> Report:
     """Collect frames for a while."""
-    from atalante_hal.frame import new_frames
+    from atalante_hal.wire.frame import new_frames
 
     frames = new_frames(256)
     end = time.monotonic() + seconds

@@ -358,7 +358,7 @@ def _open(
 def _telemetry(
     target: Target, options: Options, outlet: Mapping[str, Any], hal: Hal, network: Network, gait_hash: int
 ) -> TelemetryProcess:
-    from atalante_hal.diagnostics import Dtc
+    from atalante_hal.safety.diagnostics import Dtc
     from atalante_hal.telemetry.process import TelemetryConfig, TelemetryProcess
 
     config = TelemetryConfig(

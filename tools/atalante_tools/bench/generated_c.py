@@ -23,8 +23,8 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc import DBC_FILE, Message
-from atalante_hal.codec import Codec
-from atalante_hal.frame import FRAME_BYTES, HEADER_BYTES, Frames
+from atalante_hal.wire.codec import Codec
+from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES, Frames
 
 Vector = npt.NDArray[np.float64]
 

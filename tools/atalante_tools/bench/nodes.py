@@ -22,13 +22,13 @@ from atalante_control.guide import GuideFilter
 from atalante_control.guide_shapes import CONSTANT
 from atalante_dbc import Message, Network
 from atalante_hal.bus import Stamps
-from atalante_hal.cia402 import DriveState
-from atalante_hal.e2e import COUNTER_BYTE
-from atalante_hal.frame import FRAME_BYTES, HEADER_BYTES, Frames, new_frames
 from atalante_hal.hal import Hal
-from atalante_hal.image import TransmitImage
 from atalante_hal.robot import JOINTS, Robot, load_robot
 from atalante_hal.types import Command, State, SupervisorState
+from atalante_hal.wire.cia402 import DriveState
+from atalante_hal.wire.e2e import COUNTER_BYTE
+from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES, Frames, new_frames
+from atalante_hal.wire.process_image import TransmitImage
 from atalante_tools.bench.measure import require
 
 Vector = npt.NDArray[np.float64]

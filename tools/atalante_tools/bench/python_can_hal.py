@@ -15,10 +15,10 @@ import cantools
 import numpy as np
 
 from atalante_dbc import DBC_FILE
-from atalante_hal.cia402 import Controlword
-from atalante_hal.e2e import CRC_START, data_id_bytes
-from atalante_hal.limiter import Limiter
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, LEG_JOINTS, SIDES
+from atalante_hal.safety.limiter import Limiter
+from atalante_hal.wire.cia402 import Controlword
+from atalante_hal.wire.e2e import CRC_START, data_id_bytes
 from atalante_tools.bench.nodes import FilterOnly, Recording, Walk, syncs
 
 

@@ -8,11 +8,11 @@ from typing import Final
 
 import numpy as np
 
-from atalante_hal.codec import Codec
 from atalante_hal.compiled import compiled
-from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes, intact, protected_spans
 from atalante_hal.telemetry.ring import RingWriter
 from atalante_hal.types import SupervisorState
+from atalante_hal.wire.codec import Codec
+from atalante_hal.wire.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes, intact, protected_spans
 from atalante_tools.bench.generated_c import COMPILER, GeneratedC, available
 from atalante_tools.bench.measure import Effort, Measurement, require, timed
 from atalante_tools.bench.nodes import FilterOnly, RecordedRig, Recording, active_rig, walk

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from atalante_hal.frame import FLAG_BRS, FLAG_FDF, ID_EXTENDED, Frames, new_frames
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_EXTENDED, Frames, new_frames
 from atalante_tools.conform.bench import Bench, NotTested
 from atalante_tools.conform.frames import Heard
 from atalante_tools.conform.requirement import Outcome, Requirement

@@ -1,6 +1,6 @@
 """The joint of a drive under test, and the state machine it owes: written down here from IEC 61800-7-201.
 
-Not taken from `atalante_hal.cia402`, which the emulated drive uses too.
+Not taken from `atalante_hal.wire.cia402`, which the emulated drive uses too.
 """
 
 from __future__ import annotations
@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from atalante_hal.cia402 import Controlword, DriveState
-from atalante_hal.frame import Frames
 from atalante_hal.robot import JOINTS
+from atalante_hal.wire.cia402 import Controlword, DriveState
+from atalante_hal.wire.frame import Frames
 from atalante_tools.conform.bench import Bench, NotTested
 from atalante_tools.conform.frames import Heard
 

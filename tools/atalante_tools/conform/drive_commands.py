@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from atalante_hal.cia402 import Controlword, DriveState
-from atalante_hal.frame import Frames
+from atalante_hal.wire.cia402 import Controlword, DriveState
+from atalante_hal.wire.frame import Frames
 from atalante_tools.conform.axis import (
     FOLLOW,
     NOISE,

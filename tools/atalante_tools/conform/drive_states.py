@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from atalante_hal.cia402 import Controlword, DriveState
+from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_tools.conform.axis import (
     FOLLOW,
     LEGAL,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from atalante_hal.cia402 import Controlword, DriveState
+from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_tools.conform.axis import NOISE, SHOWN, Axis, always, mean_torque, names_of, torque_of
 from atalante_tools.conform.bench import Bench
 from atalante_tools.conform.requirement import Outcome

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from atalante_hal.cia402 import Controlword
+from atalante_hal.wire.cia402 import Controlword
 from atalante_tools.conform import any_node, drive, drive_states, haptics, pendant, sensor
 from atalante_tools.conform.axis import Axis
 from atalante_tools.conform.bench import Bench

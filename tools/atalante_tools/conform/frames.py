@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 
 from atalante_dbc import Message
-from atalante_hal.codec import Codec
-from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
-from atalante_hal.frame import FLAG_BRS, FLAG_FDF, Frames
+from atalante_hal.wire.codec import Codec
+from atalante_hal.wire.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, Frames
 
 _FD: Final = FLAG_FDF | FLAG_BRS
 

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.frame import Frames
+from atalante_hal.wire.frame import Frames
 from atalante_tools.conform.bench import Bench, NotTested
 from atalante_tools.conform.frames import Heard
 from atalante_tools.conform.requirement import Outcome, Requirement

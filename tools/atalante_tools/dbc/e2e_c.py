@@ -1,6 +1,6 @@
 """AUTOSAR E2E Profile 5 in C, in the style of cantools' generator: protect and check of each message, invalid codes, range check.
 
-It says what `atalante_hal.e2e` says in Python; `host_test` proves that.
+It says what `atalante_hal.wire.e2e` says in Python; `host_test` proves that.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from cantools.database.can.c_source import camel_to_snake_case
 
 from atalante_dbc import Message, Signal
-from atalante_hal.e2e import CRC_BYTES, CRC_START, MAX_DELTA, Check
+from atalante_hal.wire.e2e import CRC_BYTES, CRC_START, MAX_DELTA, Check
 
 if TYPE_CHECKING:
     from atalante_tools.dbc.c_code import Build

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 from cantools.database.can.c_source import camel_to_snake_case
 
 from atalante_dbc import Message, Signal
-from atalante_hal.e2e import check_counter
+from atalante_hal.wire.e2e import check_counter
 from atalante_tools.dbc.e2e_c import invalid_name
 from atalante_tools.dbc.vectors import MAGIC, Vectors, behind_header
 from atalante_tools.outcome import Failed

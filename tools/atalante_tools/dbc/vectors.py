@@ -19,10 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc import Message, Signal
-from atalante_hal.codec import Vector
-from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
-from atalante_hal.frame import FRAME_BYTES, HEADER_BYTES
-from atalante_hal.image import TransmitImage
+from atalante_hal.wire.codec import Vector
+from atalante_hal.wire.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
+from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES
+from atalante_hal.wire.process_image import TransmitImage
 
 if TYPE_CHECKING:
     from atalante_tools.dbc.c_code import Build

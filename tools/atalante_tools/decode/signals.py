@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.bulk import BulkCodec, Column, Words, payload_words
-from atalante_hal.frame import ID_ERROR, ID_REMOTE
+from atalante_hal.wire.frame import ID_ERROR, ID_REMOTE
 from atalante_tools.validate.chunk import Chunk
 from atalante_tools.validate.plan import UNKNOWN, Plan
 from atalante_tools.validate.stream import sort

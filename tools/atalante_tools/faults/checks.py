@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from atalante_hal.cia402 import Controlword, DriveState
-from atalante_hal.diagnostics import Dtc
 from atalante_hal.robot import JOINTS, LEG_JOINTS
+from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.types import SupervisorState
+from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_tools.faults.observation import Observation
 
 _KNEE: Final = JOINTS.index("left_SK")

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from atalante_dbc import Network
 from atalante_hal.robot import Robot
-from atalante_hal.telemetry.events import Event
+from atalante_hal.safety.events import Event
 from atalante_hal.types import SupervisorState
 from atalante_tools.faults.witness import Commands
 

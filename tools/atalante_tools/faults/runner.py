@@ -33,7 +33,7 @@ from atalante_tools.rig import Rig, open_hal
 
 if TYPE_CHECKING:
     from atalante_emulator.pendant import Operator
-    from atalante_hal.telemetry.events import Event
+    from atalante_hal.safety.events import Event
 
 Vector = npt.NDArray[np.float64]
 #: What the controller records of its guide: tracking error of the assisted joints, and how far off the guide is.

@@ -14,10 +14,10 @@ from typing import Final
 
 import numpy as np
 
-from atalante_hal.cia402 import Controlword
 from atalante_hal.robot import JOINTS
-from atalante_hal.telemetry.events import Event
+from atalante_hal.safety.events import Event
 from atalante_hal.types import SupervisorState
+from atalante_hal.wire.cia402 import Controlword
 from atalante_tools.faults.matrix import Row
 from atalante_tools.faults.observation import Observation
 from atalante_tools.faults.scenario import Case

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc import Message, Network, Signal
-from atalante_hal.cia402 import Controlword
-from atalante_hal.frame import FRAME, Frames
 from atalante_hal.robot import LEG_JOINTS, SIDES, Robot
+from atalante_hal.wire.cia402 import Controlword
+from atalante_hal.wire.frame import FRAME, Frames
 
 Vector = npt.NDArray[np.float64]
 #: Torque step of the wire [Nm]: a limit that falls between two codes is met by the nearer one.

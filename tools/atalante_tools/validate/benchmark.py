@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.bulk import crc_differences, crc_of_zeros
-from atalante_hal.e2e import COUNTER_BYTE, CRC_BYTES
-from atalante_hal.frame import FRAME_BYTES, HEADER_BYTES, Frames, new_frames
+from atalante_hal.wire.e2e import COUNTER_BYTE, CRC_BYTES
+from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES, Frames, new_frames
 from atalante_tools.bench.measure import Block, Effort, Measurement, require
 from atalante_tools.validate.plan import Plan
 from atalante_tools.validate.project import Project

@@ -17,7 +17,16 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, FRAME_BYTES, ID_ERROR, ID_EXTENDED, ID_REMOTE, new_frames
+from atalante_hal.wire.frame import (
+    FLAG_BRS,
+    FLAG_ESI,
+    FLAG_FDF,
+    FRAME_BYTES,
+    ID_ERROR,
+    ID_EXTENDED,
+    ID_REMOTE,
+    new_frames,
+)
 from atalante_tools.validate.chunk import NO_DIRECTION, RECEIVED, SENT, Chunk
 
 Text = npt.NDArray[np.uint8]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.frame import Frames
+from atalante_hal.wire.frame import Frames
 
 #: Direction of a frame in its log; `NO_DIRECTION` if the log does not record it.
 SENT, RECEIVED, NO_DIRECTION = 1, 0, -1

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.cia402 import TRANSITIONS, Controlword, DriveState, next_state
+from atalante_hal.wire.cia402 import TRANSITIONS, Controlword, DriveState, next_state
 from atalante_tools.validate.e2e_rules import Steps
 from atalante_tools.validate.findings import Findings
 from atalante_tools.validate.plan import Family, Plan

@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.bulk import crc_differences
-from atalante_hal.e2e import COUNTER_BYTE
-from atalante_hal.frame import FRAME_BYTES, HEADER_BYTES
+from atalante_hal.wire.e2e import COUNTER_BYTE
+from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES
 from atalante_tools.validate.findings import Findings
 from atalante_tools.validate.plan import Plan, Rows
 from atalante_tools.validate.stream import Stream

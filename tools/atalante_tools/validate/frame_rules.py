@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.frame import FD_LENGTHS, FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_REMOTE, as_words
+from atalante_hal.wire.frame import FD_LENGTHS, FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_REMOTE, as_words
 from atalante_tools.validate.buses import ChannelMap
 from atalante_tools.validate.chunk import NO_DIRECTION, SENT, Chunk
 from atalante_tools.validate.findings import MAX_UNKNOWN_IDS, OTHERS, Findings

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE, as_words
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE, as_words
 from atalante_tools.validate.buses import ChannelMap
 from atalante_tools.validate.chunk import Chunk
 from atalante_tools.validate.findings import Findings

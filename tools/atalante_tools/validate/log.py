@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.frame import WORDS, new_frames
+from atalante_hal.wire.frame import WORDS, new_frames
 from atalante_tools.validate import candump, python_can_log
 from atalante_tools.validate.candump import MARGIN, Channels
 from atalante_tools.validate.chunk import Chunk, LogError

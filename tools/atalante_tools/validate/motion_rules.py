@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.codec import group_of
+from atalante_hal.wire.codec import group_of
 from atalante_tools.validate.e2e_rules import REPEATED, Steps
 from atalante_tools.validate.findings import Findings
 from atalante_tools.validate.plan import Family, Plan

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from atalante_dbc.foreign import Catalogue, Layout, Refused
 from atalante_hal.bulk import BulkCodec, crc_of_zeros
-from atalante_hal.frame import FLAG_BRS, FLAG_FDF, ID_EXTENDED, header_word
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_EXTENDED, header_word
 
 #: Row of an identifier that is not in the DBC.
 UNKNOWN = -1

@@ -20,7 +20,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from atalante_hal.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, FRAME_BYTES, ID_ERROR, ID_EXTENDED, ID_REMOTE, new_frames
+from atalante_hal.wire.frame import (
+    FLAG_BRS,
+    FLAG_ESI,
+    FLAG_FDF,
+    FRAME_BYTES,
+    ID_ERROR,
+    ID_EXTENDED,
+    ID_REMOTE,
+    new_frames,
+)
 from atalante_tools.validate.candump import Channels
 from atalante_tools.validate.chunk import NO_DIRECTION, RECEIVED, SENT, Chunk, LogError
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from atalante_hal.bus import Bus, BusError, open_bus
-from atalante_hal.frame import WORDS, new_frames
+from atalante_hal.wire.frame import WORDS, new_frames
 from atalante_tools.validate.chunk import NO_DIRECTION, Chunk
 from atalante_tools.validate.judge import Validator
 from atalante_tools.validate.log import Log, open_log

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.frame import FRAME, WORDS, Frames
+from atalante_hal.wire.frame import FRAME, WORDS, Frames
 from atalante_tools.validate.chunk import Chunk
 from atalante_tools.validate.plan import Family, Rows
 

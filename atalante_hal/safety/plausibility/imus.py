@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
-from atalante_hal.codec import Codec
 from atalante_hal.compiled import compiled
-from atalante_hal.diagnostics import Dtc
-from atalante_hal.plausibility.finding import IMU_NODES, Finding, Signals
 from atalante_hal.robot import IMUS, Robot, Vector
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.plausibility.finding import IMU_NODES, Finding, Signals
+from atalante_hal.wire.codec import Codec
 
 #: Cycles without a good value after which an IMU is given up.
 IMU_CYCLES = 10

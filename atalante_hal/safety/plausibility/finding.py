@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.codec import Codec
-from atalante_hal.diagnostics import Dtc
-from atalante_hal.image import NEVER
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, Vector
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.wire.codec import Codec
+from atalante_hal.wire.process_image import NEVER
 
 Cycles = npt.NDArray[np.int64]
 

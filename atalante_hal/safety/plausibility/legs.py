@@ -25,10 +25,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.diagnostics import Dtc
-from atalante_hal.image import NEVER
-from atalante_hal.plausibility.finding import JOINT_NODES, Ages, Finding, Signals
 from atalante_hal.robot import IMUS, JOINTS, SIDES, Robot, Vector
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Finding, Signals
+from atalante_hal.wire.process_image import NEVER
 
 #: Samples of a leg on end whose attitude contradicts its encoders, or one that stands still.
 DRIFT_SAMPLES, STANDSTILL_SAMPLES = 4, 2

@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.diagnostics import Dtc
-from atalante_hal.e2e import Check
-from atalante_hal.image import NEVER
-from atalante_hal.plausibility.finding import FOOT_NODES, JOINT_NODES, Cycles, Finding, Rows
 from atalante_hal.robot import FEET, IMUS, JOINTS, LEG_JOINTS, SIDES
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.plausibility.finding import FOOT_NODES, JOINT_NODES, Cycles, Finding, Rows
+from atalante_hal.wire.e2e import Check
+from atalante_hal.wire.process_image import NEVER
 
 #: Cycles on end in which a check could not run, after which it counts as failed: the slowest finds its fault in as many.
 UNCHECKED_CYCLES = 128

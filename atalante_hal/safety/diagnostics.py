@@ -1,8 +1,8 @@
 """Diagnostic trouble codes: everything that can go wrong, with what is done about it, as data.
 
-`judgement -> diagnostics -> supervisor`: the judgement raises codes, the supervisor folds them into the worst reaction. A code
-is pending while it is noticed but survivable (a frame lost, a late cycle) and confirmed when its bound is passed; its reaction
-follows when it is confirmed. The names are those of the fault matrix.
+`message monitor -> diagnostics -> supervisor`: the message monitor raises codes, the supervisor folds them into the worst
+reaction. A code is pending while it is noticed but survivable (a frame lost, a late cycle) and confirmed when its bound is
+passed; its reaction follows when it is confirmed. The names are those of the fault matrix.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Dtc(StrEnum):
         member.bit = 1 << len(cls.__members__)
         return member
 
-    # Messages: what `judgement` finds in them.
+    # Messages: what `message_monitor` finds in them.
     E2E_SOME_LOST = "E2E_SOME_LOST", _R.INFO, _S.INFO, "1 to 4 frames before this one are missing"
     E2E_REPEATED = "E2E_REPEATED", _R.INFO, _S.INFO, "a frame came twice"
     E2E_SEQUENCE = "E2E_SEQUENCE", _R.HOLD, _S.ERROR, "the counter jumped: an old frame, or more than 4 lost"

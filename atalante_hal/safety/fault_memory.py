@@ -1,6 +1,6 @@
 """The fault memory: which diagnostics are active, since when, and the events that say so once.
 
-`judgement, heartbeats, transceiver, plausibility, loop -> fault memory -> supervisor (confirmed codes), telemetry (events)`
+`message monitor, heartbeats, transceiver, plausibility, loop -> fault memory -> supervisor (confirmed codes), telemetry (events)`
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 
-from atalante_hal.diagnostics import Dtc, Reaction, Severity, event_code, worst
-from atalante_hal.telemetry.events import Event
+from atalante_hal.safety.diagnostics import Dtc, Reaction, Severity, event_code, worst
+from atalante_hal.safety.events import Event
 
 #: A diagnostic that ends and begins again is told anew after so many cycles, pending or confirmed: a bad line does not fill
 #: the log.

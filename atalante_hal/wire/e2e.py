@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc import Message
-from atalante_hal.frame import FRAME_BYTES, HEADER_BYTES
+from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES
 
 Octets = npt.NDArray[np.uint8]
 Words = npt.NDArray[np.int64]

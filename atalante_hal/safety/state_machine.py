@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from atalante_hal.diagnostics import Dtc, Reaction, worst
+from atalante_hal.safety.diagnostics import Dtc, Reaction, worst
 from atalante_hal.types import SupervisorState
 
 

@@ -1,6 +1,6 @@
 """Whether the drives may be enabled: the torque each reports fits the state it is in.
 
-    drive state, reported torque -> refusal -> supervision, event START_REFUSED
+    drive state, reported torque -> refusal -> safety monitor, event START_REFUSED
 
 At a start the HAL takes over the torque the drives hold with. A torque that a drive cannot have would be commanded as it was
 reported.
@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.cia402 import DriveState
-from atalante_hal.codec import Vector
 from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.wire.cia402 import DriveState
+from atalante_hal.wire.codec import Vector
 
 #: States in which a drive makes torque; in the others it brakes at most.
 POWERED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)

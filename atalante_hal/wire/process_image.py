@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc import Message
-from atalante_hal.codec import (
+from atalante_hal.compiled import compiled
+from atalante_hal.wire.codec import (
     INSIDE,
     NO_CODE,
     SAYS_INVALID,
@@ -26,8 +27,7 @@ from atalante_hal.codec import (
     scale,
     scale_row,
 )
-from atalante_hal.compiled import compiled
-from atalante_hal.e2e import (
+from atalante_hal.wire.e2e import (
     COUNTER_BYTE,
     NOTHING,
     Check,
@@ -38,7 +38,7 @@ from atalante_hal.e2e import (
     protect,
     protected_spans,
 )
-from atalante_hal.frame import FRAME_BYTES, HEADER_BYTES, WORDS, Frames, as_words, new_frames
+from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES, WORDS, Frames, as_words, new_frames
 
 #: In the place of a cycle tag: the senders count for themselves.
 _NO_TAG = -1
@@ -158,7 +158,7 @@ class ReceiveImage:
         """Whether `frames[:count]` begin with every message of this image, in order: then a cycle is complete."""
         return count >= len(self._headers) and self._received_in(frames).headers.tobytes() == self._expected_headers
 
-    def awaited(self) -> set[int]:
+    def expected_ids(self) -> set[int]:
         """Identifiers of the messages whose senders are alive: heard within the DBC's timeout."""
         ages = self.age.tolist()
         return {m.frame_id for row, m in enumerate(self.codec.messages) if ages[row] <= m.timeout_ms}

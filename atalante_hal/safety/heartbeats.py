@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from atalante_dbc import Network
-from atalante_hal.codec import Vector
-from atalante_hal.diagnostics import Dtc, Reaction, emergency
-from atalante_hal.e2e import FULL, Check, suspect
-from atalante_hal.fault_memory import FaultMemory
-from atalante_hal.frame import Frames
-from atalante_hal.image import NEVER, ReceiveImage
 from atalante_hal.robot import Thresholds
+from atalante_hal.safety.diagnostics import Dtc, Reaction, emergency
+from atalante_hal.safety.fault_memory import FaultMemory
+from atalante_hal.wire.codec import Vector
+from atalante_hal.wire.e2e import FULL, Check, suspect
+from atalante_hal.wire.frame import Frames
+from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: NMT states of a node that has just begun, and of one that works.
 BOOT_UP, OPERATIONAL = 0, 5
@@ -74,12 +74,12 @@ class Heartbeats:
         self._seen = 0  # cycle up to which ages count
         #: Node -> what it said last of an error that is not gone: code and emergency error code.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
-        #: Emergencies that only inform, since the last judgement.
+        #: Emergencies that only inform, since the last `judge`.
         self._notices: list[tuple[str, Dtc, int]] = []
-        self._reset: set[str] = set()  # nodes that began anew since the last judgement
+        self._reset: set[str] = set()  # nodes that began anew since the last `judge`
         #: Row -> evidence of two senders, of the rows that have any, one step a frame.
         self._evidence: dict[int, int] = {}
-        #: Nodes that sent a boot-up message since the last judgement was used: its reader clears it.
+        #: Nodes that sent a boot-up message since the last `judge` was used: its reader clears it.
         self.booted: set[str] = set()
         #: Every node that has to has sent a status.
         self.known = False

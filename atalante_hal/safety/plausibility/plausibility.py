@@ -11,16 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from atalante_hal.e2e import Check
-from atalante_hal.image import NEVER, ReceiveImage
-from atalante_hal.plausibility.encoders import Encoders
-from atalante_hal.plausibility.feet import Feet
-from atalante_hal.plausibility.finding import JOINT_NODES, Ages, Finding, Rows, signals_of
-from atalante_hal.plausibility.imus import Imus
-from atalante_hal.plausibility.legs import Legs
-from atalante_hal.plausibility.stillness import Stillness
-from atalante_hal.plausibility.unchecked import Unchecked
 from atalante_hal.robot import Robot, Vector
+from atalante_hal.safety.plausibility.encoders import Encoders
+from atalante_hal.safety.plausibility.feet import Feet
+from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Finding, Rows, signals_of
+from atalante_hal.safety.plausibility.imus import Imus
+from atalante_hal.safety.plausibility.legs import Legs
+from atalante_hal.safety.plausibility.stillness import Stillness
+from atalante_hal.safety.plausibility.unchecked import Unchecked
+from atalante_hal.wire.e2e import Check
+from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Cycles between two turns of what looks for standstill, wrong velocities and checks that cannot run, and of the look at the
 #: feet.

@@ -8,9 +8,9 @@ start may swing both, and who is lifted off may do so after `LIFTED_CYCLES`, whe
 
 from __future__ import annotations
 
-from atalante_hal.diagnostics import Dtc
-from atalante_hal.plausibility.finding import FOOT_NODES, Finding, Signals
 from atalante_hal.robot import CELLS, FEET, Robot
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.plausibility.finding import FOOT_NODES, Finding, Signals
 
 #: Cycles in which a cell has to contradict the others, both feet have to swing, and after which they swing on purpose.
 CELL_CYCLES = 256

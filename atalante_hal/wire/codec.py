@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from atalante_dbc import Message, Signal
 from atalante_hal.compiled import compiled
-from atalante_hal.frame import FLAG_BRS, FLAG_FDF, WORDS, Frames, new_frames
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, WORDS, Frames, new_frames
 
 Vector = npt.NDArray[np.float64]
 Words = npt.NDArray[np.int64]

@@ -1,6 +1,6 @@
 """Whether what the nodes say every cycle may be used: E2E, age and trust of each message.
 
-`process image -> judgement -> validity of each message, diagnostics -> supervisor`
+`process image -> message monitor -> validity of each message, diagnostics -> supervisor`
 
 A message that was not committed is pending trouble; it is confirmed when its data is as old as the DBC's timeout. A message
 that loses more than a fifth of its frames trips its leaky bucket. What tripped is trusted again after 16 good cycles in a row.
@@ -21,11 +21,11 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc import Network
-from atalante_hal.diagnostics import Dtc
-from atalante_hal.e2e import FULL, SETTLED, Check, Qualification, qualify, suspect
-from atalante_hal.fault_memory import FaultMemory
-from atalante_hal.image import NEVER, ReceiveImage
 from atalante_hal.robot import SIDES
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.fault_memory import FaultMemory
+from atalante_hal.wire.e2e import FULL, SETTLED, Check, Qualification, qualify, suspect
+from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Why a message was not committed -> what is noted at once.
 PENDING = {
@@ -55,7 +55,7 @@ _FRESH = int(Check.SOME_LOST)
 SWING_TIMEOUTS = 2
 
 
-class Judgement:
+class MessageMonitor:
     """Judges the rows of the fast image; the pendant's is judged alike, what follows from its loss is the operator's stop."""
 
     def __init__(self, network: Network, image: ReceiveImage) -> None:

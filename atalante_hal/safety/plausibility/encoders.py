@@ -18,10 +18,10 @@ from typing import NamedTuple
 import numpy as np
 
 from atalante_hal.compiled import compiled
-from atalante_hal.diagnostics import Dtc
-from atalante_hal.image import NEVER
-from atalante_hal.plausibility.finding import JOINT_NODES, Cycles, Finding, Signals
 from atalante_hal.robot import JOINTS, Robot, Vector
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.plausibility.finding import JOINT_NODES, Cycles, Finding, Signals
+from atalante_hal.wire.process_image import NEVER
 
 #: Jumps on end, without a good value between them, that are no stray any more.
 JUMPS_TO_CONFIRM = 5

@@ -13,10 +13,18 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.diagnostics import Dtc
-from atalante_hal.image import NEVER, ReceiveImage
-from atalante_hal.plausibility.finding import FOOT_NODES, IMU_NODES, JOINT_NODES, Cycles, Finding, Signals, measured
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, Robot, Vector
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.plausibility.finding import (
+    FOOT_NODES,
+    IMU_NODES,
+    JOINT_NODES,
+    Cycles,
+    Finding,
+    Signals,
+    measured,
+)
+from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Cycles after which a standstill is found at the latest, counted from the first repeated sample.
 STUCK_CYCLES = 50

@@ -1,4 +1,4 @@
-"""Supervision: what is wrong in a cycle, which state the robot is in, and what follows for its drives and the assistance.
+"""Safety monitor: what is wrong in a cycle, which state the robot is in, and what follows for its drives and the assistance.
 
     process image, heartbeats, transceiver, plausibility, loop, controller -> fault memory -> supervisor -> state
 
@@ -11,31 +11,31 @@ from __future__ import annotations
 import numpy as np
 
 from atalante_dbc import Network
-from atalante_hal.cia402 import DriveState
 from atalante_hal.commands import Commands
-from atalante_hal.diagnostics import Dtc, Reaction, worst
-from atalante_hal.fault_memory import FaultMemory
-from atalante_hal.frame import Frames
-from atalante_hal.heartbeats import Heartbeats
-from atalante_hal.image import ReceiveImage
-from atalante_hal.judgement import Judgement
-from atalante_hal.limiter import Limiter
 from atalante_hal.pendant import Pendant
-from atalante_hal.plausibility import Plausibility
 from atalante_hal.record import Record
 from atalante_hal.robot import JOINTS, Robot
-from atalante_hal.start import refusal
-from atalante_hal.supervisor import MOVING, Conditions, next_state
-from atalante_hal.telemetry.events import Event
+from atalante_hal.safety.diagnostics import Dtc, Reaction, worst
+from atalante_hal.safety.events import Event
+from atalante_hal.safety.fault_memory import FaultMemory
+from atalante_hal.safety.heartbeats import Heartbeats
+from atalante_hal.safety.limiter import Limiter
+from atalante_hal.safety.message_monitor import MessageMonitor
+from atalante_hal.safety.plausibility import Plausibility
+from atalante_hal.safety.start import refusal
+from atalante_hal.safety.state_machine import MOVING, Conditions, next_state
 from atalante_hal.transceiver import Transceiver
 from atalante_hal.types import State, SupervisorState
+from atalante_hal.wire.cia402 import DriveState
+from atalante_hal.wire.frame import Frames
+from atalante_hal.wire.process_image import ReceiveImage
 
 #: Cycles within which every drive must have followed to OPERATION ENABLED.
 ENABLE_CYCLES = 200
 #: Longest time FINISH_STEP goes on [cycles]: more than a step.
 FINISH_STEP_CYCLES = 2000
 
-#: How `Supervision.reason` begins after a START that was refused, until the state changes.
+#: How `SafetyMonitor.reason` begins after a START that was refused, until the state changes.
 REFUSED = "START refused: "
 
 #: DBC names of the drives, in joint order.
@@ -47,7 +47,7 @@ _S = SupervisorState
 _STARTABLE = (_S.READY, _S.FULL_ASSIST, _S.HOLD, _S.LOWER, _S.FAULT)
 
 
-class Supervision:
+class SafetyMonitor:
     """The judge of one HAL.
 
     Attributes:
@@ -81,10 +81,10 @@ class Supervision:
         self._robot, self._period, self._parts, self._state, self._image = robot, period, parts, state, image
         self._plausibility, self._transceiver = plausibility, transceiver
         self._limiter, self._commands = limiter, commands
-        self._judgement = Judgement(network, image)
+        self._message_monitor = MessageMonitor(network, image)
         self._heartbeats = Heartbeats(network, robot.thresholds)
         self._pendant = Pendant(image)
-        state.valid, state.age = self._judgement.valid, image.age
+        state.valid, state.age = self._message_monitor.valid, image.age
         self.memory = FaultMemory()
         self.conditions = Conditions()
         self.reason = "nothing has happened yet"
@@ -94,7 +94,7 @@ class Supervision:
         self.enabling = False
         self.lowered: set[str] = set()
         self._steady = False  # a perfect cycle would change nothing
-        #: What loop and controller did wrong since the last judgement: code, whether confirmed, value, sentence.
+        #: What loop and controller did wrong since the last `judge`: code, whether confirmed, value, sentence.
         self._reports: list[tuple[Dtc, bool, float, str]] = []
         self._ending = False
         self._barred = False  # another HAL was heard before this one moved anything
@@ -147,14 +147,14 @@ class Supervision:
 
     def missing(self) -> set[str]:
         """Nodes that keep the robot out of READY: not heard in time or not trusted yet, no status, another DBC."""
-        return self._judgement.missing() | self._heartbeats.missing()
+        return self._message_monitor.missing() | self._heartbeats.missing()
 
     def _judge(self) -> None:
         """Everything that is wrong in this cycle, and what the supervisor makes of it."""
         state, memory, cycle = self._state, self.memory, self._state.cycle
-        judgement, pendant = self._judgement, self._pendant
-        judgement.judge(cycle, memory, self._plausibility.swing)
-        state.joints_valid = judgement.joints_valid
+        message_monitor, pendant = self._message_monitor, self._pendant
+        message_monitor.judge(cycle, memory, self._plausibility.swing)
+        state.joints_valid = message_monitor.joints_valid
         self._heartbeats.judge(cycle, memory)
         for node in self._heartbeats.booted:
             self._plausibility.reference(node)
@@ -165,12 +165,12 @@ class Supervision:
         for dtc, confirmed, value, text in self._reports:
             memory.raise_dtc(cycle, dtc, "HAL", value=value, confirmed=confirmed, text=text)
         self._reports.clear()
-        nodes_well = judgement.nodes_well and self._heartbeats.known
+        nodes_well = message_monitor.nodes_well and self._heartbeats.known
         self._judge_drives(nodes_well)
         if self._barred:
             memory.raise_dtc(cycle, Dtc.HAL_DUPLICATE, "HAL", text="another HAL was there first: end one, start again")
         row = pendant.row
-        pendant.hear(judgement.trusts(row), qualifying=judgement.hears(row), beside=self._image.beside(row))
+        pendant.hear(message_monitor.trusts(row), qualifying=message_monitor.hears(row), beside=self._image.beside(row))
         memory.close_cycle(cycle)
         self._barred |= Dtc.HAL_DUPLICATE in memory.confirmed and state.supervisor in (_S.OFF, _S.READY)
         self._judge_start(nodes_well)
@@ -196,7 +196,7 @@ class Supervision:
         header[8] = self.crc_errors
         self._steady = (
             after is before
-            and judgement.settled
+            and message_monitor.settled
             and self._heartbeats.quiet
             and not (memory.active or self.start_wanted or self._leading or after is _S.FINISH_STEP or self._ending)
         )
