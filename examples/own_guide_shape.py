@@ -8,9 +8,9 @@ A value below 1 means that hip and knee of the swing leg stayed inside the guide
 
 import numpy as np
 
-from atalante_control.controller import HangController
-from atalante_control.gait import HANG_GAIT, load_gait
-from atalante_control.guide_shapes import GuideShape
+from atalante_control.airwalk.controller import AirwalkController
+from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
+from atalante_control.guide.shapes import GuideShape
 from atalante_hal.robot import load_robot
 from atalante_tools.options import Target
 from atalante_tools.rig import open_hal
@@ -31,8 +31,8 @@ def waist(phase, half_width):
 
 
 robot = load_robot()
-gait = load_gait(HANG_GAIT, robot)
-controller = HangController(robot, gait, GuideShape("waist", "3 degrees at the middle of the step", waist))
+gait = load_gait(AIRWALK_GAIT, robot)
+controller = AirwalkController(robot, gait, GuideShape("waist", "3 degrees at the middle of the step", waist))
 certificate = controller.certificate(XI)
 print("certified" if certificate.certified else "not certified", "-", certificate.reason)
 

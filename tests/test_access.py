@@ -305,7 +305,7 @@ class TestTelemetryFile:
 
 
 class TestCommand:
-    """`atalante hang --telemetry FILE` from start to end, with each kind of file that the README has."""
+    """`atalante airwalk --telemetry FILE` from start to end, with each kind of file that the README has."""
 
     @pytest.mark.parametrize(
         "keys",

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from atalante_control.account import TELEMETRY, HangStatistics, tell
-from atalante_control.guide_kernel import JOINT
+from atalante_control.airwalk.telemetry import TELEMETRY, AirwalkStatistics, write_telemetry
+from atalante_control.guide.kernel import JOINT
 
 ROW = np.arange(24.0)
 
@@ -17,7 +17,7 @@ def told(errors: tuple[float, float], active: float = 0.1) -> tuple[np.ndarray, 
     joints, telemetry = np.zeros(2, JOINT), np.zeros(1, TELEMETRY)
     joints["upper"], joints["lower"] = 0.1, 0.05
     joints["h"], joints["gate"] = (0.7, -0.2), (0.1, 0.4)
-    said = tell(telemetry, ROW, joints, errors, active, 3, 0.25, 1, 0.5)
+    said = write_telemetry(telemetry, ROW, joints, errors, active, 3, 0.25, 1, 0.5)
     return telemetry[0], said
 
 
@@ -40,9 +40,9 @@ def test_the_worse_joint_counts():
 
 
 def test_statistics_begin_with_the_first_completed_step():
-    statistics = HangStatistics()
+    statistics = AirwalkStatistics()
     statistics.count(0, 5.0, -3.0, True)
-    assert statistics == HangStatistics()
+    assert statistics == AirwalkStatistics()
     assert (statistics.inside_fraction, statistics.active_fraction) == (0.0, 0.0)
     statistics.steps = 1
     for cycle, ratio, h, acting in (
@@ -52,11 +52,11 @@ def test_statistics_begin_with_the_first_completed_step():
         (0, 0.1, 0.9, True),
     ):
         statistics.count(cycle, ratio, h, acting)
-    assert statistics == HangStatistics(1, 4, 3, 3, 1.5, 0.75)
+    assert statistics == AirwalkStatistics(1, 4, 3, 3, 1.5, 0.75)
     assert (statistics.inside_fraction, statistics.active_fraction) == (0.75, 0.75)
 
 
 def test_a_ratio_that_is_no_number_is_not_inside():
-    statistics = HangStatistics(steps=1)
+    statistics = AirwalkStatistics(steps=1)
     statistics.count(1, math.nan, math.nan, False)
     assert statistics.inside == 0

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from atalante_control.array_file import ArrayFileError, read_arrays, write_arrays
-from atalante_control.gait_network import DEFAULT_NETWORK, GaitNetwork, NetworkError, load_network
+from atalante_control.dynamics.gait_network import DEFAULT_NETWORK, GaitNetwork, NetworkError, load_network
+from atalante_control.gait.array_file import ArrayFileError, read_arrays, write_arrays
 
 SHIPPED = DEFAULT_NETWORK.read_bytes()
 SEEDS = 400  # of each of five kinds of corruption

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from atalante_control.backup import BackupPolicy, forced_response, free_drift
-from atalante_control.deadbeat import Deadbeat
-from atalante_control.gait import bezier, derivative
+from atalante_control.gait.gait import bezier, derivative
+from atalante_control.gait.recentering import Deadbeat
+from atalante_control.guide.backup_policy import BackupPolicy, forced_response, free_drift
 
 OVERDAMPED = BackupPolicy(6300.0, 473.0, 8.0)
 CRITICAL = BackupPolicy(8.0 * 28.0**2, 2 * 8.0 * 28.0, 8.0)

@@ -9,17 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from atalante_control.backup import BackupPolicy
-from atalante_control.certificate import Certificate, HandOver, certify
-from atalante_control.deadbeat import Deadbeat
-from atalante_control.gait import HANG_GAIT, bezier, load_gait
-from atalante_control.guide import GuideConfig, GuideFilter
-from atalante_control.guide_shapes import SHAPES, half_width
-from atalante_control.idealization import AssistedInertia
+from atalante_control.gait.gait import AIRWALK_GAIT, bezier, load_gait
+from atalante_control.gait.recentering import Deadbeat
+from atalante_control.guide.backup_policy import BackupPolicy
+from atalante_control.guide.certificate import Certificate, HandOver, certify
+from atalante_control.guide.filter import GuideConfig, GuideFilter
+from atalante_control.guide.shapes import SHAPES, half_width
+from atalante_control.joint.idealization import AssistedInertia
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import load_robot
 
-GAIT = load_gait(HANG_GAIT, load_robot())
+GAIT = load_gait(AIRWALK_GAIT, load_robot())
 DEADBEAT = Deadbeat(GAIT.duration, 0.4)
 POLICIES = (BackupPolicy(6300.0, 473.0, 8.0, 165.0), BackupPolicy(3600.0, 173.0, 1.9, 180.0))
 CONFIG = GuideConfig(POLICIES, ((-30.0, 30.0), (-20.0, 20.0)))

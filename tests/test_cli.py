@@ -15,8 +15,8 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from atalante_control.gait import GaitError
-from atalante_control.guide_shapes import SHAPES
+from atalante_control.gait.gait import GaitError
+from atalante_control.guide.shapes import SHAPES
 from atalante_dbc import DbcError
 from atalante_hal.bus import BusAbsent, BusDown, BusError, BusFull
 from atalante_hal.bus.channel_map import ChannelMapError
@@ -144,7 +144,7 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Any:
         (ChannelMapError("channel map 'a,b' is not one"), 2),
         (DbcError("atalante.dbc:14: no unit"), 1),
         (RobotError("robot.toml: joints.FH is missing"), 1),
-        (GaitError("hang.json: duration is missing"), 1),
+        (GaitError("airwalk.json: duration is missing"), 1),
         (AccessError("telemetry.toml: listne is unknown"), 1),
         (TelemetryError("the recorder is gone"), 1),
         (RingError("no such ring"), 1),

@@ -17,21 +17,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from atalante_control.certificate import certify
-from atalante_control.controller import HangConfig, HangController, baseline_share
-from atalante_control.gait import HANG_GAIT, Gait, load_gait
-from atalante_control.gravity import Gravity
-from atalante_control.guide_shapes import SHAPES
-from atalante_control.idealization import Friction
+from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController, baseline_share
+from atalante_control.dynamics.gravity import Gravity
+from atalante_control.gait.gait import AIRWALK_GAIT, Gait, load_gait
+from atalante_control.guide.certificate import certify
+from atalante_control.guide.shapes import SHAPES
+from atalante_control.joint.idealization import Friction
+from atalante_control.joint.pid import AIR_GAINS, LEFT, RIGHT, Pid
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
-from atalante_control.pid import AIR_GAINS, LEFT, RIGHT, Pid
 from atalante_hal.robot import IMUS, JOINTS, MOTORS, load_robot
 from atalante_hal.types import State, SupervisorState
 
 ROBOT = load_robot()
-GAIT = load_gait(HANG_GAIT, ROBOT)
+GAIT = load_gait(AIRWALK_GAIT, ROBOT)
 MODEL = pinocchio_model(urdf(ExoskeletonParameters(), ROBOT))
-CONFIG = HangConfig(startup=0.5)
+CONFIG = AirwalkConfig(startup=0.5)
 RATE = ROBOT.torque_rate_max * 1e-3  # Nm a cycle
 STARTUP = 500
 SH, SK = JOINTS.index("left_SH"), JOINTS.index("left_SK")
@@ -97,7 +97,7 @@ class Plant:
 
 
 def walk(
-    controller: HangController,
+    controller: AirwalkController,
     cycles: int,
     friction: float = 1.0,
     xi: float = 0.5,
@@ -114,8 +114,8 @@ def walk(
     return torques
 
 
-def hang(shape: str = "constant", config: HangConfig = CONFIG, gait: Gait = GAIT) -> HangController:
-    return HangController(ROBOT, gait, SHAPES[shape], config)
+def airwalk(shape: str = "constant", config: AirwalkConfig = CONFIG, gait: Gait = GAIT) -> AirwalkController:
+    return AirwalkController(ROBOT, gait, SHAPES[shape], config)
 
 
 STEP = 800
@@ -125,7 +125,7 @@ CERTIFIED = ["constant", "widening", "narrowing", "pinched", "asymmetric"]
 
 @pytest.mark.parametrize("shape", [*CERTIFIED, "snap"])
 def test_a_step_takes_the_gentlest_gains_that_are_certified_with_a_margin(shape: str):
-    controller = hang(shape)
+    controller = airwalk(shape)
     box, margin = CONFIG.hand_over, CONFIG.guide_margin
     kp = [guide.config.policies[0].kp for guide in controller.guides]
     assert kp == sorted(kp)
@@ -146,26 +146,26 @@ def test_a_step_takes_the_gentlest_gains_that_are_certified_with_a_margin(shape:
 @pytest.mark.parametrize("shape", list(SHAPES))
 @pytest.mark.parametrize("xi", [0.9 + 1e-9, 0.91, 0.95, 0.99, 1.0])
 def test_no_guide_is_certified_where_the_baseline_is_blended_in(shape: str, xi: float):
-    certificate = hang(shape).certificate(xi)
+    certificate = airwalk(shape).certificate(xi)
     assert not certificate.certified
     assert certificate.joint_torque is None
     assert ("fade" if xi < 1.0 else "baseline controller drives every joint") in certificate.reason
 
 
 def test_the_fade_is_that_of_the_configuration():
-    controller = hang("constant", replace(CONFIG, fade=0.4))
+    controller = airwalk("constant", replace(CONFIG, fade=0.4))
     assert [controller.certificate(xi).certified for xi in (0.4, 0.5)] == [True, False]
 
 
 def test_a_guide_whose_torques_are_not_decoupled_is_not_certified():
-    certificate = hang("constant", replace(CONFIG, decoupled=False)).certificate(0.5)
+    certificate = airwalk("constant", replace(CONFIG, decoupled=False)).certificate(0.5)
     assert not certificate.certified
     assert certificate.joint_torque is None
     assert "decoupled=False" in certificate.reason
 
 
 def test_statistics_keep_the_factors_of_the_steps():
-    controller = hang()
+    controller = airwalk()
 
     def operator(state: State) -> None:
         state.assistance_factor = 0.5 if state.cycle < STARTUP + 100 else 0.95
@@ -175,7 +175,7 @@ def test_statistics_keep_the_factors_of_the_steps():
 
 
 def test_a_joint_whose_torque_is_cut_winds_no_integral_up():
-    controllers = hang(), hang()
+    controllers = airwalk(), airwalk()
     joint, commands = JOINTS.index("right_FH"), []
     for controller, cut in zip(controllers, (0.0, 1.0), strict=True):
         state = blank_state(1.0)
@@ -195,7 +195,7 @@ def test_a_joint_whose_torque_is_cut_winds_no_integral_up():
 
 @pytest.mark.parametrize("shape", CERTIFIED)
 def test_a_certified_guide_is_kept_by_the_coupled_leg(shape: str):
-    controller = hang(shape)
+    controller = airwalk(shape)
     assert controller.certificate(0.5).certified
     torques = walk(controller, TWO_STEPS + 1)
     said = controller.statistics
@@ -216,21 +216,21 @@ def test_a_certified_guide_is_kept_by_the_coupled_leg(shape: str):
 @pytest.mark.parametrize("friction", [0.8, 1.2])
 @pytest.mark.parametrize("shape", ["constant", "pinched"])
 def test_friction_a_fifth_off_does_not_break_the_guide(shape: str, friction: float):
-    controller = hang(shape)
+    controller = airwalk(shape)
     walk(controller, STARTUP + 3 * STEP, friction)
     assert controller.statistics.max_ratio <= 1.0
 
 
 @pytest.mark.parametrize("xi", [0.0, 0.8, 0.93])
 def test_the_guide_is_kept_at_other_assistance_factors(xi: float):
-    controller = hang()
+    controller = airwalk()
     assert controller.certificate(xi).certified == (xi <= CONFIG.fade)
     walk(controller, STARTUP + 3 * STEP, xi=xi)
     assert controller.statistics.max_ratio <= 1.0
 
 
 def test_an_uncertified_guide_is_announced_and_left():
-    controller = hang("snap")
+    controller = airwalk("snap")
     certificate = controller.certificate(0.5)
     assert not certificate.certified
     assert certificate.reason
@@ -241,7 +241,7 @@ def test_an_uncertified_guide_is_announced_and_left():
 
 def test_without_the_coupling_undone_a_certified_guide_is_left():
     """Why `decoupled` is there: as printed, each torque on its own joint, the knee throws the hip out."""
-    controller = hang("pinched", replace(CONFIG, decoupled=False))
+    controller = airwalk("pinched", replace(CONFIG, decoupled=False))
     walk(controller, STARTUP + 3 * STEP)
     assert controller.statistics.max_ratio > 1.05
 
@@ -261,7 +261,7 @@ def test_share_of_the_baseline_is_a_smooth_step_to_exactly_one(xi: float, fade: 
 
 
 def test_at_full_assistance_the_command_is_the_baseline_torque_to_the_last_bit():
-    controller = hang()
+    controller = airwalk()
     pid, gravity = Pid(AIR_GAINS), Gravity(MODEL)
     plant = Plant(xi=1.0)
     controller.reset(plant.state)
@@ -288,7 +288,7 @@ def test_at_full_assistance_the_command_is_the_baseline_torque_to_the_last_bit()
 
 def test_at_full_assistance_the_guide_has_no_say():
     """Whatever u_v is, and in the hand-over too."""
-    calm, wild = hang(), hang()
+    calm, wild = airwalk(), airwalk()
     rng = np.random.default_rng(1)
 
     def nonsense(state: State) -> None:
@@ -310,7 +310,7 @@ def recorded(cycles: int) -> list[State]:
         }
         states.append(replace(state, **copies))
 
-    walk(hang(), cycles, each=keep)
+    walk(airwalk(), cycles, each=keep)
     return states
 
 
@@ -319,8 +319,8 @@ def walked() -> list[State]:
     return recorded(STARTUP + STEP + 200)
 
 
-def replayed(xi: float, shape: str = "constant", config: HangConfig = CONFIG, gait: Gait = GAIT) -> np.ndarray:
-    controller, states = hang(shape, config, gait), walked()
+def replayed(xi: float, shape: str = "constant", config: AirwalkConfig = CONFIG, gait: Gait = GAIT) -> np.ndarray:
+    controller, states = airwalk(shape, config, gait), walked()
     controller.reset(states[0])
     return np.array([controller.update(replace(state, assistance_factor=xi)).torque.copy() for state in states])
 
@@ -345,7 +345,7 @@ def test_only_hip_and_knee_of_the_swing_leg_are_assisted():
 
 
 def test_a_new_assistance_factor_waits_for_the_step_change():
-    controller = hang("widening")
+    controller = airwalk("widening")
     seen: list[tuple[float, float]] = []
 
     def operator(state: State) -> None:
@@ -362,7 +362,7 @@ def test_a_new_assistance_factor_waits_for_the_step_change():
 
 @pytest.mark.parametrize("asked", [-1.0, 2.0])
 def test_a_factor_out_of_range_is_brought_into_it(asked: float):
-    controller = hang()
+    controller = airwalk()
     controller.reset(walked()[0])
     for state in walked()[: STARTUP + 3]:
         controller.update(replace(state, assistance_factor=asked))
@@ -373,7 +373,7 @@ def test_a_factor_out_of_range_is_brought_into_it(asked: float):
 
 
 def test_starts_from_the_measured_pose_and_torque():
-    controller, state = hang(), blank_state(0.5)
+    controller, state = airwalk(), blank_state(0.5)
     state.position[:] = START
     state.torque[:] = np.linspace(-20.0, 20.0, 12)
     controller.reset(state)
@@ -390,7 +390,7 @@ def test_starts_from_the_measured_pose_and_torque():
 
 
 def test_starts_again_after_a_reset_as_if_new():
-    used, fresh = hang(), hang()
+    used, fresh = airwalk(), airwalk()
     walk(used, STARTUP + 900)
     first, second = (walk(controller, STARTUP + 850) for controller in (used, fresh))
     assert first.tobytes() == second.tobytes()
@@ -398,7 +398,7 @@ def test_starts_again_after_a_reset_as_if_new():
 
 
 def test_telemetry_is_what_its_fields_say():
-    controller = hang("asymmetric")
+    controller = airwalk("asymmetric")
     fields = dict(controller.telemetry_fields)
     assert sum(fields.values()) == len(controller.telemetry)
     assert list(fields)[:9] == ["q_des", "error", "q_bound", "guide", "h", "lambda", "filter_active", "step", "phase"]
@@ -423,7 +423,7 @@ def test_telemetry_is_what_its_fields_say():
 
 def test_haptics_follow_the_swing_leg_and_are_silent_at_full_assistance():
     for xi in (0.5, 1.0):
-        controller = hang()
+        controller = airwalk()
         controller.reset(walked()[0])
         for state in walked()[: STARTUP + 200]:
             vibration = controller.update(replace(state, assistance_factor=xi)).vibration
@@ -433,7 +433,7 @@ def test_haptics_follow_the_swing_leg_and_are_silent_at_full_assistance():
 
 
 def test_a_joint_outside_its_safe_backward_image_is_told():
-    controller = hang()
+    controller = airwalk()
     controller.reset(walked()[0])
     told = []
     for cycle, state in enumerate(walked()[: STARTUP + 300]):
@@ -447,7 +447,7 @@ def test_a_joint_outside_its_safe_backward_image_is_told():
 @pytest.mark.parametrize("silent", [("left_tibia", "right_tibia"), ("left_tibia", "right_tibia", "pelvis")])
 def test_flat_foot_does_not_listen_to_an_imu_that_is_silent(silent: tuple[str, ...]):
     def ankles(quaternion: float, age: int) -> np.ndarray:
-        controller = hang(config=replace(CONFIG, gentler=()))
+        controller = airwalk(config=replace(CONFIG, gentler=()))
         controller.reset(walked()[0])
         targets = []
         for state in walked()[: STARTUP + STEP + 100]:
@@ -468,7 +468,7 @@ def test_flat_foot_does_not_listen_to_an_imu_that_is_silent(silent: tuple[str, .
 
 
 def test_missed_cycles_do_not_stretch_the_step():
-    controller = hang()
+    controller = airwalk()
     controller.reset(walked()[0])
     for state in walked()[: STARTUP + STEP - 2]:
         controller.update(state)
@@ -507,4 +507,4 @@ def test_feedforward_is_off_in_the_air_and_acts_when_asked_for():
 )
 def test_refuses_a_configuration_that_is_none(bad: dict[str, object]):
     with pytest.raises(ValueError, match=r"\w"):
-        hang(config=replace(CONFIG, **bad))
+        airwalk(config=replace(CONFIG, **bad))

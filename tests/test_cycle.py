@@ -7,20 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from atalante_control.controller import HangConfig, HangController
-from atalante_control.cycle import STEP, hand_over
-from atalante_control.gait import HANG_GAIT, load_gait
-from atalante_control.guide_shapes import SHAPES
+from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
+from atalante_control.airwalk.kernel import STEP, hand_over
+from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
+from atalante_control.guide.shapes import SHAPES
 from atalante_hal.robot import load_robot
 from atalante_hal.types import State, SupervisorState
 
 ROBOT = load_robot()
-GAIT = load_gait(HANG_GAIT, ROBOT)
+GAIT = load_gait(AIRWALK_GAIT, ROBOT)
 STARTUP = 20  # cycles
 
 
-def controller() -> HangController:
-    return HangController(ROBOT, GAIT, SHAPES["pinched"], HangConfig(startup=STARTUP * 1e-3))
+def controller() -> AirwalkController:
+    return AirwalkController(ROBOT, GAIT, SHAPES["pinched"], AirwalkConfig(startup=STARTUP * 1e-3))
 
 
 def states(xi: float) -> list[State]:
@@ -61,7 +61,7 @@ def test_nothing_follows_the_swing_foot_where_that_is_switched_off():
     walked = states(0.5)[: STARTUP + 10]
     level, free = (
         controller(),
-        HangController(ROBOT, GAIT, SHAPES["pinched"], replace(controller().config, flat_foot=False)),
+        AirwalkController(ROBOT, GAIT, SHAPES["pinched"], replace(controller().config, flat_foot=False)),
     )
     for one in (level, free):
         one.reset(walked[0])

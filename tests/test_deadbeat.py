@@ -1,4 +1,4 @@
-"""Deadbeat: the four conditions of the paper, and linearity in the deviations."""
+"""Re-centring (the paper's deadbeat): the four conditions of the paper, and linearity in the deviations."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from atalante_control.deadbeat import Deadbeat
+from atalante_control.gait.recentering import Deadbeat
 
 ALPHAS = st.floats(0.02, 1.0)
 DURATIONS = st.floats(0.3, 3.0)

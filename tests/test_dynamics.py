@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio
 import pytest
 
-from atalante_control.generation.dynamics import STANCE_FOOT, SWING_FOOT, Chain, bodies
+from atalante_control.dynamics.stance import stance_dynamics
+from atalante_control.gait_optimization.symbolic_dynamics import STANCE_FOOT, SWING_FOOT, Chain, bodies
 from atalante_control.model import BASE_LINK, ExoskeletonParameters, Patient, links, pinocchio_model, urdf_text
-from atalante_control.stance_dynamics import stance_dynamics
 from atalante_hal.robot import JOINTS, load_robot
 
 PATIENT = Patient(91.0, 1.62, thigh_length=0.42)

@@ -11,7 +11,7 @@ import time
 import pytest
 from joblib.externals.loky.process_executor import _ExecutorManagerThread
 
-from atalante_control.fan_out import FanOutError, fan_out
+from atalante_control.gait_optimization.parallel import FanOutError, fan_out
 
 
 def doubled(number: int) -> tuple[int, int]:

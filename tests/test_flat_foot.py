@@ -10,8 +10,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from atalante_control.deadbeat import Deadbeat
-from atalante_control.flat_foot import FlatFoot, LevelFeet, Tibiae, flat_feet, level, put_level
+from atalante_control.gait.recentering import Deadbeat
+from atalante_control.joint.flat_foot import FlatFoot, LevelFeet, Tibiae, flat_feet, level, put_level
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import load_robot
 from atalante_hal.types import State, SupervisorState

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from atalante_control.gait import (
-    HANG_GAIT,
+from atalante_control.gait.gait import (
+    AIRWALK_GAIT,
     PERIOD,
     SIGN,
     SWAP,
@@ -29,11 +29,11 @@ from atalante_control.gait import (
 from atalante_hal.robot import JOINTS, load_robot
 
 ROBOT = load_robot()
-HANG = load_gait(HANG_GAIT, ROBOT)
+AIRWALK = load_gait(AIRWALK_GAIT, ROBOT)
 
 
 def document() -> dict[str, Any]:
-    return json.loads(HANG_GAIT.read_text())
+    return json.loads(AIRWALK_GAIT.read_text())
 
 
 def refused(tmp_path: Path, content: Any) -> str:
@@ -65,8 +65,8 @@ def test_bezier_derivative_and_power_basis_agree():
 
 
 def test_tables_are_their_own_derivatives():
-    tables = HANG.tables()
-    assert tables.q.shape == (HANG.cycles + 1, len(JOINTS))
+    tables = AIRWALK.tables()
+    assert tables.q.shape == (AIRWALK.cycles + 1, len(JOINTS))
     np.testing.assert_allclose(np.gradient(tables.q, PERIOD, axis=0)[1:-1], tables.qd[1:-1], atol=1e-4)
     np.testing.assert_allclose(np.gradient(tables.qd, PERIOD, axis=0)[1:-1], tables.qdd[1:-1], atol=2e-2)
     assert not tables.uf.any()
@@ -75,14 +75,14 @@ def test_tables_are_their_own_derivatives():
 
 
 def test_mirroring_swaps_legs_and_signs_and_is_its_own_inverse():
-    left = HANG.mirrored()
-    np.testing.assert_array_equal(left.tables().q, HANG.tables().q[:, SWAP] * SIGN)
-    np.testing.assert_array_equal(left.mirrored().coefficients, HANG.coefficients)
+    left = AIRWALK.mirrored()
+    np.testing.assert_array_equal(left.tables().q, AIRWALK.tables().q[:, SWAP] * SIGN)
+    np.testing.assert_array_equal(left.mirrored().coefficients, AIRWALK.coefficients)
 
 
-def test_hang_gait_is_periodic_through_the_leg_swap_within_limits_and_slow():
-    right, left = HANG.tables(), HANG.mirrored().tables()
-    assert HANG.duration == 0.8
+def test_airwalk_gait_is_periodic_through_the_leg_swap_within_limits_and_slow():
+    right, left = AIRWALK.tables(), AIRWALK.mirrored().tables()
+    assert AIRWALK.duration == 0.8
     np.testing.assert_allclose(right.q[-1], left.q[0], atol=1e-12)
     np.testing.assert_allclose(right.qd[-1], left.qd[0], atol=1e-10)
     assert np.abs(right.qd).max() < 3.0
@@ -96,11 +96,11 @@ def test_hang_gait_is_periodic_through_the_leg_swap_within_limits_and_slow():
 
 
 def test_hash_follows_what_is_walked_and_nothing_else():
-    other = HANG.coefficients.copy()
+    other = AIRWALK.coefficients.copy()
     other[3, 4] += 1e-6
-    assert Gait("renamed", HANG.duration, HANG.coefficients).hash32 == HANG.hash32
-    assert Gait("hang", HANG.duration, other).hash32 != HANG.hash32
-    assert Gait("hang", 0.81, HANG.coefficients).hash32 != HANG.hash32
+    assert Gait("renamed", AIRWALK.duration, AIRWALK.coefficients).hash32 == AIRWALK.hash32
+    assert Gait("airwalk", AIRWALK.duration, other).hash32 != AIRWALK.hash32
+    assert Gait("airwalk", 0.81, AIRWALK.coefficients).hash32 != AIRWALK.hash32
 
 
 def test_what_the_library_will_need_is_kept(tmp_path: Path):
@@ -144,7 +144,7 @@ def test_loader_names_the_key_and_what_is_valid(tmp_path: Path, change: Any, sai
 
 
 def test_loader_refuses_what_is_not_a_number(tmp_path: Path):
-    text = HANG_GAIT.read_text()
+    text = AIRWALK_GAIT.read_text()
     assert "NaN is not allowed" in refused(tmp_path, text.replace("0.384", "NaN", 1))
     assert "Infinity is not allowed" in refused(tmp_path, text.replace("0.384", "Infinity", 1))
     assert "finite" in refused(tmp_path, text.replace("0.384", "1e999", 1))
@@ -188,15 +188,15 @@ def test_loader_refuses_what_the_robot_cannot_do(tmp_path: Path):
 
 
 def knees_bent_by(angle: float) -> Gait:
-    points = HANG.coefficients.copy()
+    points = AIRWALK.coefficients.copy()
     points[[JOINTS.index("left_SK"), JOINTS.index("right_SK")]] += angle
-    return replace(HANG, coefficients=points)
+    return replace(AIRWALK, coefficients=points)
 
 
 def test_a_limit_that_is_left_between_two_cycles_is_found():
     knee = JOINTS.index("left_SK")
     phase = np.linspace(0.0, 1.0, 2_000_001)
-    most, sampled = bezier(HANG.coefficients[[knee]], phase).max(), HANG.tables().q[:, knee].max()
+    most, sampled = bezier(AIRWALK.coefficients[[knee]], phase).max(), AIRWALK.tables().q[:, knee].max()
     assert most - sampled > 1e-7
     limit = ROBOT.position_max[knee]
     gait = knees_bent_by(limit - (most + sampled) / 2.0)
@@ -211,13 +211,13 @@ def test_a_limit_that_is_left_between_two_cycles_is_found():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"coefficients": HANG.coefficients[:11]}, r"joints must be 64-bit floats of shape \(12, 8\), got float64 of shape \(11"),
-        ({"coefficients": HANG.coefficients.astype(np.float32)}, "joints must be 64-bit floats .*, got float32"),
-        ({"coefficients": HANG.coefficients.tolist()}, "joints must be 64-bit floats .*, got list"),
+        ({"coefficients": AIRWALK.coefficients[:11]}, r"joints must be 64-bit floats of shape \(12, 8\), got float64 of shape \(11"),
+        ({"coefficients": AIRWALK.coefficients.astype(np.float32)}, "joints must be 64-bit floats .*, got float32"),
+        ({"coefficients": AIRWALK.coefficients.tolist()}, "joints must be 64-bit floats .*, got list"),
         ({"coefficients": None}, "joints must be 64-bit floats .*, got NoneType"),
         ({"feedforward": np.zeros((12, 7))}, "feedforward must be 64-bit floats"),
         ({"feedforward": np.full((12, 8), np.nan)}, r"feedforward\.left_FH must be finite, got nan as control point 0"),
-        ({"coefficients": np.where(np.arange(8) == 3, np.inf, HANG.coefficients)}, r"joints\.left_FH must be finite, got inf"),
+        ({"coefficients": np.where(np.arange(8) == 3, np.inf, AIRWALK.coefficients)}, r"joints\.left_FH must be finite, got inf"),
         ({"coefficients": np.full((12, 8), 1.7e308) * (-1.0) ** np.arange(8)}, "must be .* deg|jumps by"),
         ({"duration": math.nan}, "duration must be a number of seconds from 0.3 to 3.0, got nan"),
         ({"duration": 0.2}, "duration must be a number of seconds from 0.3 to 3.0, got 0.2"),
@@ -227,11 +227,11 @@ def test_a_limit_that_is_left_between_two_cycles_is_found():
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_a_malformed_gait_is_refused_whoever_made_it(change: dict[str, Any], said: str):
     with pytest.raises(GaitError, match=said):
-        check_gait(replace(HANG, **change), ROBOT)
+        check_gait(replace(AIRWALK, **change), ROBOT)
 
 
 def test_a_duration_of_numpy_is_a_duration():
-    check_gait(replace(HANG, duration=np.float64(0.8)), ROBOT)
+    check_gait(replace(AIRWALK, duration=np.float64(0.8)), ROBOT)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -240,7 +240,7 @@ def test_feedforward_and_gravity_together_keep_the_torque_limit(sign: float):
     most = ROBOT.torque_max[hip]
     feedforward = np.zeros((12, 8))
     feedforward[hip] = sign * 0.6 * most
-    gait = replace(HANG, feedforward=feedforward)
+    gait = replace(AIRWALK, feedforward=feedforward)
 
     def gravity(share: float) -> Any:
         return lambda pose: share * most * (np.arange(12) == hip)
@@ -255,13 +255,13 @@ def test_a_written_gait_is_read_back_to_the_bit(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     feedforward = rng.normal(size=(12, 8)) * 10.0
     gait = Gait(
-        "walk", 0.8, HANG.coefficients, feedforward, {"patient_mass": 0.1 + 0.2}, {"status": "solved", "log": [1]}
+        "walk", 0.8, AIRWALK.coefficients, feedforward, {"patient_mass": 0.1 + 0.2}, {"status": "solved", "log": [1]}
     )
     path = tmp_path / "walk.json"
     write_gait(gait, path)
     back = load_gait(path, ROBOT)
     assert back.hash32 == gait.hash32
     assert (back.name, back.parameters, back.solver) == (gait.name, gait.parameters, gait.solver)
-    write_gait(HANG, path)
+    write_gait(AIRWALK, path)
     assert load_gait(path, ROBOT).feedforward is None
     assert [entry.name for entry in tmp_path.iterdir()] == ["walk.json"]

@@ -13,22 +13,22 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from atalante_control.gait import HANG_GAIT, Gait, load_gait
-from atalante_control.gait_network import load_network, periodicity
-from atalante_control.generation import fit as fit_module
-from atalante_control.generation import library as library_module
-from atalante_control.generation.deviation import Deviation, deviation, findings, random_subjects
-from atalante_control.generation.fit import fit, inputs
-from atalante_control.generation.library import Grid, Library
-from atalante_control.generation.solved import SOLVED, SolvedGait
+from atalante_control.dynamics.gait_network import load_network, periodicity
+from atalante_control.dynamics.stance import stance_dynamics
+from atalante_control.gait.gait import AIRWALK_GAIT, Gait, load_gait
+from atalante_control.gait.subject import Subject
+from atalante_control.gait_optimization import fit as fit_module
+from atalante_control.gait_optimization import library as library_module
+from atalante_control.gait_optimization.fit import fit, inputs
+from atalante_control.gait_optimization.library import Grid, Library
+from atalante_control.gait_optimization.network_error import Deviation, deviation, findings, random_subjects
+from atalante_control.gait_optimization.result import SOLVED, SolvedGait
 from atalante_control.model import Patient
-from atalante_control.stance_dynamics import stance_dynamics
-from atalante_control.subject import Subject
 from atalante_hal.robot import load_robot
 from atalante_tools.cli import cli
 
 ROBOT = load_robot()
-HANG = load_gait(HANG_GAIT, ROBOT)
+AIRWALK = load_gait(AIRWALK_GAIT, ROBOT)
 GRID = Grid((58.0, 75.0, 91.0), (1.62, 1.78, 1.93), (0.1, 0.15, 0.2), (0.8, 0.95, 1.1))
 LOW, HIGH = (np.array([axis[end] for axis in GRID.axes()]) for end in (0, -1))
 _, _, _RIGHT = np.linalg.svd(periodicity())
@@ -39,7 +39,7 @@ WAYS = np.random.default_rng(8).normal(size=(5, 72)) @ _RIGHT[24:] * 0.004
 def drawn(subject: Subject) -> SolvedGait:
     mass, height, length, duration = (2.0 * (inputs_of(subject) - LOW) / (HIGH - LOW) - 1.0).tolist()
     share = np.array([mass, height + 0.3 * height * length, length, duration + 0.2 * mass**2, math.sin(duration)])
-    coefficients = HANG.coefficients + (share @ WAYS).reshape(12, 8)
+    coefficients = AIRWALK.coefficients + (share @ WAYS).reshape(12, 8)
     feedforward = stance_dynamics(ROBOT, subject.patient).feedforward(coefficients, subject.step_duration)
     gait = Gait(
         str(subject), subject.step_duration, coefficients, feedforward * 0.1, subject.parameters(), {"status": SOLVED}

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from atalante_control.gait import HANG_GAIT, Gait, load_gait
-from atalante_control.generation import library as library_module
-from atalante_control.generation.library import Grid, Library, LibraryError
-from atalante_control.generation.solved import SOLVED, SolvedGait
-from atalante_control.subject import Subject
+from atalante_control.gait.gait import AIRWALK_GAIT, Gait, load_gait
+from atalante_control.gait.subject import Subject
+from atalante_control.gait_optimization import library as library_module
+from atalante_control.gait_optimization.library import Grid, Library, LibraryError
+from atalante_control.gait_optimization.result import SOLVED, SolvedGait
 from atalante_hal.robot import load_robot
 
 ROBOT = load_robot()
-HANG = load_gait(HANG_GAIT, ROBOT)
+AIRWALK = load_gait(AIRWALK_GAIT, ROBOT)
 GRID = Grid((60.0, 70.0, 80.0), (1.6, 1.7, 1.8, 1.9), (0.1, 0.15, 0.2), (0.7, 0.8, 1.0))
 POINTS = math.prod(GRID.shape)
 WHY = "no such gait: the speed of the swing knee cannot hold"
@@ -28,7 +28,7 @@ def drawn(subject: Subject) -> SolvedGait:
     """A gait that depends on its subject."""
     share = 1.0 + 0.01 * (subject.step_length - 0.15)
     made = {"status": SOLVED}
-    gait = Gait(str(subject), subject.step_duration, HANG.coefficients * share, None, subject.parameters(), made)
+    gait = Gait(str(subject), subject.step_duration, AIRWALK.coefficients * share, None, subject.parameters(), made)
     return SolvedGait(gait, SOLVED, 1e-9, 0.01, 10)
 
 

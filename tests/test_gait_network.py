@@ -13,10 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from atalante_control import gait_network
-from atalante_control.array_file import CHECKSUM, write_arrays
-from atalante_control.gait import SIGN, SWAP, Gait, check_gait, motion
-from atalante_control.gait_network import (
+from atalante_control.dynamics import gait_network
+from atalante_control.dynamics.gait_network import (
     INPUTS,
     OUTPUTS,
     GaitNetwork,
@@ -26,9 +24,11 @@ from atalante_control.gait_network import (
     periodicity,
     save_network,
 )
+from atalante_control.dynamics.stance import stance_dynamics
+from atalante_control.gait.array_file import CHECKSUM, write_arrays
+from atalante_control.gait.gait import SIGN, SWAP, Gait, check_gait, motion
+from atalante_control.gait.subject import Subject
 from atalante_control.model import Patient
-from atalante_control.stance_dynamics import stance_dynamics
-from atalante_control.subject import Subject
 from atalante_hal.robot import load_robot
 
 ROBOT = load_robot()
@@ -204,7 +204,7 @@ def test_a_damaged_network_of_the_package_asks_for_its_installation(
 
 def test_walking_needs_none_of_the_training_stack() -> None:
     program = (
-        "import sys; from atalante_control.gait_network import load_network; load_network(); "
+        "import sys; from atalante_control.dynamics.gait_network import load_network; load_network(); "
         "print([m for m in ('casadi', 'joblib', 'sklearn', 'scipy') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

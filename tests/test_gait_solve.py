@@ -14,8 +14,8 @@ import pytest
 from click.testing import CliRunner, Result
 from PIL import Image
 
-from atalante_control.gait import load_gait
-from atalante_control.generation import solve
+from atalante_control.gait.gait import load_gait
+from atalante_control.gait_optimization import solve
 from atalante_hal.robot import JOINTS, load_robot
 from atalante_tools.cli import cli
 from atalante_tools.gait.figures import draw_animation
@@ -60,7 +60,7 @@ def test_a_signal_in_the_midst_of_the_optimiser_is_no_verdict(
             os.kill(os.getpid(), number)
         return GivenUp()
 
-    monkeypatch.setattr("atalante_control.generation.solve.solve", optimise)
+    monkeypatch.setattr("atalante_control.gait_optimization.solve.solve", optimise)
     outcome = run(*PATIENT)
     assert outcome.exit_code == code
     assert "no such gait" not in outcome.stderr
@@ -121,7 +121,7 @@ def test_without_casadi_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch)
     real = builtins.__import__
 
     def absent(name: str, *arguments: Any, **keywords: Any) -> Any:
-        if name.startswith("atalante_control.generation.solve"):
+        if name.startswith("atalante_control.gait_optimization.solve"):
             raise ModuleNotFoundError("No module named 'casadi'", name="casadi")
         return real(name, *arguments, **keywords)
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pinocchio
 
-from atalante_control.gravity import Gravity
+from atalante_control.dynamics.gravity import Gravity
 from atalante_control.model import ArticulatedModel, ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import load_robot
 

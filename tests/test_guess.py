@@ -7,13 +7,13 @@ from itertools import product
 import numpy as np
 import pytest
 
-from atalante_control.gait import bezier
-from atalante_control.generation.guess import guess
-from atalante_control.generation.problem import StepProblem
-from atalante_control.generation.rules import Rules
+from atalante_control.dynamics.stance import stance_dynamics
+from atalante_control.gait.gait import bezier
+from atalante_control.gait.subject import Subject
+from atalante_control.gait_optimization.guess import guess
+from atalante_control.gait_optimization.requirements import Requirements
+from atalante_control.gait_optimization.step_problem import StepProblem
 from atalante_control.model import Patient
-from atalante_control.stance_dynamics import stance_dynamics
-from atalante_control.subject import Subject
 from atalante_hal.robot import load_robot
 
 ROBOT = load_robot()
@@ -21,7 +21,7 @@ ROBOT = load_robot()
 
 @pytest.fixture(scope="module")
 def problem() -> StepProblem:
-    return StepProblem("periodic", ROBOT, Rules())
+    return StepProblem("periodic", ROBOT, Requirements())
 
 
 @pytest.mark.parametrize(("height", "length"), list(product((1.62, 1.93), (0.10, 0.20))))

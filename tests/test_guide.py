@@ -16,16 +16,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from atalante_control.backup import BackupPolicy
-from atalante_control.certificate import HandOver, certify
-from atalante_control.deadbeat import Deadbeat
-from atalante_control.gait import HANG_GAIT, PERIOD, bezier, derivative, load_gait
-from atalante_control.guide import GuideConfig, GuideFilter
-from atalante_control.guide_kernel import damped_gate, gate, tick
-from atalante_control.guide_shapes import SHAPES, GuideShape, half_width
+from atalante_control.gait.gait import AIRWALK_GAIT, PERIOD, bezier, derivative, load_gait
+from atalante_control.gait.recentering import Deadbeat
+from atalante_control.guide.backup_policy import BackupPolicy
+from atalante_control.guide.certificate import HandOver, certify
+from atalante_control.guide.filter import GuideConfig, GuideFilter
+from atalante_control.guide.kernel import damped_gate, gate, tick
+from atalante_control.guide.shapes import SHAPES, GuideShape, half_width
 from atalante_hal.robot import load_robot
 
-GAIT = load_gait(HANG_GAIT, load_robot())
+GAIT = load_gait(AIRWALK_GAIT, load_robot())
 NOMINAL, FOLLOWING = GAIT.coefficients[2:4], GAIT.mirrored().coefficients[2:4]
 DEADBEAT = Deadbeat(GAIT.duration, 0.4)
 FEEDFORWARD = np.random.default_rng(5).normal(size=(2, 8)) * 15.0

@@ -14,21 +14,21 @@ from functools import cache
 import numpy as np
 import pytest
 
-from atalante_control.controller import HangConfig, HangController
-from atalante_control.gait import HANG_GAIT, PERIOD, bezier, derivative, load_gait
-from atalante_control.guide import GuideFilter
-from atalante_control.guide_kernel import tick
-from atalante_control.guide_shapes import SHAPES
-from atalante_control.idealization import AssistedInertia
+from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
+from atalante_control.gait.gait import AIRWALK_GAIT, PERIOD, bezier, derivative, load_gait
+from atalante_control.guide.filter import GuideFilter
+from atalante_control.guide.kernel import tick
+from atalante_control.guide.shapes import SHAPES
+from atalante_control.joint.idealization import AssistedInertia
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import load_robot
 
 ROBOT = load_robot()
-GAIT = load_gait(HANG_GAIT, ROBOT)
+GAIT = load_gait(AIRWALK_GAIT, ROBOT)
 NOMINAL = GAIT.coefficients[2:4]
 INERTIA = AssistedInertia(pinocchio_model(urdf(ExoskeletonParameters(), ROBOT)), GAIT.tables().q)
-CONFIG = HangConfig()
+CONFIG = AirwalkConfig()
 BOX = [(0.0, 0.0), *itertools.product((-CONFIG.hand_over.deviation, CONFIG.hand_over.deviation),
                                       (-CONFIG.hand_over.rate, CONFIG.hand_over.rate))]  # fmt: skip
 #: Largest |e| / q_bound allowed. No tolerance for sampling is needed: the largest found is 0.998 ideal, 0.985 coupled.
@@ -42,8 +42,8 @@ CERTIFIED = [
 
 
 @cache
-def controller(shape: str) -> HangController:
-    return HangController(ROBOT, GAIT, SHAPES[shape], CONFIG)
+def controller(shape: str) -> AirwalkController:
+    return AirwalkController(ROBOT, GAIT, SHAPES[shape], CONFIG)
 
 
 def desired(guide: GuideFilter, deviation: float, rate: float) -> tuple[np.ndarray, np.ndarray]:

@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from atalante_control.backup import BackupPolicy, ForcedResponse, forced_response, free_drift
-from atalante_control.deadbeat import Deadbeat
-from atalante_control.gait import HANG_GAIT, PERIOD, load_gait
-from atalante_control.guide import GuideConfig, GuideFilter
-from atalante_control.guide_kernel import damped_gate, gate, limited, tick
-from atalante_control.guide_shapes import GuideShape, half_width
+from atalante_control.gait.gait import AIRWALK_GAIT, PERIOD, load_gait
+from atalante_control.gait.recentering import Deadbeat
+from atalante_control.guide.backup_policy import BackupPolicy, ForcedResponse, forced_response, free_drift
+from atalante_control.guide.filter import GuideConfig, GuideFilter
+from atalante_control.guide.kernel import damped_gate, gate, limited, tick
+from atalante_control.guide.shapes import GuideShape, half_width
 from atalante_hal.robot import load_robot
 
-GAIT = load_gait(HANG_GAIT, load_robot())
+GAIT = load_gait(AIRWALK_GAIT, load_robot())
 DEADBEAT = Deadbeat(GAIT.duration, 0.4)
 LIMITS = (150.0, 110.0)
 RESERVE = 0.1

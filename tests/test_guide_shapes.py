@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from atalante_control.guide_shapes import CONSTANT, SHAPES, GuideShape, half_width
+from atalante_control.guide.shapes import CONSTANT, SHAPES, GuideShape, half_width
 
 PHASE = np.linspace(0.0, 1.0, 801)
 ALL = list(SHAPES.values())

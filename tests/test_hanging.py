@@ -6,14 +6,14 @@ import numpy as np
 import pinocchio
 import pytest
 
-from atalante_control.controller import HangConfig, HangController
-from atalante_control.gait import HANG_GAIT, Gait, GaitError, bezier, check_gait, load_gait, motion
-from atalante_control.gait_network import load_network
-from atalante_control.gravity import Gravity
-from atalante_control.guide_shapes import SHAPES
-from atalante_control.hanging import check_hung, hung
+from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
+from atalante_control.dynamics.gait_network import load_network
+from atalante_control.dynamics.gravity import Gravity
+from atalante_control.dynamics.suspended import check_hung, suspended_gait
+from atalante_control.gait.gait import AIRWALK_GAIT, Gait, GaitError, bezier, check_gait, load_gait, motion
+from atalante_control.gait.subject import Subject
+from atalante_control.guide.shapes import SHAPES
 from atalante_control.model import ExoskeletonParameters, Patient, pinocchio_model, urdf
-from atalante_control.subject import Subject
 from atalante_hal.robot import JOINTS, load_robot
 
 ROBOT = load_robot()
@@ -21,7 +21,7 @@ EXOSKELETON = ExoskeletonParameters().fitted(Patient(80.0, 1.85))
 
 
 def test_gravity_and_feedforward_together_are_the_torque_of_the_motion() -> None:
-    gait = hung(load_gait(HANG_GAIT, ROBOT), EXOSKELETON, ROBOT)
+    gait = suspended_gait(load_gait(AIRWALK_GAIT, ROBOT), EXOSKELETON, ROBOT)
     model, into, out_of = pinocchio_model(urdf(EXOSKELETON, ROBOT))
     data = model.createData()
     phase = np.linspace(0.0, 1.0, 50)
@@ -37,8 +37,8 @@ def test_gravity_and_feedforward_together_are_the_torque_of_the_motion() -> None
 
 
 def test_trajectories_stay() -> None:
-    gait = load_gait(HANG_GAIT, ROBOT)
-    np.testing.assert_array_equal(hung(gait, EXOSKELETON, ROBOT).coefficients, gait.coefficients)
+    gait = load_gait(AIRWALK_GAIT, ROBOT)
+    np.testing.assert_array_equal(suspended_gait(gait, EXOSKELETON, ROBOT).coefficients, gait.coefficients)
 
 
 @pytest.mark.parametrize("mass_height", [(58.0, 1.62), (75.0, 1.75), (91.0, 1.93)])
@@ -48,36 +48,38 @@ def test_guides_are_certified_with_the_gaits_of_the_network(
 ) -> None:
     subject = Subject(Patient(*mass_height), *step)
     exoskeleton = ExoskeletonParameters().fitted(subject.patient)
-    gait = hung(load_network().gait(subject, ROBOT), exoskeleton, ROBOT)
+    gait = suspended_gait(load_network().gait(subject, ROBOT), exoskeleton, ROBOT)
     for shape in SHAPES.values():
-        certificate = HangController(ROBOT, gait, shape, HangConfig(feedforward=True), exoskeleton).certificate(0.5)
+        certificate = AirwalkController(ROBOT, gait, shape, AirwalkConfig(feedforward=True), exoskeleton).certificate(
+            0.5
+        )
         assert certificate.certified == (shape.name != "snap"), certificate.reason
 
 
-HANG = load_gait(HANG_GAIT, ROBOT)
-ANKLE_OFFSET = HangConfig().ankle_offset
+AIRWALK = load_gait(AIRWALK_GAIT, ROBOT)
+ANKLE_OFFSET = AirwalkConfig().ankle_offset
 
 
 def shifted(joint: str, angle: float) -> Gait:
     """The gait of the air with a joint of both legs turned by an angle [rad]."""
     rows = [JOINTS.index(f"{side}_{joint}") for side in ("left", "right")]
-    points = HANG.coefficients.copy()
+    points = AIRWALK.coefficients.copy()
     points[rows] += angle
-    return replace(HANG, coefficients=points)
+    return replace(AIRWALK, coefficients=points)
 
 
 def bent(points: tuple[int, ...], angle: float) -> Gait:
     """The gait of the air with control points of the left knee moved by an angle [rad]."""
-    moved = HANG.coefficients.copy()
+    moved = AIRWALK.coefficients.copy()
     moved[JOINTS.index("left_SK"), points] += angle
-    return replace(HANG, coefficients=moved)
+    return replace(AIRWALK, coefficients=moved)
 
 
 def pushed(torque: float) -> Gait:
     """The gait of the air with a constant feedforward of both henke ankles [Nm]."""
-    feedforward = np.zeros_like(HANG.coefficients)
+    feedforward = np.zeros_like(AIRWALK.coefficients)
     feedforward[[JOINTS.index("left_HA"), JOINTS.index("right_HA")]] = torque
-    return replace(HANG, feedforward=feedforward)
+    return replace(AIRWALK, feedforward=feedforward)
 
 
 def endless(gait: Gait) -> Gait:
@@ -91,47 +93,47 @@ def endless(gait: Gait) -> Gait:
     [
         (
             shifted("SK", 2.5),
-            r"gait 'hang': angle of joints\.\w+_SK must be 0 to 110\.01 deg, got 1\d\d\.\d+ deg at phase",
+            r"gait 'airwalk': angle of joints\.\w+_SK must be 0 to 110\.01 deg, got 1\d\d\.\d+ deg at phase",
         ),
         (bent((3, 4), 2.0), r"joints\.left_SK must be"),
         (bent((7,), 0.1), r"joints\.\w+_SK jumps by 0\.1 rad at the step change"),
-        (replace(HANG, coefficients=HANG.coefficients[:11]), r"gait 'hang': joints must be 64-bit floats of shape \(12, 8\)"),
-        (endless(HANG), r"joints\.left_SK must be finite, got nan"),
+        (replace(AIRWALK, coefficients=AIRWALK.coefficients[:11]), r"gait 'airwalk': joints must be 64-bit floats of shape \(12, 8\)"),
+        (endless(AIRWALK), r"joints\.left_SK must be finite, got nan"),
         (pushed(81.9), r"feedforward and gravity of joints\.\w+_HA must be -82 to 82 Nm"),
         (pushed(-81.9), r"feedforward and gravity of joints\.\w+_HA must be -82 to 82 Nm"),
-        (replace(HANG, duration=0.3), r"speed of joints\.left_SK must be -4 to 4 rad/s"),
+        (replace(AIRWALK, duration=0.3), r"speed of joints\.left_SK must be -4 to 4 rad/s"),
     ],
     ids=["86 degrees beyond", "between the ends", "jump", "shape", "nan", "torque", "torque backwards", "speed"],
 )  # fmt: skip
 def test_the_controller_takes_no_gait_that_is_beyond_a_limit(gait: Gait, said: str) -> None:
     with pytest.raises(GaitError, match=said):
-        HangController(ROBOT, gait, SHAPES["constant"])
+        AirwalkController(ROBOT, gait, SHAPES["constant"])
 
 
 def test_the_offset_of_the_ankles_counts() -> None:
     ankle = JOINTS.index("left_SA")
-    room = ROBOT.position_max[ankle] - HANG.tables().q[:, ankle].max()
+    room = ROBOT.position_max[ankle] - AIRWALK.tables().q[:, ankle].max()
     gait = shifted("SA", room - 0.5 * ANKLE_OFFSET)
     check_gait(gait, ROBOT)
     with pytest.raises(GaitError, match=r"angle of joints\.\w+_SA must be"):
-        HangController(ROBOT, gait, SHAPES["constant"])
-    HangController(ROBOT, gait, SHAPES["constant"], HangConfig(ankle_offset=0.4 * ANKLE_OFFSET))
+        AirwalkController(ROBOT, gait, SHAPES["constant"])
+    AirwalkController(ROBOT, gait, SHAPES["constant"], AirwalkConfig(ankle_offset=0.4 * ANKLE_OFFSET))
 
 
 def test_a_gait_without_feedforward_is_judged_by_the_torque_its_motion_asks_for() -> None:
     articulated = pinocchio_model(urdf(EXOSKELETON, ROBOT))
     gravity, hip = Gravity(articulated), JOINTS.index("left_TH")
-    tables = hung(HANG, EXOSKELETON, ROBOT).tables()
+    tables = suspended_gait(AIRWALK, EXOSKELETON, ROBOT).tables()
     still = np.array([gravity.torque(pose, (1.0, 0.0, 0.0, 0.0))[hip] for pose in tables.q.copy()])
     most_still, most_moving = np.abs(still).max(), np.abs(still + tables.uf[:, hip]).max()
     assert most_moving > 2.0 * most_still
     limits = ROBOT.torque_max.copy()
     limits[[hip, JOINTS.index("right_TH")]] = 0.5 * (most_still + most_moving)
     weak = replace(ROBOT, torque_max=limits)
-    assert HANG.feedforward is None
-    check_gait(HANG, weak)
+    assert AIRWALK.feedforward is None
+    check_gait(AIRWALK, weak)
     with pytest.raises(GaitError, match=r"feedforward and gravity of joints\.\w+_TH must be"):
-        check_hung(HANG, weak, articulated, gravity, 0.0)
+        check_hung(AIRWALK, weak, articulated, gravity, 0.0)
 
 
 def random_subjects(count: int) -> list[Subject]:
@@ -146,5 +148,5 @@ def test_200_gaits_of_the_network_are_accepted() -> None:
         exoskeleton = EXOSKELETON.fitted(subject.patient)
         articulated = pinocchio_model(urdf(exoskeleton, ROBOT))
         gait, gravity = network.gait(subject, ROBOT), Gravity(articulated)
-        for walked in (gait, hung(gait, exoskeleton, ROBOT)):
+        for walked in (gait, suspended_gait(gait, exoskeleton, ROBOT)):
             check_hung(walked, ROBOT, articulated, gravity, ANKLE_OFFSET)

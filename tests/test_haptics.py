@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from atalante_control.haptics import intensity, levels
+from atalante_control.joint.haptics import intensity, levels
 from atalante_hal.robot import MOTORS
 
 BOUND = math.radians(4.0)

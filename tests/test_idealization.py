@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from atalante_control.gait import HANG_GAIT, load_gait
-from atalante_control.idealization import AssistedInertia, Friction, law_of, merge
+from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
+from atalante_control.joint.idealization import AssistedInertia, Friction, law_of, merge
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import JOINTS, load_robot
 
 ROBOT = load_robot()
 URDF = urdf(ExoskeletonParameters(), ROBOT)
 MODEL = pinocchio_model(URDF)
-SWING = load_gait(HANG_GAIT, ROBOT).tables().q
+SWING = load_gait(AIRWALK_GAIT, ROBOT).tables().q
 HIP, KNEE = JOINTS.index("left_SH"), JOINTS.index("left_SK")
 
 

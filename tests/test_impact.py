@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from atalante_control.impact import ImpactConfig, ImpactDetector, step_over
+from atalante_control.gait.gait import step_over
+from atalante_control.walking.contact import ImpactConfig, ImpactDetector
 
 CONFIG = ImpactConfig(impact_force=80.0, release_force=30.0, debounce=5, earliest=0.5)
 

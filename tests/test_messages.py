@@ -14,7 +14,7 @@ import pytest
 from google.protobuf import descriptor_pb2
 
 import atalante_dbc
-from atalante_control.controller import HangController
+from atalante_control.airwalk.controller import AirwalkController
 from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.hal import Hal
 from atalante_hal.record_layout import Layout
@@ -31,7 +31,7 @@ NANOSECONDS = 1_000_000_000
 @pytest.fixture
 def layout(network: atalante_dbc.Network, robot: Robot) -> Layout:
     """What the HAL records with the guide running."""
-    return Hal(network, robot, lockstep_pair()[0], controller_fields=HangController.telemetry_fields).layout
+    return Hal(network, robot, lockstep_pair()[0], controller_fields=AirwalkController.telemetry_fields).layout
 
 
 @pytest.fixture
@@ -162,7 +162,7 @@ class TestStreams:
         fields = {field.name: list(field.value) for field in message.field}
         assert fields == {name: record[layout[f"controller.{name}"]].tolist() for name in fields}
         known = {"q_des", "error", "q_bound", "h", "lambda", "filter_active", "step", "phase", "stance"}
-        assert set(fields) == {name for name, _ in HangController.telemetry_fields} - known
+        assert set(fields) == {name for name, _ in AirwalkController.telemetry_fields} - known
 
     def test_another_controller_has_no_guide_but_all_its_fields(
         self, network: atalante_dbc.Network, robot: Robot

@@ -27,7 +27,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
         "atalante_dbc/atalante.dbc",
         "atalante_hal/robot.toml",
         "atalante_hal/telemetry/messages.binpb",
-        "atalante_control/gaits/hang.json",
+        "atalante_control/gaits/airwalk.json",
         "atalante_control/gaits/network.npz",
         "atalante_emulator/emulator.py",
         "atalante_tools/cli.py",
@@ -56,7 +56,7 @@ def test_hal_and_controller_run_without_pybullet_and_without_a_telemetry_library
         "import sys\n"
         "for name in ('pybullet', 'zenoh', 'mcap', 'google', 'matplotlib'): sys.modules[name] = None\n"
         "import atalante_hal.hal, atalante_hal.loop, atalante_hal.bus.socketcan, atalante_hal.telemetry.process\n"
-        "import atalante_control.controller, atalante_control.certificate\n"
+        "import atalante_control.airwalk.controller, atalante_control.guide.certificate\n"
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from atalante_control.pid import AIR_GAINS, LEFT, RIGHT, LegGains, Pid, PidGains
+from atalante_control.joint.pid import AIR_GAINS, LEFT, RIGHT, LegGains, Pid, PidGains
 
 RNG = np.random.default_rng(3)
 GAINS = PidGains()

@@ -1,4 +1,4 @@
-"""The programme of a step: its derivatives, what follows from a motion alone, and violations in physical units."""
+"""The program of a step: its derivatives, what follows from a motion alone, and violations in physical units."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ import math
 import numpy as np
 import pytest
 
-from atalante_control.generation.guess import guess
-from atalante_control.generation.problem import GRAVITY, KINDS, StepProblem
-from atalante_control.generation.programme import Functions
-from atalante_control.generation.rules import Rules
+from atalante_control.gait.subject import Subject
+from atalante_control.gait_optimization.guess import guess
+from atalante_control.gait_optimization.nlp import Functions
+from atalante_control.gait_optimization.requirements import Requirements
+from atalante_control.gait_optimization.step_problem import GRAVITY, KINDS, StepProblem
 from atalante_control.model import Patient
-from atalante_control.subject import Subject
 from atalante_hal.robot import JOINTS, load_robot
 
-ROBOT, RULES = load_robot(), Rules()
+ROBOT, REQUIREMENTS = load_robot(), Requirements()
 SUBJECT = Subject(Patient(75.0, 1.75), 0.16, 0.8)
 
 
 @pytest.fixture(scope="module")
 def problem() -> StepProblem:
-    return StepProblem("periodic", ROBOT, RULES)
+    return StepProblem("periodic", ROBOT, REQUIREMENTS)
 
 
 @pytest.fixture(scope="module")
 def functions(problem: StepProblem) -> Functions:
-    return problem.programme.functions()
+    return problem.program.functions()
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_derivatives_along_random_directions(
 ) -> None:
     random = np.random.default_rng(5)
     x, step = problem.unknowns(coefficients, parameters), 1e-6
-    lam = random.normal(size=len(problem.programme.lower))
+    lam = random.normal(size=len(problem.program.lower))
 
     def slope(at: np.ndarray) -> np.ndarray:
         jacobian = functions.jacobian(at, parameters)[1]
@@ -80,7 +80,7 @@ def test_torques_and_ground_forces_follow_from_the_motion(
         assert found[name] < 1e-9
     x = problem.unknowns(coefficients, parameters)
     np.testing.assert_array_equal(problem.coefficients(x), coefficients)
-    assert problem.torques(x).shape == (RULES.nodes, len(JOINTS))
+    assert problem.torques(x).shape == (REQUIREMENTS.nodes, len(JOINTS))
 
 
 def test_violations_are_in_physical_units(
@@ -96,7 +96,9 @@ def test_violations_are_in_physical_units(
     assert violations(problem, functions, place, parameters)["landing place"] > 0.02  # m, 0.1 rad on 0.43 m of shank
     backwards = coefficients.copy()
     backwards[JOINTS.index("right_SK")] = -0.5
-    assert violations(problem, functions, backwards, parameters)["joint limits"] == pytest.approx(RULES.knee_min + 0.5)
+    assert violations(problem, functions, backwards, parameters)["joint limits"] == pytest.approx(
+        REQUIREMENTS.knee_min + 0.5
+    )
 
 
 def test_bounds_are_the_robots_less_the_margins(problem: StepProblem) -> None:
@@ -105,7 +107,7 @@ def test_bounds_are_the_robots_less_the_margins(problem: StepProblem) -> None:
     others = [i for i in range(len(JOINTS)) if i not in knees]
     np.testing.assert_allclose(low[others], ROBOT.position_min[others] + math.radians(2.0))
     np.testing.assert_allclose(high, ROBOT.position_max - math.radians(2.0))
-    assert (low[knees] == RULES.knee_min).all()
+    assert (low[knees] == REQUIREMENTS.knee_min).all()
     lower, upper = problem.bounds(0.8)
     node = problem.node(3)
     np.testing.assert_allclose(upper[node[36:48]] * 100.0, 0.9 * ROBOT.torque_max)
@@ -115,8 +117,8 @@ def test_bounds_are_the_robots_less_the_margins(problem: StepProblem) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_group_has_a_unit_and_only_the_periodic_step_hits_the_ground(kind: str) -> None:
-    step = StepProblem(kind, ROBOT, RULES)
-    assert {group.name for group in step.programme.groups} <= set(step.units)
+    step = StepProblem(kind, ROBOT, REQUIREMENTS)
+    assert {group.name for group in step.program.groups} <= set(step.units)
     assert ("impact map" in step.units) == (kind == "periodic")
     assert ("rest" in step.units) == (kind != "periodic")
 
@@ -125,6 +127,6 @@ def test_standing_still_carries_the_weight(problem: StepProblem, parameters: np.
     still = np.zeros((len(JOINTS), 8))
     still[[3, 9]] = 0.3
     x = problem.unknowns(still, parameters)
-    forces = np.array([x[problem.node(n)][48:51] for n in range(RULES.nodes)]) * 1500.0
+    forces = np.array([x[problem.node(n)][48:51] for n in range(REQUIREMENTS.nodes)]) * 1500.0
     np.testing.assert_allclose(forces[:, 2], (82.0 + 75.0) * GRAVITY, rtol=0.01)
     np.testing.assert_allclose(forces[:, :2], 0.0, atol=1e-9)

@@ -1,4 +1,4 @@
-"""The sparse programme: its derivatives against finite differences, its rows against what was asked for."""
+"""The sparse program: its derivatives against finite differences, its rows against what was asked for."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import casadi
 import numpy as np
 import pytest
 
-from atalante_control.generation.programme import NAMES, Functions, Programme, Rows
+from atalante_control.gait_optimization.nlp import NAMES, Functions, NonlinearProgram, Rows
 
 P = np.array([1.3, 0.7])
 X = np.array([0.2, -0.4, 0.9, 1.1, -0.8])
@@ -14,9 +14,9 @@ PLACES = [np.array([0, 2]), np.array([2, 1]), np.array([4, 3])]  # unknown 2 is 
 
 
 @pytest.fixture(scope="module")
-def programme() -> Programme:
+def program() -> NonlinearProgram:
     p = casadi.SX.sym("p", 2)
-    built = Programme(5, p)
+    built = NonlinearProgram(5, p)
     built.add_linear("sum", "m", np.array([[1.0, 0.0, 2.0, 0.0, 0.0]]), np.array([3.0]))
     x = casadi.SX.sym("x", 2)
     circle = Rows("circle", "m2", 4.0, casadi.sumsqr(x) * p[0], np.array([-np.inf]), np.array([[1.0], [2.0], [3.0]]))
@@ -27,8 +27,8 @@ def programme() -> Programme:
 
 
 @pytest.fixture(scope="module")
-def functions(programme: Programme) -> Functions:
-    return programme.functions()
+def functions(program: NonlinearProgram) -> Functions:
+    return program.functions()
 
 
 def slopes(function: object, count: int) -> np.ndarray:
@@ -43,7 +43,7 @@ def slopes(function: object, count: int) -> np.ndarray:
     return np.array(columns).T
 
 
-def test_values(programme: Programme, functions: Functions) -> None:
+def test_values(program: NonlinearProgram, functions: Functions) -> None:
     expected = [X[0] + 2.0 * X[2]]
     for a, b in PLACES:
         expected += [(X[a] ** 2 + X[b] ** 2) * P[0] / 4.0, X[a] * X[b] ** 2 / 2.0, np.sin(X[a]) / 2.0]
@@ -52,8 +52,8 @@ def test_values(programme: Programme, functions: Functions) -> None:
     assert float(functions.objective(X, P)) == pytest.approx(objective, rel=1e-14)
 
 
-def test_derivatives(programme: Programme, functions: Functions) -> None:
-    rows = len(programme.lower)
+def test_derivatives(program: NonlinearProgram, functions: Functions) -> None:
+    rows = len(program.lower)
     gradient = np.array(functions.gradient(X, P)[1]).ravel()
     np.testing.assert_allclose(gradient, slopes(lambda x: functions.objective(x, P), 5)[0], atol=1e-8)
     jacobian = np.array(functions.jacobian(X, P)[1])
@@ -69,17 +69,17 @@ def test_derivatives(programme: Programme, functions: Functions) -> None:
     np.testing.assert_allclose(upper + np.triu(upper, 1).T, slopes(lagrangian_slope, 5), atol=1e-7)
 
 
-def test_bounds_are_over_the_groups_size_and_may_change_from_place_to_place(programme: Programme) -> None:
-    circle = next(group for group in programme.groups if group.name == "circle")
-    assert programme.upper[circle.rows].tolist() == [0.25, 0.5, 0.75]
-    product = next(group for group in programme.groups if group.name == "product")
-    assert programme.upper[product.rows].tolist() == [0.5] * 6
-    assert programme.lower[0] == programme.upper[0] == 3.0
+def test_bounds_are_over_the_groups_size_and_may_change_from_place_to_place(program: NonlinearProgram) -> None:
+    circle = next(group for group in program.groups if group.name == "circle")
+    assert program.upper[circle.rows].tolist() == [0.25, 0.5, 0.75]
+    product = next(group for group in program.groups if group.name == "product")
+    assert program.upper[product.rows].tolist() == [0.5] * 6
+    assert program.lower[0] == program.upper[0] == 3.0
 
 
-def test_every_row_is_in_one_group(programme: Programme) -> None:
-    rows = np.concatenate([group.rows for group in programme.groups])
-    assert sorted(rows.tolist()) == list(range(len(programme.lower)))
+def test_every_row_is_in_one_group(program: NonlinearProgram) -> None:
+    rows = np.concatenate([group.rows for group in program.groups])
+    assert sorted(rows.tolist()) == list(range(len(program.lower)))
 
 
 def test_functions_are_named_as_the_solver_calls_them(functions: Functions) -> None:

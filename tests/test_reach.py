@@ -6,16 +6,16 @@ from itertools import product
 
 import pytest
 
-from atalante_control.generation.problem import StepProblem
-from atalante_control.generation.reach import Reach
-from atalante_control.generation.rules import Rules
+from atalante_control.gait_optimization.reach import Reach
+from atalante_control.gait_optimization.requirements import Requirements
+from atalante_control.gait_optimization.step_problem import StepProblem
 from atalante_control.model import Patient
 from atalante_hal.robot import load_robot
 
 
 @pytest.fixture(scope="module")
 def problem() -> StepProblem:
-    return StepProblem("periodic", load_robot(), Rules())
+    return StepProblem("periodic", load_robot(), Requirements())
 
 
 @pytest.fixture(scope="module")

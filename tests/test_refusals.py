@@ -20,11 +20,11 @@ from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-import atalante_control.gait
+import atalante_control.gait.gait
 import atalante_dbc.loader
 import atalante_hal.robot
-from atalante_control.gait import HANG_GAIT, GaitError, check_gait, load_gait
-from atalante_control.generation.library import Library, LibraryError
+from atalante_control.gait.gait import AIRWALK_GAIT, GaitError, check_gait, load_gait
+from atalante_control.gait_optimization.library import Library, LibraryError
 from atalante_dbc import DBC_FILE, DbcError
 from atalante_hal.robot import JOINTS, LEG_JOINTS, ROBOT_FILE, RobotError, load_robot
 from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
@@ -33,7 +33,7 @@ from atalante_tools.validate.project import ProjectError, load_project
 
 ROBOT = tomllib.loads(ROBOT_FILE.read_text())
 KEYS = tuple(ROBOT["joints"]["FH"])
-GAIT = json.loads(HANG_GAIT.read_text())
+GAIT = json.loads(AIRWALK_GAIT.read_text())
 #: No number of any robot or gait.
 NONSENSE = st.sampled_from(
     [math.nan, math.inf, -math.inf, 1e300, -1e300, 10**400, True, False, "4 rad/s", "", [], [[1.0, 2.0]], {}, {"a": 1}]
@@ -143,7 +143,7 @@ FIELDS: list[tuple[str | int, ...]] = [
 
 
 def gait_with(path: Path, field: tuple[str | int, ...], value: Any) -> Path:
-    document = json.loads(HANG_GAIT.read_text())
+    document = json.loads(AIRWALK_GAIT.read_text())
     *parents, last = field
     place = document
     for parent in parents:
@@ -200,7 +200,7 @@ class TestF55GaitInvalid:
 
     def test_f55_a_key_given_twice(self, tmp_path: Path) -> None:
         path = tmp_path / "gait.json"
-        path.write_text(HANG_GAIT.read_text().replace("{", '{"duration": 0.8, ', 1))
+        path.write_text(AIRWALK_GAIT.read_text().replace("{", '{"duration": 0.8, ', 1))
         assert "duration is there twice" in gait_refusal_of(path)
 
     @anywhere
@@ -257,7 +257,14 @@ def test_f52_a_mutated_dbc_is_refused_in_sentences_or_is_a_network_like_any_othe
     [
         (atalante_dbc.loader, "DBC_FILE", DBC_FILE, "(0.0125,0)", "(0,0)", "DBC_INVALID: "),
         (atalante_hal.robot, "ROBOT_FILE", ROBOT_FILE, "torque_max = 350.0", "torque_max = -350.0", "CONFIG_INVALID: "),
-        (atalante_control.gait, "HANG_GAIT", HANG_GAIT, '"duration": 0.8', '"duration": 8', "GAIT_INVALID: "),
+        (
+            atalante_control.gait.gait,
+            "AIRWALK_GAIT",
+            AIRWALK_GAIT,
+            '"duration": 0.8',
+            '"duration": 8',
+            "GAIT_INVALID: ",
+        ),
     ],
     ids=["f52", "f54", "f55"],
 )
@@ -297,5 +304,5 @@ def test_a_file_that_cannot_be_read_is_named_with_the_reason(
 
 
 def test_the_gait_that_is_shipped_is_checked_without_its_file() -> None:
-    gait = load_gait(HANG_GAIT, load_robot())
+    gait = load_gait(AIRWALK_GAIT, load_robot())
     check_gait(gait, load_robot())

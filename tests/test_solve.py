@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from atalante_control.gait import SIGN, SWAP, Gait, check_gait, load_gait, motion, write_gait
-from atalante_control.generation.problem import TRANSITION, Kind
-from atalante_control.generation.rules import Rules
-from atalante_control.generation.solve import RESIDUAL, code_version, solve
-from atalante_control.generation.solved import SOLVED, SolvedGait
+from atalante_control.gait.gait import SIGN, SWAP, Gait, check_gait, load_gait, motion, write_gait
+from atalante_control.gait.subject import Subject
+from atalante_control.gait_optimization.requirements import Requirements
+from atalante_control.gait_optimization.result import SOLVED, SolvedGait
+from atalante_control.gait_optimization.solve import RESIDUAL, code_version, solve
+from atalante_control.gait_optimization.step_problem import TRANSITION, Kind
 from atalante_control.model import Patient
-from atalante_control.subject import Subject
 from atalante_hal.robot import JOINTS, load_robot
 
 SUBJECT = Subject(Patient(75.0, 1.75), 0.16, 0.8)
@@ -83,7 +83,7 @@ def test_steps_from_and_to_rest_join_the_gait(solved: SolvedGait, kind: Kind) ->
 def test_the_next_step_is_the_mirrored_one(solved: SolvedGait) -> None:
     q, qd, _ = motion(solved.gait.coefficients, solved.gait.duration, np.array([0.0, 1.0]))
     np.testing.assert_allclose(q[1], SIGN * q[0][SWAP], atol=1e-9)
-    np.testing.assert_allclose(qd[1], SIGN * qd[0][SWAP], atol=Rules().impact_jump + 1e-9)
+    np.testing.assert_allclose(qd[1], SIGN * qd[0][SWAP], atol=Requirements().impact_jump + 1e-9)
 
 
 def test_what_is_out_of_reach_is_said_at_once() -> None:

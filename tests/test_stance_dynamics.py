@@ -4,10 +4,10 @@ import numpy as np
 import pinocchio
 import pytest
 
-from atalante_control.gait import HANG_GAIT, bezier, load_gait, motion
-from atalante_control.gravity import Gravity
+from atalante_control.dynamics.gravity import Gravity
+from atalante_control.dynamics.stance import STANCE_FOOT, StanceDynamics, stance_dynamics
+from atalante_control.gait.gait import AIRWALK_GAIT, bezier, load_gait, motion
 from atalante_control.model import ExoskeletonParameters, Patient, pinocchio_model, urdf
-from atalante_control.stance_dynamics import STANCE_FOOT, StanceDynamics, stance_dynamics
 from atalante_hal.robot import load_robot
 
 ROBOT = load_robot()
@@ -78,7 +78,7 @@ def test_at_rest_the_ground_carries_the_weight_under_the_centre_of_mass() -> Non
 
 
 def test_feedforward_and_gravity_of_the_hanging_exoskeleton_are_the_torque_that_walks() -> None:
-    gait = load_gait(HANG_GAIT, ROBOT)
+    gait = load_gait(AIRWALK_GAIT, ROBOT)
     slow = 3.0  # s: drawn by hand for the air, it would ask too much of the ground in its own time
     phase = np.linspace(0.0, 1.0, 41)
     q, qd, qdd = motion(gait.coefficients, slow, phase)
@@ -94,14 +94,14 @@ def test_feedforward_and_gravity_of_the_hanging_exoskeleton_are_the_torque_that_
 
 def test_the_swing_leg_of_an_empty_exoskeleton_needs_no_feedforward_at_rest() -> None:
     """Its weight is the same, standing on the other foot or hanging from the pelvis: u_g is all of it."""
-    q = load_gait(HANG_GAIT, ROBOT).tables().q[300]
+    q = load_gait(AIRWALK_GAIT, ROBOT).tables().q[300]
     feedforward = stance_dynamics(ROBOT).feedforward(np.repeat(q[:, None], 8, axis=1), 1.0)
     assert np.abs(feedforward[:6]).max() < 1e-9
     assert np.abs(feedforward[6:]).max() > 10.0
 
 
 def test_a_heavier_patient_asks_for_more() -> None:
-    q = load_gait(HANG_GAIT, ROBOT).tables().q[400]
+    q = load_gait(AIRWALK_GAIT, ROBOT).tables().q[400]
     forces = [
         stance_dynamics(ROBOT, patient).forces(q, np.zeros(12), np.zeros(12)).force[2]
         for patient in (None, Patient(58.0, 1.75), Patient(91.0, 1.75))

@@ -7,15 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from atalante_control.backup import BackupPolicy
-from atalante_control.deadbeat import Deadbeat
-from atalante_control.gait import HANG_GAIT, load_gait
-from atalante_control.guide import GuideConfig, GuideFilter
-from atalante_control.guide_shapes import CONSTANT
+from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
+from atalante_control.gait.recentering import Deadbeat
+from atalante_control.guide.backup_policy import BackupPolicy
+from atalante_control.guide.filter import GuideConfig, GuideFilter
+from atalante_control.guide.shapes import CONSTANT
 from atalante_control.stepped import SteppedRollouts
 from atalante_hal.robot import load_robot
 
-GAIT = load_gait(HANG_GAIT, load_robot())
+GAIT = load_gait(AIRWALK_GAIT, load_robot())
 CONFIG = GuideConfig(
     (BackupPolicy(6300.0, 473.0, 8.0), BackupPolicy(3600.0, 173.0, 1.9)), ((-30.0, 10.0), (-20.0, 20.0))
 )

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
+from atalante_control.gait.subject import Subject
 from atalante_control.model import Patient
-from atalante_control.subject import Subject
 
 PATIENT = Patient(75.0, 1.75, thigh_length=0.44)
 

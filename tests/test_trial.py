@@ -1,4 +1,4 @@
-"""`atalante demo` and `hang`: what scripts may rely on, and the promises of the paper's first experiment."""
+"""`atalante demo` and `airwalk`: what scripts may rely on, and the promises of the paper's first experiment."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ import pytest
 from click.testing import CliRunner
 from mcap.reader import make_reader
 
-from atalante_control import gait_network
-from atalante_control.controller import HangConfig, HangController
-from atalante_control.gait import HANG_GAIT, load_gait
-from atalante_control.gait_network import load_network, save_network
-from atalante_control.guide_shapes import SHAPES
+from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
+from atalante_control.dynamics import gait_network
+from atalante_control.dynamics.gait_network import load_network, save_network
+from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
+from atalante_control.guide.shapes import SHAPES
 from atalante_emulator.body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
@@ -90,7 +90,7 @@ def test_stdout_is_one_object_a_shape_and_one_of_the_recording(demo):
         assert 0 <= result["inside"] <= 1
         assert 0 <= result["filter_active"] <= 1
     bound = (
-        HangController(load_robot(), load_gait(HANG_GAIT, load_robot()), SHAPES["pinched"])
+        AirwalkController(load_robot(), load_gait(AIRWALK_GAIT, load_robot()), SHAPES["pinched"])
         .certificate(0.5)
         .joint_torque
     )
@@ -118,7 +118,7 @@ def test_an_uncertified_guide_is_announced_before_the_run(demo):
 @pytest.mark.parametrize(("factors", "certified"), [({0.5}, True), ({0.5, 0.9}, True), ({0.5, 0.95}, False)])
 def test_a_run_promises_the_least_of_all_factors_walked(factors: set[float], certified: bool):
     robot = load_robot()
-    controller = HangController(robot, load_gait(HANG_GAIT, robot), SHAPES["constant"])
+    controller = AirwalkController(robot, load_gait(AIRWALK_GAIT, robot), SHAPES["constant"])
     promise = trial._promise(trial._weakest(controller, factors))
     assert promise["certified"] == certified
     bound = controller.certificate(0.5).joint_torque  # the wider the guide, the worse the worst pose
@@ -188,7 +188,7 @@ class CommandFrames:
         pass
 
 
-class Baseline(HangController):
+class Baseline(AirwalkController):
     """The same controller without the assistance; its guide says nothing that could be merged."""
 
     def _change_step(self, state: State, stance: int) -> None:
@@ -199,11 +199,11 @@ class Baseline(HangController):
 @pytest.mark.parametrize(("xi", "equal"), [(1.0, True), (0.99, False)])
 def test_at_full_assistance_the_command_frames_are_the_baselines_to_the_last_bit(network, robot, urdf_text, xi, equal):
     sent = []
-    for kind in (HangController, Baseline):
+    for kind in (AirwalkController, Baseline):
         ours, theirs = lockstep_pair()
         body = PyBulletBody(urdf_text)
         ours.step = Emulator(network, robot, body, theirs, operator=Operator(xi)).poll
-        controller = kind(robot, load_gait(HANG_GAIT, robot), SHAPES["constant"], HangConfig(startup=0.3))
+        controller = kind(robot, load_gait(AIRWALK_GAIT, robot), SHAPES["constant"], AirwalkConfig(startup=0.3))
         tap = CommandFrames()
         hal = Hal(network, robot, ours, controller_fields=controller.telemetry_fields, tap=tap)
         run(hal, controller, LockStep(), until=lambda state: state.cycle >= 2300)
@@ -336,14 +336,14 @@ def test_every_event_is_recorded_of_a_hal_that_keeps_one(tmp_path: Path, monkeyp
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_in_hold_with_its_code_and_keeps_what_was_walked(number, code, tmp_path: Path):
     command = [ATALANTE, "hang", "--steps", "1000", "--out", str(tmp_path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as hang:
-        assert hang.stderr is not None
-        for line in hang.stderr:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as airwalk:
+        assert airwalk.stderr is not None
+        for line in airwalk.stderr:
             if "ACTIVE" in line:
                 break
-        hang.send_signal(number)
-        _, said = hang.communicate(timeout=60)
-    assert hang.returncode == code, said
+        airwalk.send_signal(number)
+        _, said = airwalk.communicate(timeout=60)
+    assert airwalk.returncode == code, said
     assert "HOLD" in said
     with (tmp_path / "recording.mcap").open("rb") as file:
         states = [

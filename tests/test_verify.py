@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from atalante_control.gait import Gait, motion
-from atalante_control.generation.problem import KINDS, Kind, StepProblem
-from atalante_control.generation.rules import Rules
-from atalante_control.generation.solve import solve
-from atalante_control.generation.verify import Verifier
+from atalante_control.dynamics.stance import stance_dynamics
+from atalante_control.gait.gait import Gait, motion
+from atalante_control.gait.subject import Subject
+from atalante_control.gait_optimization.requirements import Requirements
+from atalante_control.gait_optimization.solve import solve
+from atalante_control.gait_optimization.step_problem import KINDS, Kind, StepProblem
+from atalante_control.gait_optimization.verify import Verifier
 from atalante_control.model import Patient
-from atalante_control.stance_dynamics import stance_dynamics
-from atalante_control.subject import Subject
 from atalante_hal.robot import load_robot
 
 ROBOT = load_robot()
@@ -38,7 +38,7 @@ def test_solved_steps_hold(verifier: Verifier, kind: Kind) -> None:
 
 
 def test_torques_at_the_nodes_are_the_optimisers(verifier: Verifier, gait: Gait) -> None:
-    problem = StepProblem("periodic", ROBOT, Rules())
+    problem = StepProblem("periodic", ROBOT, Requirements())
     parameters = problem.parameters(SUBJECT.patient, SUBJECT.step_duration, SUBJECT.step_length)
     torques = problem.torques(problem.unknowns(gait.coefficients, parameters))
     states = zip(*motion(gait.coefficients, gait.duration, problem.phases), strict=True)

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from atalante_control.gait import PERIOD
-from atalante_control.guide import GuideFilter
+from atalante_control.gait.gait import PERIOD
+from atalante_control.guide.filter import GuideFilter
 
 Vector = npt.NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from atalante_control.controller import HangConfig, HangController
-from atalante_control.gait import HANG_GAIT, load_gait
-from atalante_control.guide_shapes import SHAPES
+from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
+from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
+from atalante_control.guide.shapes import SHAPES
 from atalante_dbc import Network
 from atalante_emulator.body import PyBulletBody
 from atalante_emulator.emulator import Emulator
@@ -30,7 +30,7 @@ from atalante_hal.wire.cia402 import DriveState
 
 S = SupervisorState
 #: A short way to the first pose: what these tests want is the steps.
-CONFIG = HangConfig(startup=0.5)
+CONFIG = AirwalkConfig(startup=0.5)
 
 
 class ClosedLoop:
@@ -47,7 +47,7 @@ class ClosedLoop:
 
     @pytest.fixture
     def walked(self, bus: Bus, network: Network, robot: Robot) -> Any:
-        controller = HangController(robot, load_gait(HANG_GAIT, robot), SHAPES["constant"], CONFIG)
+        controller = AirwalkController(robot, load_gait(AIRWALK_GAIT, robot), SHAPES["constant"], CONFIG)
         hal = Hal(network, robot, bus, patience=self.patience, controller_fields=controller.telemetry_fields)
         records: list[np.ndarray] = []
         cycles = round((CONFIG.startup + self.until_phase * 0.8) * 1000)

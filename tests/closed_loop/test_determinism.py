@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from atalante_control.controller import HangConfig, HangController
-from atalante_control.gait import HANG_GAIT, load_gait
-from atalante_control.guide_shapes import SHAPES
+from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
+from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
+from atalante_control.guide.shapes import SHAPES
 from atalante_emulator.faults import Fault
 from atalante_hal.wire.frame import Frames
 from atalante_tools.embedded import EmbeddedRobot
@@ -35,7 +35,9 @@ class Log:
 @pytest.fixture
 def log_of(network, robot):
     def walk(seed: int, cycles: int = 1500, apart: EmbeddedRobot | None = None) -> bytes:
-        controller = HangController(robot, load_gait(HANG_GAIT, robot), SHAPES["pinched"], HangConfig(startup=0.3))
+        controller = AirwalkController(
+            robot, load_gait(AIRWALK_GAIT, robot), SHAPES["pinched"], AirwalkConfig(startup=0.3)
+        )
         log = Log()
         fields = controller.telemetry_fields
         faults = [

@@ -24,7 +24,7 @@ CORE = {
     ),
     "limiter": (("atalante_hal/safety/limiter.py",), ("test_limiter.py",)),
     "guide": (
-        ("atalante_control/guide.py", "atalante_control/guide_kernel.py"),
+        ("atalante_control/guide/filter.py", "atalante_control/guide/kernel.py"),
         ("test_guide.py", "test_guide_kernel.py"),
     ),
     "drive": (

@@ -40,16 +40,16 @@ from atalante_hal.wire.cia402 import DriveState
 DRIVER = """
 import json, mmap, os, signal, sys, time
 import atalante_dbc
-from atalante_control.controller import HangController
-from atalante_control.gait import HANG_GAIT, load_gait
-from atalante_control.guide_shapes import SHAPES
+from atalante_control.airwalk.controller import AirwalkController
+from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
+from atalante_control.guide.shapes import SHAPES
 from atalante_hal.bus.shared import SharedBus
 from atalante_hal.hal import Hal
 from atalante_hal.loop import LockStep, WallClock, run
 from atalante_hal.robot import load_robot
 
 network, robot = atalante_dbc.load(), load_robot()
-controller = HangController(robot, load_gait(HANG_GAIT, robot), SHAPES["constant"])
+controller = AirwalkController(robot, load_gait(AIRWALK_GAIT, robot), SHAPES["constant"])
 signal.signal(signal.SIGCHLD, signal.SIG_IGN)
 wall = None if sys.argv[1] == "-1" else memoryview(mmap.mmap(int(sys.argv[1]), 8)).cast("d")
 

@@ -26,6 +26,6 @@ def command(shape: tuple[str, ...], options: Options, as_json: bool) -> None:
     Example: atalante demo
              atalante demo --shape pinched --xi 0.25 --steps 5 --can-log demo.log
     """
-    from atalante_control.guide_shapes import SHAPES
+    from atalante_control.guide.shapes import SHAPES
 
     run_trial(Target(EMBEDDED, "", lockstep=True), shape or tuple(SHAPES), options, as_json=as_json)

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import click
 
 if TYPE_CHECKING:
+    from atalante_control.gait.subject import Subject
     from atalante_control.model import Patient
-    from atalante_control.subject import Subject
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -150,7 +150,7 @@ def _subject(patient: Patient | None, step_length: float | None, step_duration: 
         if step_length is not None or step_duration is not None:
             raise click.UsageError("a step of one's own needs a patient: --mass and --height")
         return None
-    from atalante_control.subject import Subject
+    from atalante_control.gait.subject import Subject
 
     default_length, default_duration = DEFAULT_STEP
     try:

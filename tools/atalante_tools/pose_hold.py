@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from atalante_control.gravity import Gravity
+from atalante_control.dynamics.gravity import Gravity
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.hal import PERIOD
 from atalante_hal.robot import IMUS, JOINTS, MOTORS, Robot, Vector

@@ -25,12 +25,12 @@ from atalante_tools.signals import stop_requested
 from atalante_tools.terminal import say, show_json
 
 if TYPE_CHECKING:
-    from atalante_control.certificate import Certificate
-    from atalante_control.controller import HangController
-    from atalante_control.gait import Gait
-    from atalante_control.guide_shapes import GuideShape
+    from atalante_control.airwalk.controller import AirwalkController
+    from atalante_control.gait.gait import Gait
+    from atalante_control.gait.subject import Subject
+    from atalante_control.guide.certificate import Certificate
+    from atalante_control.guide.shapes import GuideShape
     from atalante_control.model import ExoskeletonParameters
-    from atalante_control.subject import Subject
     from atalante_dbc import Network
     from atalante_hal.hal import Hal
     from atalante_hal.loop import Statistics
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from atalante_tools.rig import Rig
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
-#: Those of `guide_shapes.SHAPES`, for help that imports no controller.
+#: Those of `shapes.SHAPES`, for help that imports no controller.
 SHAPE_NAMES = "constant, widening, narrowing, pinched, asymmetric, snap"
 #: Cycles between two looks at the telemetry process.
 _TEND_CYCLES = 250
@@ -105,7 +105,7 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
         Failed: the steps were done and the recording is not complete.
         SystemExit: a signal ended it.
     """
-    from atalante_control.guide_shapes import SHAPES
+    from atalante_control.guide.shapes import SHAPES
     from atalante_hal.telemetry.access import load_telemetry_file
 
     names = tuple(SHAPES)
@@ -205,7 +205,7 @@ class _Walk:
     def __init__(
         self,
         rig: Rig,
-        controller: HangController,
+        controller: AirwalkController,
         telemetry: TelemetryProcess,
         report_endpoint: _EndpointReport,
         name: str,
@@ -263,22 +263,22 @@ class _Walk:
 
 def _controllers(
     subject: Subject | None, robot: Robot, shapes: Mapping[str, GuideShape]
-) -> tuple[ExoskeletonParameters, Gait, dict[str, HangController]]:
+) -> tuple[ExoskeletonParameters, Gait, dict[str, AirwalkController]]:
     """The exoskeleton adjusted to the subject, his gait, and a controller of each shape that walks it in the air."""
-    from atalante_control.controller import HangConfig, HangController
-    from atalante_control.gait import HANG_GAIT, load_gait
-    from atalante_control.gait_network import load_network
-    from atalante_control.hanging import hung
+    from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
+    from atalante_control.dynamics.gait_network import load_network
+    from atalante_control.dynamics.suspended import suspended_gait
+    from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
     from atalante_control.model import ExoskeletonParameters
 
     exoskeleton = ExoskeletonParameters()
     if subject is None:
-        gait, config = load_gait(HANG_GAIT, robot), HangConfig()
+        gait, config = load_gait(AIRWALK_GAIT, robot), AirwalkConfig()
     else:
         exoskeleton = exoskeleton.fitted(subject.patient)
-        gait = hung(load_network().gait(subject, robot), exoskeleton, robot)
-        config = HangConfig(feedforward=True)
-    made = {name: HangController(robot, gait, shape, config, exoskeleton) for name, shape in shapes.items()}
+        gait = suspended_gait(load_network().gait(subject, robot), exoskeleton, robot)
+        config = AirwalkConfig(feedforward=True)
+    made = {name: AirwalkController(robot, gait, shape, config, exoskeleton) for name, shape in shapes.items()}
     if subject is not None:  # the gait was accepted
         say(f"gait of the network: {subject}; nobody is in the exoskeleton")
     return exoskeleton, gait, made
@@ -312,7 +312,7 @@ def _promise(certificate: Certificate) -> dict[str, Any]:
     }
 
 
-def _weakest(controller: HangController, factors: Iterable[float]) -> Certificate:
+def _weakest(controller: AirwalkController, factors: Iterable[float]) -> Certificate:
     """Return the certificate that promises least of those at the assistance factors."""
     certificates = [controller.certificate(xi) for xi in factors]
     return min(certificates, key=lambda c: -1.0 if c.joint_torque is None else c.joint_torque.hip)
@@ -335,7 +335,7 @@ def _open(
     options: Options,
     network: Network,
     robot: Robot,
-    controller: HangController,
+    controller: AirwalkController,
     gait_hash: int,
     apart: EmbeddedRobot | None,
     exoskeleton: ExoskeletonParameters,
@@ -418,7 +418,7 @@ def _close(telemetry: TelemetryProcess, walked: Walked) -> None:
         say("the telemetry process has died: the recording may end early")
 
 
-def _result(certificate: Certificate, controller: HangController, hal: Hal, statistics: Statistics) -> Result:
+def _result(certificate: Certificate, controller: AirwalkController, hal: Hal, statistics: Statistics) -> Result:
     walked = controller.statistics
     return Result(
         shape=certificate.shape,

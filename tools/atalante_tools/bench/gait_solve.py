@@ -8,9 +8,9 @@ from functools import cache
 from itertools import cycle, islice
 from typing import Final
 
-from atalante_control.gait import Gait
+from atalante_control.gait.gait import Gait
+from atalante_control.gait.subject import Subject
 from atalante_control.model import Patient
-from atalante_control.subject import Subject
 from atalante_tools.bench.measure import Effort, Measurement, require
 
 #: What a gait may take on a core, and what it should [s].
@@ -38,15 +38,15 @@ def gait_solve_warm(effort: Effort) -> Measurement:
 
 @cache
 def _centre() -> Gait:
-    """The neighbour of all subjects; once it is solved, the programme is built."""
-    from atalante_control.generation.solve import solve
+    """The neighbour of all subjects; once it is solved, the program is built."""
+    from atalante_control.gait_optimization.solve import solve
 
     return solve(_CENTRE).gait
 
 
 def _solved(effort: Effort, neighbour: Gait | None) -> float:
-    """Median processor time of a solve [s], the programme being built; compiled, unless it has to be quick."""
-    from atalante_control.generation.solve import solve
+    """Median processor time of a solve [s], the program being built; compiled, unless it has to be quick."""
+    from atalante_control.gait_optimization.solve import solve
 
     if effort.quick:
         _centre()

@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 import pinocchio
 
-from atalante_control.gait_network import load_network
+from atalante_control.dynamics.gait_network import load_network
+from atalante_control.dynamics.stance import stance_dynamics
 from atalante_control.model import ExoskeletonParameters, Patient, pinocchio_model, urdf
-from atalante_control.stance_dynamics import stance_dynamics
 from atalante_hal.robot import load_robot
 from atalante_tools.bench.measure import Effort, Measurement, require, timed
 
@@ -77,10 +77,10 @@ def library_two_processes(effort: Effort) -> Measurement:
 
 
 def _library(effort: Effort, jobs: int) -> Measurement:
-    """The fan-out of a library, from when every process has built its programme and made a gait, to the last gait."""
-    from atalante_control.fan_out import fan_out
-    from atalante_control.generation.deviation import random_subjects
-    from atalante_control.generation.library import solve_subject
+    """The fan-out of a library, from when every process has built its program and made a gait, to the last gait."""
+    from atalante_control.gait_optimization.library import solve_subject
+    from atalante_control.gait_optimization.network_error import random_subjects
+    from atalante_control.gait_optimization.parallel import fan_out
 
     count = (1 if effort.quick else 12) * jobs
     network = load_network()

@@ -12,8 +12,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from atalante_control.controller import HangController
-from atalante_control.guide_shapes import CONSTANT
+from atalante_control.airwalk.controller import AirwalkController
+from atalante_control.guide.shapes import CONSTANT
 from atalante_control.stepped import SteppedRollouts
 from atalante_hal.hal import PERIOD
 from atalante_hal.telemetry.ring import RingWriter
@@ -109,7 +109,7 @@ class _Stack:
     """Everything in the air, as `atalante demo` runs it."""
 
     rig: Rig
-    controller: HangController
+    controller: AirwalkController
     ring: RingWriter
     blocks: list[float] = field(default_factory=list)  # s, wall time of each block of walking
 
@@ -158,7 +158,7 @@ class _Stack:
 def _stack(apart: EmbeddedRobot | None) -> Iterator[_Stack]:
     """With the robot in a process of its own, or in this one."""
     walking = walk()
-    controller = HangController(walking.robot, walking.gait, CONSTANT)
+    controller = AirwalkController(walking.robot, walking.gait, CONSTANT)
     with (
         open_hal(
             Target(EMBEDDED, "", lockstep=True),

@@ -16,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 import atalante_dbc
-from atalante_control.controller import HangController
-from atalante_control.gait import HANG_GAIT, Gait, StepTables, load_gait
-from atalante_control.guide import GuideFilter
-from atalante_control.guide_shapes import CONSTANT
+from atalante_control.airwalk.controller import AirwalkController
+from atalante_control.gait.gait import AIRWALK_GAIT, Gait, StepTables, load_gait
+from atalante_control.guide.filter import GuideFilter
+from atalante_control.guide.shapes import CONSTANT
 from atalante_dbc import Message, Network
 from atalante_hal.bus import Stamps
 from atalante_hal.hal import Hal
@@ -60,8 +60,8 @@ class Walk:
 def walk() -> Walk:
     """The gait of the demo and its guide filter."""
     network, robot = atalante_dbc.load(), load_robot()
-    gait = load_gait(HANG_GAIT, robot)
-    return Walk(network, robot, gait, gait.tables(), HangController(robot, gait, CONSTANT).guide_at(ASSISTANCE))
+    gait = load_gait(AIRWALK_GAIT, robot)
+    return Walk(network, robot, gait, gait.tables(), AirwalkController(robot, gait, CONSTANT).guide_at(ASSISTANCE))
 
 
 def cyclic_messages(network: Network) -> list[Message]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from atalante_control.fan_out import FanOutError, fan_out
+from atalante_control.gait_optimization.parallel import FanOutError, fan_out
 from atalante_tools.faults.tasks import Result, Task, run_task
 from atalante_tools.outcome import Failed
 

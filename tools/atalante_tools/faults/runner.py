@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 import atalante_dbc
-from atalante_control.controller import HangConfig, HangController
-from atalante_control.gait import HANG_GAIT, PERIOD, Gait, load_gait
-from atalante_control.guide_shapes import SHAPES
+from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
+from atalante_control.gait.gait import AIRWALK_GAIT, PERIOD, Gait, load_gait
+from atalante_control.guide.shapes import SHAPES
 from atalante_dbc import Network
 from atalante_emulator.faults import Fault
 from atalante_hal.loop import run
@@ -39,7 +39,7 @@ Vector = npt.NDArray[np.float64]
 #: What the controller records of its guide: tracking error of the assisted joints, and how far off the guide is.
 _GUIDE: Final = ("error", "q_bound")
 #: The robot hangs in the gait's first pose: what is wanted is the walk.
-CONFIG: Final = HangConfig(startup=0.1)
+CONFIG: Final = AirwalkConfig(startup=0.1)
 ASSISTANCE: Final = 0.5
 #: Cycles of the HAL within which a robot with no fault is ACTIVE.
 _START: Final = 600
@@ -57,16 +57,16 @@ class Stage:
     robot: Robot
     gait: Gait
     pose: list[float]  # the gait's first, rad
-    controller: HangController
+    controller: AirwalkController
 
 
 @functools.cache
 def stage() -> Stage:
     """Network, robot, gait and controller of every run."""
     network, robot = atalante_dbc.load(), load_robot()
-    gait = load_gait(HANG_GAIT, robot)
+    gait = load_gait(AIRWALK_GAIT, robot)
     pose = gait.tables().q[0].tolist()
-    shared = Stage(network, robot, gait, pose, HangController(robot, gait, SHAPES["constant"], CONFIG))
+    shared = Stage(network, robot, gait, pose, AirwalkController(robot, gait, SHAPES["constant"], CONFIG))
     # It lives as long as the process; or the loop would collect before every run, a quarter of what a run takes.
     gc.collect()
     gc.freeze()

@@ -51,7 +51,7 @@ command.add_command(solve)
     "--compile/--no-compile",
     "machine_code",
     default=False,
-    help="Compile the programme with gcc first: minutes, once on a machine; then a gait takes half the time.",
+    help="Compile the program with gcc first: minutes, once on a machine; then a gait takes half the time.",
 )
 @click.option("--dask", "cluster", metavar="ADDRESS", help="Solve on the workers of this dask scheduler instead.")
 @click.option(
@@ -75,7 +75,7 @@ def library(
              atalante gait library --out runs/slow --step-duration 1.0,1.1,1.2
     """
     with extra():
-        from atalante_control.generation.library import Grid, Library, solve_compiled, solve_subject
+        from atalante_control.gait_optimization.library import Grid, Library, solve_compiled, solve_subject
     try:
         grid = Grid(**{name: values for name, values in levels.items() if values is not None})
     except ValueError as error:
@@ -119,12 +119,12 @@ def fit(folder: Path, out: Path, as_json: bool) -> None:
     """
     import math
 
-    from atalante_control.gait_network import save_network
+    from atalante_control.dynamics.gait_network import save_network
     from atalante_hal.robot import load_robot
 
     with extra():
-        from atalante_control.generation.fit import fit as fit_network
-        from atalante_control.generation.library import Library
+        from atalante_control.gait_optimization.fit import fit as fit_network
+        from atalante_control.gait_optimization.library import Library
     collection = Library(folder)
     gaits = collection.gaits(load_robot())
     if missing := collection.missing():
@@ -165,12 +165,12 @@ def check(file: Path | None, count: int, seed: int, as_json: bool) -> None:
     Example: atalante gait check
              atalante gait check --network runs/network.npz --count 20 --seed 7
     """
-    from atalante_control.gait_network import load_network
+    from atalante_control.dynamics.gait_network import load_network
     from atalante_hal.robot import load_robot
 
     with extra():
-        from atalante_control.generation.deviation import deviation, findings, random_subjects
-        from atalante_control.generation.library import solve_subject
+        from atalante_control.gait_optimization.library import solve_subject
+        from atalante_control.gait_optimization.network_error import deviation, findings, random_subjects
     robot, network = load_robot(), load_network(file)
     progress, deviations = Progress(), []
     for number, subject in enumerate(random_subjects(network.low, network.high, count, seed)):

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 import pinocchio
 
-from atalante_control.gait import Gait, motion
+from atalante_control.dynamics.stance import stance_dynamics
+from atalante_control.gait.gait import Gait, motion
 from atalante_control.model import BASE_LINK, LEG_LINKS, ExoskeletonParameters, Patient, pinocchio_model, urdf
-from atalante_control.stance_dynamics import stance_dynamics
 from atalante_hal.robot import LEG_JOINTS, SIDES, load_robot
 
 matplotlib.use("Agg")

@@ -15,10 +15,10 @@ from atalante_tools.signals import stop_requested
 from atalante_tools.terminal import Progress, say, show_json, table
 
 if TYPE_CHECKING:
-    from atalante_control.generation.problem import Kind
-    from atalante_control.generation.solved import SolvedGait
-    from atalante_control.generation.verify import Check
-    from atalante_control.subject import Subject
+    from atalante_control.gait.subject import Subject
+    from atalante_control.gait_optimization.result import SolvedGait
+    from atalante_control.gait_optimization.step_problem import Kind
+    from atalante_control.gait_optimization.verify import Check
 
 
 @click.command(short_help="Optimise the gait of a patient.")
@@ -54,13 +54,13 @@ def solve(
     if subject is None:
         raise click.UsageError("a gait is a patient's: --mass and --height")
     with extra():
-        from atalante_control.generation.solve import solve as optimise
-    from atalante_control.gait import write_gait
-    from atalante_control.generation.verify import Verifier
+        from atalante_control.gait_optimization.solve import solve as optimise
+    from atalante_control.gait.gait import write_gait
+    from atalante_control.gait_optimization.verify import Verifier
     from atalante_hal.robot import load_robot
 
     progress = Progress()
-    progress.show(f"{subject}: building the programme")
+    progress.show(f"{subject}: building the program")
 
     def show(iteration: int, violation: float) -> None:
         if progress.due():

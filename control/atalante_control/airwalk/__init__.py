@@ -1,0 +1,1 @@
+"""Walk in the air: the controller, its step kernel and its telemetry."""

@@ -1,0 +1,1 @@
+"""Dynamics of the exoskeleton: gravity, stance and suspension, and the network of gaits."""

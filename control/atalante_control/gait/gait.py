@@ -1,0 +1,351 @@
+"""Gait: twelve joint trajectories of one right-stance step as Bezier polynomials, read strictly from a file.
+
+`gait file -> Gait -> StepTables (1 ms) -> baseline controller, guide filter`. The left-stance step is the right-stance
+step of the mirrored robot: the legs swap and each joint takes its MIRROR_SIGN. A gait that does not continue through
+that swap, or that leaves the robot's limits, is refused when it is read, not when it is walked.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from math import comb
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.robot import JOINTS, LEG_JOINTS, MIRROR_SIGN, SIDES, Robot
+
+Vector = npt.NDArray[np.float64]
+
+FORMAT = "atalante-gait/1"
+DEGREE = 7
+PERIOD = 1e-3  # s, the cycle; tables and step durations lie on it
+AIRWALK_GAIT = Path(__file__).parents[1] / "gaits" / "airwalk.json"
+
+#: Joint i of the mirrored robot is joint SWAP[i] of the robot, times SIGN[i].
+SWAP = np.r_[len(LEG_JOINTS) : len(JOINTS), 0 : len(LEG_JOINTS)]
+SIGN = np.array(MIRROR_SIGN * len(SIDES), dtype=np.float64)
+
+POSITION_JUMP = math.radians(0.1)  # rad, largest discontinuity accepted at the step change
+VELOCITY_JUMP = 0.05  # rad/s
+DURATION_RANGE = (0.3, 3.0)  # s
+ROUNDING = 1e-9  # of the sums behind a table: a gait may touch a limit
+
+_REQUIRED = ("format", "name", "duration", "joints")
+_OPTIONAL = ("feedforward", "parameters", "solver")
+
+
+class GaitError(ValueError):
+    """The gait file is not a gait of this robot; the message names the key and what is valid."""
+
+    code = "GAIT_INVALID"
+
+
+@dataclass(frozen=True)
+class StepTables:
+    """A step sampled every cycle from 0 to T included: arrays of shape (N + 1, 12), read-only."""
+
+    q: Vector  # rad
+    qd: Vector  # rad/s
+    qdd: Vector  # rad/s2
+    uf: Vector  # Nm, feedforward without gravity; zero where the gait has none
+
+
+@dataclass(frozen=True)
+class Gait:
+    """One right-stance step: the left leg swings. The step of the other leg is `mirrored()`."""
+
+    name: str
+    duration: float  # s, T
+    coefficients: Vector  # (12, 8) rad, Bezier control points in the order of JOINTS
+    feedforward: Vector | None = None  # (12, 8) Nm, Bezier control points of u_f, gravity not in it
+    parameters: Mapping[str, float] = field(default_factory=dict)  # what the gait was made for: patient, step length
+    solver: Mapping[str, Any] = field(default_factory=dict)  # how it was made; kept, never read
+
+    @property
+    def cycles(self) -> int:
+        """Cycles in a step, N."""
+        return round(self.duration / PERIOD)
+
+    @property
+    def hash32(self) -> int:
+        """CRC-32 of what is walked: duration, trajectories, feedforward."""
+        content = np.float64(self.duration).tobytes() + np.ascontiguousarray(self.coefficients).tobytes()
+        if self.feedforward is not None:
+            content += np.ascontiguousarray(self.feedforward).tobytes()
+        return zlib.crc32(content)
+
+    def mirrored(self) -> Gait:
+        """The step with the other stance leg. Twice mirrored is the gait itself."""
+        feedforward = None if self.feedforward is None else _mirror(self.feedforward)
+        return Gait(self.name, self.duration, _mirror(self.coefficients), feedforward, self.parameters, self.solver)
+
+    def tables(self) -> StepTables:
+        """The step on the cycle grid."""
+        phase = _cycle_phases(self)
+        uf = np.zeros_like(self.coefficients) if self.feedforward is None else self.feedforward
+        tables = (*motion(self.coefficients, self.duration, phase), bezier(uf, phase))
+        return StepTables(*map(_read_only, tables))
+
+
+def bezier(coefficients: Vector, phase: Vector) -> Vector:
+    """Bezier polynomials of control points (m, d + 1) at phases (n,) in [0, 1]. Shape (n, m)."""
+    degree = coefficients.shape[1] - 1
+    x = phase[:, None]
+    k = np.arange(degree + 1)
+    binomial = np.array([comb(degree, int(i)) for i in k], dtype=np.float64)
+    basis: Vector = binomial * x**k * (1.0 - x) ** (degree - k)
+    return basis @ coefficients.T
+
+
+def derivative(coefficients: Vector) -> Vector:
+    """Control points of the derivative with respect to the phase: (m, d + 1) to (m, d)."""
+    return np.asarray((coefficients.shape[1] - 1) * np.diff(coefficients, axis=1))
+
+
+def motion(coefficients: Vector, duration: float, phase: Vector) -> tuple[Vector, Vector, Vector]:
+    """Angles, speeds and accelerations [rad, rad/s, rad/s2] of a step of `duration` [s] at phases (n,), each (n, m)."""
+    first = derivative(coefficients)
+    return (
+        bezier(coefficients, phase),
+        bezier(first, phase) / duration,
+        bezier(derivative(first), phase) / duration**2,
+    )
+
+
+def control_points(phase: Vector, values: Vector) -> Vector:
+    """Control points of the polynomials nearest to samples: phases (n,), values (n, m), to (m, 8), read-only."""
+    basis = bezier(np.eye(DEGREE + 1), phase)
+    return _read_only(np.linalg.lstsq(basis, values, rcond=None)[0].T.astype(np.float64))
+
+
+def power_basis(coefficients: Vector) -> Vector:
+    """Coefficients in powers of the phase, lowest first, of Bezier control points. Shape kept, (m, d + 1)."""
+    degree = coefficients.shape[1] - 1
+    change = np.zeros((degree + 1, degree + 1))
+    for power in range(degree + 1):
+        for k in range(power + 1):
+            change[power, k] = comb(degree, power) * comb(power, k) * (-1) ** (power - k)
+    return coefficients @ change.T
+
+
+def load_gait(path: Path, robot: Robot) -> Gait:
+    """Read a gait file (JSON) strictly and check it against the robot.
+
+    Keys: `format` ("atalante-gait/1"), `name`, `duration` [s], `joints` (each of JOINTS: 8 Bezier control points [rad]
+    of the right-stance step); optional `feedforward` (the same, [Nm], gravity not in it), `parameters` (name: number),
+    `solver` (anything).
+
+    Raises:
+        GaitError: unknown, missing or malformed key; a value that is not finite; a discontinuity through the step
+            change over 0.1 degrees or 0.05 rad/s; a position, speed or feedforward beyond the robot's limits.
+    """
+    try:
+        document = json.loads(
+            path.read_text(encoding="utf-8"), parse_constant=_refuse_constant, object_pairs_hook=_without_twins
+        )
+    except OSError as error:
+        raise GaitError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise GaitError(f"{path}: {error}") from error
+    if not isinstance(document, dict):
+        raise GaitError(f"{path}: a gait file is a JSON object with the keys {', '.join(_REQUIRED)}")
+    if unknown := sorted(set(document) - {*_REQUIRED, *_OPTIONAL}):
+        raise GaitError(f"{path}: {unknown[0]} is unknown; valid keys are {', '.join(_REQUIRED + _OPTIONAL)}")
+    if missing := [key for key in _REQUIRED if key not in document]:
+        raise GaitError(f"{path}: {missing[0]} is missing; required keys are {', '.join(_REQUIRED)}")
+    if document["format"] != FORMAT:
+        raise GaitError(f"{path}: format is {FORMAT!r}, not {document['format']!r}")
+    name, parameters, solver = document["name"], document.get("parameters", {}), document.get("solver", {})
+    if not (isinstance(name, str) and name):
+        raise GaitError(f"{path}: name is a text that is not empty, not {name!r}")
+    if not isinstance(parameters, dict) or not all(_is_number(value) for value in parameters.values()):
+        raise GaitError(f"{path}: parameters is an object of finite numbers, not {parameters!r}")
+    if not isinstance(solver, dict):
+        raise GaitError(f"{path}: solver is an object, not {solver!r}")
+    gait = Gait(
+        name,
+        _check_duration(document["duration"], str(path)),
+        _control_points(path, "joints", document["joints"]),
+        _control_points(path, "feedforward", document["feedforward"]) if "feedforward" in document else None,
+        {key: float(value) for key, value in parameters.items()},
+        solver,
+    )
+    check_gait(gait, robot, str(path))
+    return gait
+
+
+def write_gait(gait: Gait, path: Path) -> None:
+    """Write a gait file that `load_gait` reads back to the bit; it appears whole or not at all."""
+    document: dict[str, Any] = {"format": FORMAT, "name": gait.name, "duration": gait.duration}
+    document["joints"] = dict(zip(JOINTS, gait.coefficients.tolist(), strict=True))
+    if gait.feedforward is not None:
+        document["feedforward"] = dict(zip(JOINTS, gait.feedforward.tolist(), strict=True))
+    document |= {"parameters": dict(gait.parameters), "solver": dict(gait.solver)}
+    unfinished = path.with_name(f"{path.name}.new")
+    unfinished.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    unfinished.replace(path)
+
+
+def check_gait(
+    gait: Gait, robot: Robot, where: str = "gait", gravity: Callable[[Vector], Vector] | None = None
+) -> None:
+    """Refuse a gait that is malformed, jumps at the step change or leaves the robot's limits.
+
+    Angles, speeds and torques are compared with their limits in every cycle and at every turning point between cycles.
+
+    Args:
+        gait: a right-stance step that repeats; its mirror image is checked too.
+        robot: with the limits.
+        where: first words of the message, for example the name of the file.
+        gravity: torque that the controller adds to the feedforward at a pose, (12,) [rad] to (12,) [Nm]; the torque limits
+            are those of the sum. Without it they are those of the feedforward alone.
+
+    Raises:
+        GaitError: names the joint, what is allowed, what was found and at which phase.
+    """
+    _check_form(gait, where)
+    steps = {"right": gait, "left": gait.mirrored()}
+    right, left = (step.tables() for step in steps.values())
+    for end, start, limit, unit in (
+        (right.q[-1], left.q[0], POSITION_JUMP, "rad"),
+        (right.qd[-1], left.qd[0], VELOCITY_JUMP, "rad/s"),
+    ):
+        jump = np.abs(end - start)
+        worst = int(jump.argmax())
+        if not jump[worst] <= limit:
+            raise GaitError(
+                f"{where}: joints.{JOINTS[worst]} jumps by {jump[worst]:.4g} {unit} at the step change; "
+                f"at most {limit:.4g} {unit} is allowed against the mirrored start"
+            )
+    # The mirrored step has mirrored limits: checking both steps also covers limits that are not symmetric.
+    for stance, step in steps.items():
+        for phases in (_cycle_phases, _turning_points):
+            _check_limits(step, phases(step), robot, gravity, where, stance)
+
+
+def _check_form(gait: Gait, where: str) -> None:
+    """Refuse arrays of another shape or type, numbers that are not finite and durations off the cycle grid."""
+    shape = len(JOINTS), DEGREE + 1
+    for key, array in (("joints", gait.coefficients), ("feedforward", gait.feedforward)):
+        if array is None and key == "feedforward":
+            continue
+        if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
+            got = f"{array.dtype} of shape {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+            raise GaitError(f"{where}: {key} must be 64-bit floats of shape {shape}, got {got}")
+        wrong = np.argwhere(~np.isfinite(array))
+        if len(wrong):
+            joint, point = wrong[0]
+            raise GaitError(
+                f"{where}: {key}.{JOINTS[joint]} must be finite, got {array[joint, point]} as control point {point}"
+            )
+    _check_duration(
+        float(gait.duration) if isinstance(gait.duration, float) else gait.duration, where
+    )  # numpy's is one
+
+
+def _check_limits(
+    gait: Gait, phase: Vector, robot: Robot, gravity: Callable[[Vector], Vector] | None, where: str, stance: str
+) -> None:
+    """Refuse a step with an angle, speed or torque beyond its limit at one of the phases (n,)."""
+    q, qd, _ = motion(gait.coefficients, gait.duration, phase)
+    torque = np.zeros_like(q) if gait.feedforward is None else bezier(gait.feedforward, phase)
+    if gravity is not None:
+        torque = torque + np.array([gravity(pose) for pose in q]).reshape(q.shape)
+    source = "feedforward" if gravity is None else "feedforward and gravity"
+    for quantity, values, low, high, unit, scale in (
+        ("angle", q, robot.position_min, robot.position_max, "deg", math.degrees(1.0)),
+        ("speed", qd, -robot.velocity_max, robot.velocity_max, "rad/s", 1.0),
+        (source, torque, -robot.torque_max, robot.torque_max, "Nm", 1.0),
+    ):
+        beyond = np.maximum(values - high, low - values)
+        if not beyond.max(initial=0.0) <= ROUNDING:
+            row, joint = np.unravel_index(int(beyond.argmax()), beyond.shape)
+            found, least, most = (scale * x for x in (values[row, joint], low[joint], high[joint]))
+            raise GaitError(
+                f"{where}: {quantity} of joints.{JOINTS[joint]} must be {least:.5g} to {most:.5g} {unit}, got "
+                f"{found:.5g} {unit} at phase {phase[row]:.3f} of the {stance}-stance step, "
+                f"{scale * beyond[row, joint]:.2g} {unit} beyond"
+            )
+
+
+def _cycle_phases(gait: Gait) -> Vector:
+    """Return the phases of the cycles of a step, both ends included. Shape (N + 1,)."""
+    return np.arange(gait.cycles + 1) / gait.cycles
+
+
+def _turning_points(gait: Gait) -> Vector:
+    """Return the phases in [0, 1] at which the angle, the speed or the feedforward of a joint is largest or smallest.
+
+    A pair of roots that rounding made complex gives its real part, which is a phase like any other. Shape (n,).
+    """
+    slope = derivative(gait.coefficients)
+    slopes = [slope, derivative(slope)]
+    if gait.feedforward is not None:
+        slopes.append(derivative(gait.feedforward))
+    roots = [np.roots(row[::-1]).real for rows in slopes for row in power_basis(rows)]
+    phases = np.concatenate(roots)
+    return phases[(phases >= 0.0) & (phases <= 1.0)]
+
+
+def _check_duration(value: Any, where: str) -> float:
+    """Return a duration [s]. Raises `GaitError` unless it is a whole number of cycles in `DURATION_RANGE`."""
+    low, high = DURATION_RANGE
+    if not (_is_number(value) and low <= value <= high):
+        raise GaitError(f"{where}: duration must be a number of seconds from {low} to {high}, got {value!r}")
+    cycles = value / PERIOD
+    if abs(cycles - round(cycles)) > 1e-6:
+        raise GaitError(f"{where}: duration must be a whole number of milliseconds, got {value!r} s")
+    return float(value)
+
+
+def _control_points(path: Path, key: str, table: Any) -> Vector:
+    if not isinstance(table, dict):
+        raise GaitError(f"{path}: {key} is an object with one list for each of {', '.join(JOINTS)}")
+    if unknown := sorted(set(table) - set(JOINTS)):
+        raise GaitError(f"{path}: {key}.{unknown[0]} is unknown; valid joints are {', '.join(JOINTS)}")
+    for joint in JOINTS:
+        points = table.get(joint)
+        if not isinstance(points, list) or len(points) != DEGREE + 1 or not all(_is_number(p) for p in points):
+            raise GaitError(f"{path}: {key}.{joint} is a list of {DEGREE + 1} finite numbers, not {points!r}")
+    return _read_only(np.array([table[joint] for joint in JOINTS], dtype=np.float64))
+
+
+def _is_number(value: Any) -> bool:
+    return (
+        type(value) in (int, float) and abs(value) <= sys.float_info.max
+    )  # false for NaN, and no overflow of an integer
+
+
+def _refuse_constant(text: str) -> float:
+    raise ValueError(f"{text} is not allowed; every number in a gait file is finite")
+
+
+def _without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twin = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{twin} is there twice; every key is given once")
+    return found
+
+
+def _mirror(rows: Vector) -> Vector:
+    return _read_only(rows[SWAP] * SIGN[:, None])
+
+
+def _read_only(array: Vector) -> Vector:
+    array.setflags(write=False)
+    return array
+
+
+def step_over(cycle: int, cycles: int) -> bool:
+    """Step switch by time: True when `cycle` since the change has reached the step's length."""
+    return cycle >= cycles

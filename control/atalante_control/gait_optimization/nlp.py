@@ -1,0 +1,206 @@
+"""A sparse nonlinear program put together from small functions, each repeated over groups of unknowns.
+
+`Rows (SX expressions of a few unknowns) -> NonlinearProgram.add -> f, g and their exact sparse derivatives as five functions`.
+It knows nothing of walking; `step_problem` does. Every repeated function is differentiated once, in scalars; what belongs to
+the whole program are the places its results go to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import casadi
+import numpy as np
+import numpy.typing as npt
+
+Vector = npt.NDArray[np.float64]
+Places = npt.NDArray[np.intp]
+Symbol = Any  # casadi.SX or casadi.MX
+
+
+class Rows(NamedTuple):
+    """Constraints that say one thing: lower <= values <= upper."""
+
+    name: str  # as people call it: "swing clearance"
+    unit: str
+    size: float  # [unit] what counts as one in the program
+    values: Symbol  # SX, shape (m,) [unit]
+    lower: Vector  # shape (m,) or, where it changes from place to place, (places, m) [unit]
+    upper: Vector
+
+
+class Group(NamedTuple):
+    """Where constraints of one name stand in g."""
+
+    name: str
+    unit: str
+    size: float
+    rows: Places
+
+
+class Functions(NamedTuple):
+    """What the solver calls, in the order of `NAMES`; x are the unknowns, p the parameters."""
+
+    objective: Any  # x, p -> f
+    constraints: Any  # x, p -> g
+    gradient: Any  # x, p -> f, df/dx
+    jacobian: Any  # x, p -> g, dg/dx
+    hessian: Any  # x, p, lam_f, lam_g -> upper triangle of the Lagrangian's second derivative
+
+
+NAMES = ("nlp_f", "nlp_g", "nlp_grad_f", "nlp_jac_g", "nlp_hess_l")
+
+
+class _Block(NamedTuple):
+    """An expression repeated over places: rows of g, or with weights a part of the objective."""
+
+    expression: Symbol
+    x: Symbol
+    at: Places  # (places, n)
+    weights: Vector | None
+
+
+class NonlinearProgram:
+    """minimise f(x, p) subject to lower <= g(x, p) <= upper.
+
+    Attributes:
+        lower, upper: bounds of g, each row over its group's size.
+        groups: the rows by name.
+    """
+
+    def __init__(self, unknowns: int, parameters: Symbol) -> None:
+        """Start without rows.
+
+        Args:
+            parameters: SX symbols all expressions may use.
+        """
+        self.unknowns = unknowns
+        self._p = parameters
+        self._linear = np.zeros((0, unknowns))
+        self._blocks: list[_Block] = []
+        self.lower, self.upper = np.zeros(0), np.zeros(0)
+        self.groups: list[Group] = []
+
+    def add_linear(self, name: str, unit: str, matrix: Vector, value: Vector) -> None:
+        """Constrain matrix @ x = value. Comes before all other rows."""
+        assert not self._blocks, "linear rows come first"
+        self.groups.append(Group(name, unit, 1.0, len(self.lower) + np.arange(len(value))))
+        self._linear = np.concatenate([self._linear, matrix])
+        self.lower, self.upper = np.append(self.lower, value), np.append(self.upper, value)
+
+    def add(self, rows: Sequence[Rows], x: Symbol, places: Sequence[Places]) -> None:
+        """Constrain: the same rows at each of the places.
+
+        Args:
+            x: SX symbols the rows depend on, shape (n,).
+            places: which of the program's unknowns they are, n indices a place.
+        """
+        first, height, count = len(self.lower), sum(row.values.shape[0] for row in rows), len(places)
+        lower, upper = np.zeros((count, height)), np.zeros((count, height))
+        start = 0
+        for row in rows:
+            columns = np.arange(start, start + row.values.shape[0])
+            lower[:, columns], upper[:, columns] = row.lower / row.size, row.upper / row.size
+            index = first + (columns + height * np.arange(count)[:, None]).ravel()
+            self.groups.append(Group(row.name, row.unit, row.size, index))
+            start += row.values.shape[0]
+        self.lower, self.upper = np.append(self.lower, lower), np.append(self.upper, upper)
+        expression = casadi.vertcat(*(row.values / row.size for row in rows))
+        self._blocks.append(_Block(expression, x, np.array(places), None))
+
+    def minimise(self, cost: Symbol, x: Symbol, places: Sequence[Places], weights: Vector) -> None:
+        """Add the weighted sum of a scalar expression over the places to the objective."""
+        self._blocks.append(_Block(cost, x, np.array(places), weights))
+
+    def functions(self) -> Functions:
+        """The five functions."""
+        x, p = casadi.MX.sym("x", self.unknowns), casadi.MX.sym("p", self._p.shape[0])
+        lam_f, lam_g = casadi.MX.sym("lam_f"), casadi.MX.sym("lam_g", len(self.lower))
+        gradient = _Sparse(self.unknowns, 1)
+        jacobian, hessian = _Sparse(len(self.lower), self.unknowns), _Sparse(self.unknowns, self.unknowns)
+        f: Symbol = casadi.MX(0)
+        rows, columns = np.nonzero(self._linear)
+        jacobian.add(rows, columns, casadi.DM(self._linear[rows, columns]))
+        g = [casadi.sparsify(casadi.DM(self._linear)) @ x]
+        row = len(self._linear)
+        for block in self._blocks:
+            count, height, at = len(block.at), block.expression.shape[0], block.at
+            local = casadi.horzcat(*(x[place.tolist()] for place in at))
+            values, slopes, curvature = _derivatives(block, self._p)
+            value, slope = values.map(count)(local, p), slopes.function.map(count)(local, p)
+            if block.weights is None:
+                lam = casadi.reshape(lam_g[row : row + height * count], height, count)
+                g.append(casadi.vec(value))
+                jacobian.add(row + slopes.rows + height * np.arange(count)[:, None], at[:, slopes.columns], slope)
+                row += height * count
+            else:
+                weights = casadi.DM(block.weights)
+                lam = lam_f * weights.T
+                f += value @ weights
+                gradient.add(at[:, slopes.columns], 0 * at[:, slopes.columns], slope @ casadi.diag(weights))
+            one, other = at[:, curvature.rows], at[:, curvature.columns]
+            curved = curvature.function.map(count)(local, p, lam)
+            hessian.add(np.minimum(one, other), np.maximum(one, other), curved)
+        constraints, given = casadi.vertcat(*g), ["x", "p"]
+        return Functions(
+            casadi.Function(NAMES[0], [x, p], [f], given, ["f"]),
+            casadi.Function(NAMES[1], [x, p], [constraints], given, ["g"]),
+            casadi.Function(NAMES[2], [x, p], [f, casadi.densify(gradient.matrix())], given, ["f", "grad_f_x"]),
+            casadi.Function(NAMES[3], [x, p], [constraints, jacobian.matrix()], given, ["g", "jac_g_x"]),
+            casadi.Function(
+                NAMES[4],
+                [x, p, lam_f, lam_g],
+                [hessian.matrix()],
+                [*given, "lam_f", "lam_g"],
+                ["triu_hess_gamma_x_x"],
+            ),
+        )
+
+
+class _Entries(NamedTuple):
+    """A function that returns the entries of a sparse matrix, and where they stand."""
+
+    function: Any
+    rows: Places
+    columns: Places
+
+
+def _derivatives(block: _Block, p: Symbol) -> tuple[Any, _Entries, _Entries]:
+    """The expression, its Jacobian, the upper triangle of its Hessian weighted with multipliers."""
+    lam = casadi.SX.sym("lam", block.expression.shape[0])
+    slopes = casadi.jacobian(block.expression, block.x)
+    curvature = casadi.triu(casadi.hessian(casadi.dot(lam, block.expression), block.x)[0])
+    entries = []
+    for name, matrix, arguments in (
+        ("jacobian", slopes, [block.x, p]),
+        ("hessian", curvature, [block.x, p, lam]),
+    ):
+        rows, columns = matrix.sparsity().get_triplet()
+        # No common subexpressions are looked for: that takes longer than all the rest and finds 3 % of the operations.
+        function = casadi.Function(name, arguments, [casadi.vertcat(*matrix.nonzeros())])
+        entries.append(_Entries(function, np.array(rows, np.intp), np.array(columns, np.intp)))
+    return casadi.Function("values", [block.x, p], [block.expression]), entries[0], entries[1]
+
+
+class _Sparse:
+    """A sparse matrix in the making: entries at the same place add up."""
+
+    def __init__(self, rows: int, columns: int) -> None:
+        self._shape = (rows, columns)
+        self._keys: list[Places] = []
+        self._values: list[Symbol] = []
+
+    def add(self, rows: Places, columns: Places, values: Symbol) -> None:
+        """Entries a place: index arrays (places, n), values of shape (n, places)."""
+        self._keys.append((columns * self._shape[0] + rows).ravel())
+        self._values.append(casadi.vec(values))
+
+    def matrix(self) -> Symbol:
+        """The matrix as an MX."""
+        keys = np.concatenate(self._keys)
+        distinct, place = np.unique(keys, return_inverse=True)
+        height = self._shape[0]
+        sparsity = casadi.Sparsity.triplet(*self._shape, (distinct % height).tolist(), (distinct // height).tolist())
+        collect = casadi.Sparsity.triplet(len(distinct), len(keys), place.tolist(), list(range(len(keys))))
+        return casadi.MX(sparsity, casadi.DM(collect, 1.0) @ casadi.vertcat(*self._values))

@@ -1,0 +1,62 @@
+"""Whether the landing pose exists at all, before a gait is looked for: `problem, subject -> sentence or nothing`.
+
+The pose with both feet flat on the ground, step length apart, is sought with joint limits that may give; the joint that has
+to leave its range furthest is the reason why there is no such gait.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import casadi
+import numpy as np
+import numpy.typing as npt
+
+from atalante_control.gait_optimization.step_problem import StepProblem
+from atalante_hal.robot import JOINTS
+
+Vector = npt.NDArray[np.float64]
+
+_TOLERANCE = math.radians(0.5)  # what the optimiser's other freedoms may still make up for
+_NEAR = 1e-6  # weight of staying near the middle of the ranges, against giving way
+_OPTIONS: dict[str, Any] = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "error_on_fail": False}
+
+
+class Reach:
+    """The search for a landing pose, built once for a program."""
+
+    def __init__(self, problem: StepProblem) -> None:
+        """Build it."""
+        self._low, self._high = problem.joint_range()
+        q, give = casadi.SX.sym("q", len(JOINTS)), casadi.SX.sym("give", len(JOINTS))
+        rows = [*problem.landing(q), *problem.attitude(q)]
+        inside = casadi.vertcat(q - self._low + give, self._high + give - q)
+        free = np.full(2 * len(JOINTS), np.inf)
+        self._bounds = (
+            np.concatenate([*(row.lower for row in rows), np.zeros(len(free))]),
+            np.concatenate([*(row.upper for row in rows), free]),
+        )
+        program = {
+            "x": casadi.vertcat(q, give),
+            "p": problem.symbols,
+            "f": casadi.sumsqr(give) + _NEAR * casadi.sumsqr(q - (self._low + self._high) / 2.0),
+            "g": casadi.vertcat(*(row.values for row in rows), inside),
+        }
+        self._solver: Any = casadi.nlpsol("reach", "ipopt", program, _OPTIONS)
+
+    def refusal(self, parameters: Vector, step_length: float) -> str | None:
+        """Why the landing pose cannot be, or None."""
+        middle = np.clip(0.0, self._low, self._high)
+        start = np.concatenate([middle, np.zeros(len(JOINTS))])
+        low = np.concatenate([np.full(len(JOINTS), -np.pi), np.zeros(len(JOINTS))])
+        found = self._solver(x0=start, p=parameters, lbx=low, lbg=self._bounds[0], ubg=self._bounds[1])
+        apart = f"with both feet flat on the ground and {step_length:g} m apart"
+        if not self._solver.stats()["success"]:
+            return f"{apart} no pose was found"
+        pose, give = np.split(np.array(found["x"]).ravel(), 2)
+        worst = int(give.argmax())
+        if give[worst] < _TOLERANCE:
+            return None
+        angle, end = np.degrees([pose[worst], np.clip(pose[worst], self._low, self._high)[worst]])
+        return f"{apart} {JOINTS[worst]} would be at {angle:.1f} degrees; a gait uses it to {end:.1f} degrees at most"

@@ -1,0 +1,171 @@
+"""Solve one step: `subject -> first guess or neighbour -> IPOPT -> gait with its residuals in physical units`.
+
+The program of each kind of step is built once a process and serves every subject. Where the optimiser starts makes it
+faster, not different: in all cases tried, cold and warm starts ended in the same gait.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import casadi
+import numpy as np
+import numpy.typing as npt
+
+from atalante_control.dynamics.stance import stance_dynamics
+from atalante_control.gait.gait import Gait
+from atalante_control.gait.subject import Subject
+from atalante_control.gait_optimization.compiled import compiled
+from atalante_control.gait_optimization.guess import guess
+from atalante_control.gait_optimization.nlp import Functions
+from atalante_control.gait_optimization.progress import Progress, Watch
+from atalante_control.gait_optimization.reach import Reach
+from atalante_control.gait_optimization.requirements import Requirements
+from atalante_control.gait_optimization.result import SOLVED, Residual, SolvedGait
+from atalante_control.gait_optimization.step_problem import TRANSITION, Kind, StepProblem
+from atalante_hal.robot import ROBOT_FILE, load_robot
+
+Vector = npt.NDArray[np.float64]
+
+RESIDUAL = 1e-6  # SI unit of each constraint, the largest a solved gait may have
+_OPTIONS: dict[str, Any] = {
+    "ipopt.nlp_scaling_method": "none",  # rows and unknowns have their sizes already
+    "ipopt.max_iter": 150,
+    "ipopt.tol": 1e-8,
+    "ipopt.constr_viol_tol": 1e-10,
+    "ipopt.bound_relax_factor": 0.0,
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "print_time": False,
+    "error_on_fail": False,
+    "calc_lam_p": False,
+    "no_nlp_grad": True,  # only for sensitivities, which compiled functions do not have
+}
+#: From a neighbour: begin with small barriers, but not at the bounds. 17 to 21 iterations instead of 34 to 36.
+_WARM: dict[str, Any] = {"ipopt.mu_init": 1e-3, "ipopt.bound_mult_init_method": "mu-based"}
+#: Everything that decides a gait.
+_SOURCES = (
+    *(
+        f"gait_optimization/{module}.py"
+        for module in ("symbolic_dynamics", "guess", "step_problem", "nlp", "requirements", "solve")
+    ),
+    *("gait/gait.py", "dynamics/gravity.py", "dynamics/stance.py", "model/*.py"),
+)
+
+
+def solve(
+    subject: Subject,
+    warm_start: Gait | None = None,
+    kind: Kind = "periodic",
+    progress: Progress | None = None,
+    machine_code: bool = False,
+) -> SolvedGait:
+    """Optimise a gait.
+
+    A start step leads from rest on both feet to the end of the subject's periodic step, a stop step from its beginning to
+    rest; both take `step_problem.TRANSITION` seconds, whatever the step duration.
+
+    Args:
+        warm_start: a neighbour to start from.
+        kind: `periodic`, `start` or `stop`.
+        machine_code: compile the program first if that was not done on this machine yet: some 15 s, once. It pays for a
+            library.
+
+    Returns:
+        The gait; where none was found, the last iterate, with a status that names the constraint that cannot hold.
+    """
+    around = None if kind == "periodic" else solve(subject, machine_code=machine_code)
+    if around is not None and not around.solved:
+        return around
+    problem, functions = _built(kind, machine_code)
+    duration = subject.step_duration if around is None else TRANSITION
+    parameters = problem.parameters(subject.patient, duration, subject.step_length)
+    lower, upper = problem.bounds(duration)
+    low, high = problem.constraint_bounds(None if around is None else around.gait)
+    coefficients = guess(problem, parameters, subject) if warm_start is None else warm_start.coefficients
+    refusal = _reach().refusal(parameters, subject.step_length) if kind == "periodic" else None
+    ending, iterations = "not begun", 0
+    started = time.perf_counter()
+    if refusal is None:
+        if progress is None:
+            solver = _silent_solver(kind, machine_code, warm_start is not None)
+        else:
+            watch = Watch(problem.program.unknowns, (low, high), progress)
+            solver = _solver(kind, machine_code, warm_start is not None, {"iteration_callback": watch})
+        x0 = problem.unknowns(coefficients, parameters)
+        solution = solver(x0=x0, p=parameters, lbx=lower, ubx=upper, lbg=low, ubg=high)
+        ending, iterations = solver.stats()["return_status"], int(solver.stats()["iter_count"])
+        coefficients = problem.coefficients(np.array(solution["x"]).ravel())
+    seconds = time.perf_counter() - started
+
+    x = problem.unknowns(coefficients, parameters)
+    residuals = problem.residuals(x, np.array(functions.constraints(x, parameters)).ravel(), (low, high), duration)
+    worst = max(residuals.values(), key=lambda residual: residual.value).value
+    if ending == "Solve_Succeeded" and worst <= RESIDUAL:
+        status = SOLVED
+    else:
+        status = f"no such gait for {subject}: {refusal or _unmet(problem, residuals)}"
+    record = {
+        "method": f"{kind} step, IPOPT: {ending}",
+        "status": status,
+        "max_residual": worst,
+        "iterations": iterations,
+        "solve_s": round(seconds, 3),
+        "version": code_version(),
+    }
+    feedforward = stance_dynamics(load_robot(), subject.patient).feedforward(coefficients, duration)
+    gait = Gait(f"{kind}, {subject}", duration, coefficients, feedforward, subject.parameters(), record)
+    peak = np.abs(problem.torques(x)).max(axis=0)
+    return SolvedGait(gait, status, worst, seconds, iterations, residuals, peak)
+
+
+@cache
+def code_version() -> str:
+    """The package's version and a hash of what decides a gait: program, model, feedforward, robot file."""
+    package = Path(__file__).parents[1]
+    digest = hashlib.sha256(ROBOT_FILE.read_bytes())
+    for pattern in _SOURCES:
+        for source in sorted(package.glob(pattern)):
+            digest.update(source.read_bytes())
+    return f"{version('atalante-hal')}+{digest.hexdigest()[:12]}"
+
+
+def _unmet(problem: StepProblem, residuals: Mapping[str, Residual]) -> str:
+    """The constraint that is furthest from holding, against what counts as one of it."""
+    name = max(residuals, key=lambda group: residuals[group].value / problem.units[group][1])
+    value, unit = residuals[name]
+    return f"the {name} cannot hold, {value:.3g} {unit} are missing"
+
+
+@cache
+def _reach() -> Reach:
+    return Reach(_built("periodic", False)[0])
+
+
+@cache
+def _built(kind: Kind, machine_code: bool) -> tuple[StepProblem, Functions]:
+    if machine_code:
+        problem, interpreted = _built(kind, False)
+        return problem, compiled(interpreted) or interpreted
+    problem = StepProblem(kind, load_robot(), Requirements())
+    return problem, problem.program.functions()
+
+
+@cache
+def _silent_solver(kind: Kind, machine_code: bool, warm: bool) -> Any:
+    return _solver(kind, machine_code, warm, {})
+
+
+def _solver(kind: Kind, machine_code: bool, warm: bool, options: dict[str, Any]) -> Any:
+    problem, functions = _built(kind, machine_code)
+    x = casadi.MX.sym("x", problem.program.unknowns)
+    p = casadi.MX.sym("p", functions.objective.size1_in(1))
+    program = {"x": x, "p": p, "f": functions.objective(x, p), "g": functions.constraints(x, p)}
+    derivatives = {"grad_f": functions.gradient, "jac_g": functions.jacobian, "hess_lag": functions.hessian}
+    return casadi.nlpsol("gait", "ipopt", program, _OPTIONS | (_WARM if warm else {}) | derivatives | options)

@@ -1,0 +1,395 @@
+"""The walking step as a nonlinear program: its unknowns, its constraints in named groups, its cost.
+
+`Chain, Requirements -> rows of one node, of both ends, of the impact -> NonlinearProgram`, built once for a kind of step:
+subject, step length and duration are parameters. Bezier control points determine the motion. At each node stand the joint
+angles, their first and second derivative by the phase, the torques and the ground wrench, tied to the control points by linear
+and to each other by dynamic equations. That is redundant on purpose: the equations become short and the matrix sparse.
+
+Stance foot and swing foot are flat rigid bodies on flat ground; the stance foot does not move, which makes it partial
+hybrid zero dynamics without a zero dynamics: every step is fully actuated, and the impact map closes the cycle.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import casadi
+import numpy as np
+import numpy.typing as npt
+
+from atalante_control.gait.gait import DEGREE, SIGN, SWAP, Gait, bezier, derivative
+from atalante_control.gait_optimization.nlp import NonlinearProgram, Places, Rows
+from atalante_control.gait_optimization.requirements import Requirements
+from atalante_control.gait_optimization.result import Residual
+from atalante_control.gait_optimization.symbolic_dynamics import Chain
+from atalante_control.model import ExoskeletonParameters, Patient, links
+from atalante_hal.robot import JOINTS, Robot
+
+Vector = npt.NDArray[np.float64]
+Symbol = Any  # casadi.SX
+Kind = Literal["periodic", "start", "stop"]
+KINDS: tuple[Kind, ...] = ("periodic", "start", "stop")
+TRANSITION = 1.2  # s, of start and stop steps
+
+GRAVITY = 9.81  # m/s2
+_N = len(JOINTS)
+_POINTS = _N * (DEGREE + 1)  # unknowns before the nodes: control points, joint after joint
+_NODE = 4 * _N + 6  # unknowns of a node: q, dq/ds, d2q/ds2, torque, ground force, ground moment
+_TORQUE, _FORCE, _MOMENT = 100.0, 1500.0, 1500.0  # Nm, N, Nm: what counts as one in the unknowns
+_BOUND_UNITS = {
+    "joint limits": ("rad", 0.1),
+    "speed limits": ("rad/s", 1.0),
+    "torque limits": ("Nm", _TORQUE),
+    "vertical ground force": ("N", _FORCE),
+}
+_KNEES = [i for i, joint in enumerate(JOINTS) if joint.endswith("SK")]
+_MIRROR = casadi.DM([1.0, -1.0, 1.0])  # of a polar vector in the sagittal plane; an axial one takes the negative
+
+
+class StepProblem:
+    """The program of one kind of step, for any subject, step length and duration.
+
+    Attributes:
+        program: rows and bounds.
+        phases: of the nodes, shape (nodes,).
+        symbols: the parameters.
+    """
+
+    def __init__(self, kind: Kind, robot: Robot, requirements: Requirements) -> None:
+        """Build it; takes some seconds, so build it once (`functions` of the program are the costly part)."""
+        self.kind, self.robot, self.requirements = kind, robot, requirements
+        self.exoskeleton = ExoskeletonParameters()
+        self.chain = Chain(links(self.exoskeleton, Patient(75.0, 1.75)))
+        self.phases = np.linspace(0.0, 1.0, requirements.nodes)
+        identity = np.eye(DEGREE + 1)
+        self._bases = [bezier(points, self.phases) for points in (identity, derivative(identity))]
+        self._bases.append(bezier(derivative(derivative(identity)), self.phases))
+        self._duration, self._length = casadi.SX.sym("T"), casadi.SX.sym("L")
+        self.symbols = casadi.vertcat(self.chain.symbols, self._duration, self._length)
+        self._yaw = casadi.DM(_about_z(self.chain.stance_yaw))  # stance foot to walking direction
+        self.program = NonlinearProgram(_POINTS + requirements.nodes * _NODE, self.symbols)
+        self._build()
+        #: Unit of each group of constraints, and how many of it count as much.
+        self.units = {group.name: (group.unit, group.size) for group in self.program.groups} | _BOUND_UNITS
+
+    def parameters(self, patient: Patient, duration: float, step_length: float) -> Vector:
+        """Parameters of the program."""
+        numbers = self.chain.values(links(self.exoskeleton, patient))
+        return np.concatenate([numbers, [duration, step_length if self.kind == "periodic" else 0.0]])
+
+    def joint_range(self) -> tuple[Vector, Vector]:
+        """Lowest and highest angles a gait may use, shape (12,) [rad]."""
+        low = self.robot.position_min + self.requirements.joint_margin
+        low[_KNEES] = np.maximum(low[_KNEES], self.requirements.knee_min)
+        return low, self.robot.position_max - self.requirements.joint_margin
+
+    def bounds(self, duration: float) -> tuple[Vector, Vector]:
+        """Lower and upper bounds of the unknowns: joint, speed and torque limits, vertical force."""
+        requirements, robot = self.requirements, self.robot
+        low, high = self.joint_range()
+        speed = requirements.speed_share * robot.velocity_max * duration
+        torque = requirements.torque_share * robot.torque_max / _TORQUE
+        free = np.full(_N, np.inf)
+        upper = np.concatenate([high, speed, free, torque, np.full(6, np.inf)])
+        lower = np.concatenate([low, -speed, -free, -torque, np.full(6, -np.inf)])
+        lower[4 * _N + 2] = requirements.force_min / _FORCE
+        points, nodes = np.full(_POINTS, np.inf), requirements.nodes
+        return np.concatenate([-points, np.tile(lower, nodes)]), np.concatenate([points, np.tile(upper, nodes)])
+
+    def unknowns(self, coefficients: Vector, parameters: Vector) -> Vector:
+        """All unknowns of a motion: control points (12, 8) [rad] to shape (unknowns,); torques by inverse dynamics."""
+        motion = np.stack([basis @ coefficients.T for basis in self._bases], axis=1)  # (nodes, 3, 12)
+        loads = self._loads.map(len(self.phases))(motion.reshape(len(motion), -1).T, parameters)
+        nodes = np.concatenate([motion.reshape(len(motion), -1), np.array(loads).T], axis=1)
+        return np.concatenate([coefficients.ravel(), nodes.ravel()])
+
+    def coefficients(self, unknowns: Vector) -> Vector:
+        """Control points (12, 8) of a solution."""
+        return np.asarray(unknowns[:_POINTS].reshape(_N, DEGREE + 1))
+
+    def torques(self, unknowns: Vector) -> Vector:
+        """Joint torques at the nodes of a solution, shape (nodes, 12) [Nm]."""
+        return np.asarray(unknowns[_POINTS:].reshape(-1, _NODE)[:, 3 * _N : 4 * _N] * _TORQUE)
+
+    @property
+    def basis(self) -> Vector:
+        """Angles at the nodes from control points, shape (nodes, 8)."""
+        return self._bases[0]
+
+    def residuals(
+        self, unknowns: Vector, rows: Vector, bounds: tuple[Vector, Vector], duration: float
+    ) -> dict[str, Residual]:
+        """Largest violation of each group of constraints, in its unit.
+
+        Args:
+            unknowns: of `unknowns`, so that torques and ground forces follow from the motion.
+            rows: g there.
+            bounds: of the rows.
+        """
+        outside, found = _outside(rows, bounds), dict[str, float]()
+        for group in self.program.groups:
+            value = float(outside[group.rows].max()) * group.size
+            found[group.name] = max(value, found.get(group.name, 0.0))
+        beyond = _outside(unknowns, self.bounds(duration))[_POINTS:].reshape(-1, _NODE).max(axis=0)
+        found["joint limits"] = float(beyond[:_N].max())
+        found["speed limits"] = float(beyond[_N : 2 * _N].max()) / duration
+        found["torque limits"] = float(beyond[3 * _N : 4 * _N].max()) * _TORQUE
+        found["vertical ground force"] = float(beyond[4 * _N :].max()) * _FORCE
+        return {name: Residual(value, self.units[name][0]) for name, value in found.items()}
+
+    def node(self, index: int) -> Places:
+        """Places of a node's unknowns."""
+        return _POINTS + index * _NODE + np.arange(_NODE)
+
+    def _build(self) -> None:
+        requirements, program = self.requirements, self.program
+        last = requirements.nodes - 1
+        q, v, a, torque, wrench = (casadi.SX.sym(name, n) for name, n in zip("qvatw", (_N, _N, _N, _N, 6), strict=True))
+        z = casadi.vertcat(q, v, a, torque, wrench)
+        rate, acceleration = v / self._duration, a / self._duration**2
+        up = casadi.DM([0.0, 0.0, GRAVITY])
+        torques, ground = self.chain.inverse_dynamics(q, rate, acceleration, up, casadi.SX(3, 1))
+        loads = casadi.vertcat(torques / _TORQUE, ground.force / _FORCE, ground.moment / _MOMENT)
+        self._loads = casadi.Function("loads", [casadi.vertcat(q, v, a), self.symbols], [loads])
+        self.reach = self._reach_function(q)
+
+        program.add_linear("trajectory", "rad", self._trajectory_rows(), np.zeros(3 * _N * requirements.nodes))
+        self._add_boundary()
+        everywhere = [*self._dynamics(loads, torque, wrench), *self._ground(wrench), *self.attitude(q)]
+        swing = self._swing(q, rate)
+        program.add(everywhere, z, [self.node(0), self.node(last)])
+        program.add([*everywhere, *swing], z, [self.node(n) for n in range(1, last)])
+        pose = self.landing(q)
+        if self.kind == "periodic":
+            program.add([*pose, *self._touchdown(q, rate)], z, [self.node(last)])
+            self._add_impact()
+        else:
+            program.add(pose, z, [self.node(0 if self.kind == "start" else last)])
+        weights = np.full(requirements.nodes, 1.0 / last)
+        weights[[0, last]] *= 0.5
+        pressure = self._pressure_moment(wrench)
+        sole = self.chain.frames(q, rate)[self.chain.swing_foot].rotation[2, :2]
+        cost = (
+            casadi.sumsqr(torque)
+            + requirements.tilt_weight * casadi.sumsqr(sole)
+            + requirements.acceleration_weight * casadi.sumsqr(acceleration)
+            + requirements.pressure_weight * casadi.sumsqr(pressure[:2] / _MOMENT)
+        )
+        program.minimise(cost, z, [self.node(n) for n in range(requirements.nodes)], weights)
+
+    def _reach_function(self, q: Symbol) -> Any:
+        """pose, (pelvis, swing ankle) [m] in the walking frame, parameters -> error of both with their attitudes, Jacobian."""
+        target = casadi.SX.sym("target", 6)
+        frames = self.chain.frames(q, casadi.SX(_N, 1))
+        pelvis, foot = frames[self.chain.pelvis], frames[self.chain.swing_foot]
+        error = casadi.vertcat(
+            self._yaw @ pelvis.position - target[:3],
+            _tilt(self._yaw @ pelvis.rotation),
+            self._yaw @ foot.position - target[3:],
+            _tilt(self._yaw @ self._yaw @ foot.rotation),
+        )
+        return casadi.Function("reach", [q, target, self.symbols], [error, casadi.jacobian(error, q)])
+
+    def _trajectory_rows(self) -> Vector:
+        """Nodes follow from the control points: q, dq/ds, d2q/ds2 minus basis times points is zero."""
+        rows = np.zeros((self.requirements.nodes, 3, _N, self.program.unknowns))
+        for node in range(self.requirements.nodes):
+            for order, basis in enumerate(self._bases):
+                for joint in range(_N):
+                    row = rows[node, order, joint]
+                    row[joint * (DEGREE + 1) : (joint + 1) * (DEGREE + 1)] = -basis[node]
+                    row[self.node(node)[order * _N + joint]] = 1.0
+        return rows.reshape(-1, self.program.unknowns)
+
+    def _control_point(self, index: int) -> Vector:
+        """Rows that pick a control point of every joint, shape (12, unknowns)."""
+        rows = np.zeros((_N, self.program.unknowns))
+        rows[np.arange(_N), np.arange(_N) * (DEGREE + 1) + index % (DEGREE + 1)] = 1.0
+        return rows
+
+    def _add_boundary(self) -> None:
+        program, point = self.program, self._control_point
+        if self.kind == "periodic":
+            rows = point(0) - SIGN[:, None] * point(-1)[SWAP]
+            program.add_linear("periodicity", "rad", rows, np.zeros(_N))
+            return
+        # At one end the gait's control points are given (`constraint_bounds`), at the other the robot rests.
+        given, rest = ((-1, -2), (0, 1, 2)) if self.kind == "start" else ((0, 1), (-1, -2, -3))
+        for name, index in zip(("gait pose", "gait speed"), given, strict=True):
+            program.add_linear(name, "rad", point(index), np.zeros(_N))
+        for name, index in zip(("rest", "rest acceleration"), rest[1:], strict=True):
+            program.add_linear(name, "rad", point(rest[0]) - point(index), np.zeros(_N))
+
+    def constraint_bounds(self, around: Gait | None = None) -> tuple[Vector, Vector]:
+        """Bounds of the rows; `around` is the periodic gait that a start step leads to and a stop step comes from."""
+        lower, upper = self.program.lower.copy(), self.program.upper.copy()
+        if around is not None:
+            end, next_one = (-1, -2) if self.kind == "start" else (0, 1)
+            pose, other = around.coefficients[:, end], around.coefficients[:, next_one]
+            # The same speed, over a step of another duration.
+            points = {"gait pose": pose, "gait speed": pose + (other - pose) * TRANSITION / around.duration}
+            for group in self.program.groups:
+                if group.name in points:
+                    lower[group.rows] = upper[group.rows] = points[group.name]
+        return lower, upper
+
+    def _dynamics(self, loads: Symbol, torque: Symbol, wrench: Symbol) -> list[Rows]:
+        zero = np.zeros(_N)
+        return [
+            Rows("equation of motion", "Nm", _TORQUE, (loads[:_N] - torque) * _TORQUE, zero, zero),
+            Rows("ground force balance", "N", _FORCE, (loads[_N : _N + 3] - wrench[:3]) * _FORCE, zero[:3], zero[:3]),
+            Rows("ground moment balance", "Nm", _MOMENT, (loads[_N + 3 :] - wrench[3:]) * _MOMENT, zero[:3], zero[:3]),
+        ]
+
+    def _pressure_moment(self, wrench: Symbol) -> Symbol:
+        """Ground moment about the sole's centre [Nm]."""
+        x, z = self.exoskeleton.sole_centre
+        return wrench[3:] * _MOMENT - casadi.cross(casadi.DM([x, 0.0, z]), wrench[:3] * _FORCE)
+
+    def _ground(self, wrench: Symbol) -> list[Rows]:
+        """Friction cone; centre of pressure and yaw moment, as vertical force left over [N]."""
+        requirements, exo = self.requirements, self.exoskeleton
+        force, moment = wrench[:3] * _FORCE, self._pressure_moment(wrench)
+        length, width = exo.sole_size
+        lever_x = min(
+            requirements.sole_share * length / 2, requirements.cell_share * (exo.cell_x[0] - exo.cell_x[1]) / 2
+        )
+        lever_y = min(requirements.sole_share * width / 2, requirements.cell_share * exo.cell_y)
+
+        def within(value: Symbol, lever: float) -> Symbol:
+            return casadi.vertcat(force[2] - value / lever, force[2] + value / lever)
+
+        # The cone as a difference of squares over its size: N, and smooth everywhere.
+        cone = (force[2] ** 2 - (force[0] ** 2 + force[1] ** 2) / requirements.friction**2) / _FORCE
+        return [
+            _positive("ground friction", "N", _FORCE, cone),
+            _positive("centre of pressure along the sole", "N", _FORCE, within(moment[1], lever_x)),
+            _positive("centre of pressure across the sole", "N", _FORCE, within(moment[0], lever_y)),
+            _positive("yaw moment of the stance foot", "N", _FORCE, within(moment[2], requirements.yaw_lever)),
+        ]
+
+    def attitude(self, q: Symbol) -> list[Rows]:
+        """The pelvis upright and forward."""
+        requirements = self.requirements
+        tilt = _tilt(self._yaw @ self.chain.frames(q, casadi.SX(_N, 1))[self.chain.pelvis].rotation)
+        limit = np.sin([requirements.roll, requirements.pitch, requirements.yaw])
+        return [Rows("pelvis attitude", "rad", 0.1, tilt, -limit, limit)]
+
+    def _swing(self, q: Symbol, rate: Symbol) -> list[Rows]:
+        """Clearance of the four corners of the swing sole; corridor of its ankle."""
+        requirements = self.requirements
+        foot = self.chain.frames(q, rate)[self.chain.swing_foot]
+        ground = self.exoskeleton.sole_centre[1]
+        heights = [
+            foot.position[2] + casadi.dot(foot.rotation[2, :].T, casadi.DM(corner)) - ground
+            for corner in self._corners()
+        ]
+        needed = requirements.clearance * np.sin(np.pi * self.phases[1:-1, None]) ** (
+            2 if self.kind == "periodic" else 4
+        )
+        side = (self._yaw @ foot.position)[1]
+        return [
+            Rows("swing clearance", "m", 0.05, casadi.vertcat(*heights), np.tile(needed, 4), np.full(4, np.inf)),
+            Rows(
+                "swing corridor",
+                "m",
+                0.1,
+                side,
+                np.array([requirements.corridor[0]]),
+                np.array([requirements.corridor[1]]),
+            ),
+        ]
+
+    def landing(self, q: Symbol) -> list[Rows]:
+        """Swing foot flat on the ground, toes out as the stance foot's, step length ahead."""
+        foot = self.chain.frames(q, casadi.SX(_N, 1))[self.chain.swing_foot]
+        position = self._yaw @ foot.position
+        tilt = _tilt(self._yaw @ self._yaw @ foot.rotation)  # the stance foot's toe-out, mirrored
+        zero, requirements = np.zeros(3), self.requirements
+        place = casadi.vertcat(position[0] - self._length, position[2])
+        return [
+            Rows("landing place", "m", 1.0, place, zero[:2], zero[:2]),
+            Rows("landing attitude", "rad", 1.0, tilt, zero, zero),
+            Rows(
+                "landing width",
+                "m",
+                0.1,
+                position[1],
+                np.array([requirements.corridor[0]]),
+                np.array([requirements.corridor[1]]),
+            ),
+        ]
+
+    def _touchdown(self, q: Symbol, rate: Symbol) -> list[Rows]:
+        """Soft landing: the foot comes down slowly and hardly slides or turns."""
+        requirements = self.requirements
+        foot = self.chain.frames(q, rate)[self.chain.swing_foot]
+        speed = self._yaw @ foot.rotation @ foot.linear
+        one = np.ones(3)
+        low, high = (np.array([value]) for value in requirements.landing_speed)
+        slide, turn = requirements.landing_slide * one[:2], requirements.landing_turn * one
+        return [
+            Rows("landing speed", "m/s", 0.02, speed[2], low, high),
+            Rows("landing slide", "m/s", requirements.landing_slide, speed[:2], -slide, slide),
+            Rows("landing turn", "rad/s", requirements.landing_turn, foot.angular, -turn, turn),
+        ]
+
+    def _add_impact(self) -> None:
+        """The impact map to the mirrored start: no joint impulse, ground impulse upwards, the foot that leaves hardly sinks.
+
+        In the mirrored robot the landing foot is the stance foot: from its twist to rest, from the old rates to the new.
+        """
+        requirements, program, duration = self.requirements, self.program, self._duration
+        q0, v0, q1, v1 = (casadi.SX.sym(name, _N) for name in ("q0", "v0", "q1", "v1"))
+        landing = self.chain.frames(q1, v1 / duration)[self.chain.swing_foot]
+        change = (v0 - casadi.DM(SIGN) * v1[SWAP.tolist()]) / duration
+        impulses, ground = self.chain.inverse_dynamics(
+            q0, casadi.SX(_N, 1), change, -_MIRROR * landing.linear, _MIRROR * landing.angular
+        )
+        leaving = self.chain.frames(q0, v0 / duration)[self.chain.swing_foot]
+        speeds = [
+            (leaving.rotation @ (leaving.linear + casadi.cross(leaving.angular, casadi.DM(corner))))[2]
+            for corner in self._corners()
+        ]
+        jump = np.full(_N, requirements.impact_jump)
+        rows = [
+            Rows("impact map", "Nms", 5.0, impulses, np.zeros(_N), np.zeros(_N)),
+            Rows("speed change at impact", "rad/s", 0.05, change, -jump, jump),
+            _positive("impact impulse", "Ns", 3.0, ground.force[2]),
+            Rows(
+                "foot leaving",
+                "m/s",
+                0.02,
+                casadi.vertcat(*speeds),
+                np.full(4, -requirements.sinking),
+                np.full(4, np.inf),
+            ),
+        ]
+        ends = np.concatenate([self.node(0)[: 2 * _N], self.node(requirements.nodes - 1)[: 2 * _N]])
+        program.add(rows, casadi.vertcat(q0, v0, q1, v1), [ends])
+
+    def _corners(self) -> list[tuple[float, float, float]]:
+        exo = self.exoskeleton
+        x, z = exo.sole_centre
+        length, width = exo.sole_size
+        return [(x + i * length / 2, j * width / 2, z) for i in (1, -1) for j in (1, -1)]
+
+
+def _outside(values: Vector, bounds: tuple[Vector, Vector]) -> Vector:
+    return np.maximum(np.maximum(bounds[0] - values, values - bounds[1]), 0.0)
+
+
+def _tilt(rotation: Symbol) -> Symbol:
+    """Small rotation as three numbers, zero when there is none."""
+    return casadi.vertcat(rotation[2, 1], -rotation[2, 0], rotation[1, 0])
+
+
+def _positive(name: str, unit: str, size: float, values: Symbol) -> Rows:
+    count = values.shape[0]
+    return Rows(name, unit, size, values, np.zeros(count), np.full(count, np.inf))
+
+
+def _about_z(angle: float) -> Vector:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

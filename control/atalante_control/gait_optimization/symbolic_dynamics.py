@@ -1,0 +1,253 @@
+"""Inverse dynamics and kinematics of the walking chain in CasADi symbols, from the flat stance foot to the swing foot.
+
+`links of the model -> bodies -> Chain (topology, numbers as parameters) -> expressions for the program`. The tree of the
+model is rooted at the pelvis; the right foot stands, so it is walked from there: up the stance leg against the joints'
+direction, down the swing leg along it. Vectors are those of Featherstone's recursive Newton-Euler algorithm in link
+frames, accelerations of a frame's origin with gravity in them; the root frame is the stance foot's, flat on the ground.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+import numpy as np
+import numpy.typing as npt
+
+from atalante_control.model import BASE_LINK, LEG_LINKS, Inertia, Link, Vector3
+from atalante_hal.robot import JOINTS, SIDES
+
+Vector = npt.NDArray[np.float64]
+Symbol = Any  # casadi.SX
+
+_LEFT, _RIGHT = SIDES
+STANCE_FOOT, SWING_FOOT = f"{_RIGHT}_{LEG_LINKS['HA']}", f"{_LEFT}_{LEG_LINKS['HA']}"
+_NUMBERS = 13  # of a body: mass, first moment (3), inertia about the origin (6), joint origin (3)
+
+
+@dataclass(frozen=True)
+class Body:
+    """A link that moves, with the links fixed to it. Inertia about the link's origin."""
+
+    name: str
+    parent: str
+    joint: int  # index in JOINTS, -1 for the pelvis
+    origin: Vector3  # m, joint in the parent's frame
+    yaw: float  # rad, about the parent's z
+    axis: Vector3
+    mass: float  # kg
+    moment: Vector3  # kg m, mass times centre of mass
+    inertia: Vector  # (6,) kg m2 about the origin: xx, xy, xz, yy, yz, zz
+
+
+@dataclass(frozen=True)
+class Wrench:
+    """What the ground does to the stance foot, at the foot link's origin, in its axes."""
+
+    force: Symbol  # (3,) N
+    moment: Symbol  # (3,) Nm
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Pose and, where asked for, velocity of a link in the stance foot's frame."""
+
+    rotation: Symbol  # (3, 3), link to stance foot
+    position: Symbol  # (3,) m
+    angular: Symbol  # (3,) rad/s, in the link's own axes
+    linear: Symbol  # (3,) m/s, of the link's origin, in the link's own axes
+
+
+def bodies(links: Sequence[Link]) -> tuple[Body, ...]:
+    """The pelvis and the twelve bodies the joints move, in the order of `JOINTS`; fixed links become part of theirs.
+
+    Raises:
+        ValueError: a fixed link is turned or carries a moving one: this generator makes none.
+    """
+    carriers = {link.name: link for link in links if link.joint or link.name == BASE_LINK}
+    mass = dict.fromkeys(carriers, 0.0)
+    moment = {name: np.zeros(3) for name in carriers}
+    inertia = {name: np.zeros((3, 3)) for name in carriers}
+    for link in links:
+        carrier, place = (link.name, np.zeros(3)) if link.name in carriers else (link.parent, np.array(link.origin))
+        if carrier not in carriers or (carrier != link.name and link.yaw):
+            raise ValueError(
+                f"link {link.name} is fixed to {link.parent} with a turn, or to a fixed link; neither is known"
+            )
+        centre = place + np.array(link.inertia.centre)
+        mass[carrier] += link.inertia.mass
+        moment[carrier] += link.inertia.mass * centre
+        inertia[carrier] += _tensor(link.inertia) + link.inertia.mass * (
+            centre @ centre * np.eye(3) - np.outer(centre, centre)
+        )
+    upper = np.triu_indices(3)
+    ordered = sorted(carriers.values(), key=lambda link: JOINTS.index(link.joint) if link.joint else -1)
+    return tuple(
+        Body(
+            link.name,
+            link.parent,
+            JOINTS.index(link.joint) if link.joint else -1,
+            link.origin,
+            link.yaw,
+            link.axis,
+            mass[link.name],
+            (float(moment[link.name][0]), float(moment[link.name][1]), float(moment[link.name][2])),
+            inertia[link.name][upper],
+        )
+        for link in ordered
+    )
+
+
+class Chain:
+    """The chain with its numbers as symbols: one set of expressions serves every subject.
+
+    Axes and toe-out are constants. Numbers that are zero in the reference stay zero, which keeps the expressions small.
+    """
+
+    def __init__(self, reference: Sequence[Link]) -> None:
+        """Take topology, axes and the pattern of zeros from a reference robot."""
+        self.bodies = bodies(reference)
+        numbers = _numbers(self.bodies)
+        self._used = np.flatnonzero(numbers)
+        self.symbols = casadi.SX.sym("chain", len(self._used))
+        flat = [casadi.SX(0)] * numbers.size
+        for place, index in enumerate(self._used):
+            flat[index] = self.symbols[place]
+        width = numbers.shape[1]
+        self._rows = [casadi.vertcat(*flat[i * width : (i + 1) * width]) for i in range(len(self.bodies))]
+        by_name = {body.name: i for i, body in enumerate(self.bodies)}
+        self._route: list[tuple[int, int, bool]] = []  # (known body, next body, the next is the known one's parent)
+        place = by_name[STANCE_FOOT]
+        while self.bodies[place].parent:
+            parent = by_name[self.bodies[place].parent]
+            self._route.append((place, parent, True))
+            place = parent
+        self._route += [
+            (by_name[body.parent], by_name[body.name], False) for body in self.bodies if body.name.startswith(_LEFT)
+        ]
+        self.root, self.pelvis, self.swing_foot = by_name[STANCE_FOOT], by_name[BASE_LINK], by_name[SWING_FOOT]
+        #: rad, of the stance foot when the pelvis faces forward and all joints are zero.
+        self.stance_yaw = math.fsum(body.yaw for body in self.bodies if body.name.startswith(_RIGHT))
+
+    def values(self, links: Sequence[Link]) -> Vector:
+        """Numbers of a robot for `symbols`.
+
+        Raises:
+            ValueError: the robot has another topology than the reference.
+        """
+        robot = bodies(links)
+        same = all(
+            (a.name, a.parent, a.joint, a.yaw, a.axis) == (b.name, b.parent, b.joint, b.yaw, b.axis)
+            for a, b in zip(robot, self.bodies, strict=True)
+        )
+        numbers = _numbers(robot).ravel()
+        unused = np.delete(numbers, self._used)
+        if not same or unused.any():
+            raise ValueError("the robot has another topology than the one the program was built for")
+        return np.asarray(numbers[self._used])
+
+    def frames(self, q: Symbol, qd: Symbol) -> dict[int, Frame]:
+        """Pose and velocity of every body, keyed by its index in `bodies`, with the stance foot at rest."""
+        zero = casadi.SX(3, 1)
+        frames = {self.root: Frame(casadi.SX.eye(3), zero, zero, zero)}
+        for known, new, upwards in self._route:
+            at, body = frames[known], self.bodies[known if upwards else new]
+            turn, origin, axis = self._joint(known if upwards else new, q)
+            rate = qd[body.joint] * axis
+            if upwards:
+                rotation = at.rotation @ turn.T
+                angular = turn @ (at.angular - rate)
+                position = at.position - rotation @ origin
+                linear = turn @ at.linear - casadi.cross(angular, origin)
+            else:
+                rotation = at.rotation @ turn
+                angular = turn.T @ at.angular + rate
+                position = at.position + at.rotation @ origin
+                linear = turn.T @ (at.linear + casadi.cross(at.angular, origin))
+            frames[new] = Frame(rotation, position, angular, linear)
+        return frames
+
+    def inverse_dynamics(
+        self, q: Symbol, qd: Symbol, qdd: Symbol, linear: Symbol, angular: Symbol
+    ) -> tuple[Symbol, Wrench]:
+        """Joint torques (12,) [Nm] and ground wrench of a motion of the chain.
+
+        Args:
+            linear, angular: acceleration of the stance foot's origin in its own axes, gravity as an acceleration upwards;
+                the foot does not turn. With velocities in the place of accelerations and `qd` zero, torques are joint
+                impulses and the wrench is that of an impact.
+        """
+        omega, alpha, acceleration = {self.root: casadi.SX(3, 1)}, {self.root: angular}, {self.root: linear}
+        turns, origins, axes = {}, {}, {}
+        cross = casadi.cross
+        for known, new, upwards in self._route:
+            child = known if upwards else new
+            body = self.bodies[child]
+            turn, origin, axis = turns[child], origins[child], axes[child] = self._joint(child, q)
+            rate, rate2 = qd[body.joint] * axis, qdd[body.joint] * axis
+            if upwards:
+                w, b = omega[known], alpha[known]
+                omega[new] = turn @ (w - rate)
+                alpha[new] = turn @ (b - rate2 - cross(w, rate))
+                acceleration[new] = turn @ acceleration[known] - _carried(omega[new], alpha[new], origin)
+            else:
+                w = turn.T @ omega[known]
+                omega[new] = w + rate
+                alpha[new] = turn.T @ alpha[known] + rate2 + cross(w, rate)
+                acceleration[new] = turn.T @ (acceleration[known] + _carried(omega[known], alpha[known], origin))
+        force, moment = {}, {}
+        for i, row in enumerate(self._rows):
+            mass, first, inertia = row[0], row[1:4], _symmetric(row[4:10])
+            w, b, a = omega[i], alpha[i], acceleration[i]
+            force[i] = mass * a + _carried(w, b, first)
+            moment[i] = inertia @ b + cross(w, inertia @ w) + cross(first, a)
+        torque = [casadi.SX(0)] * len(JOINTS)
+        for known, new, upwards in reversed(self._route):
+            child = known if upwards else new
+            turn, origin, axis = turns[child], origins[child], axes[child]
+            f, n = force[new], moment[new]
+            if upwards:
+                f, n = turn.T @ f, turn.T @ (n - cross(origin, f))
+                torque[self.bodies[child].joint] = -casadi.dot(axis, n)
+            else:
+                torque[self.bodies[child].joint] = casadi.dot(axis, n)
+                f = turn @ f
+                n = turn @ n + cross(origin, f)
+            force[known], moment[known] = force[known] + f, moment[known] + n
+        return casadi.vertcat(*torque), Wrench(force[self.root], moment[self.root])
+
+    def _joint(self, child: int, q: Symbol) -> tuple[Symbol, Symbol, Symbol]:
+        """Rotation child to parent, joint origin in the parent's frame, axis in the child's."""
+        body = self.bodies[child]
+        norm = math.hypot(*body.axis)
+        axis = np.array(body.axis) / norm
+        along = np.outer(axis, axis)
+        skew = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+        angle = q[body.joint]
+        turn = casadi.DM(along) + casadi.cos(angle) * casadi.DM(np.eye(3) - along) + casadi.sin(angle) * casadi.DM(skew)
+        if body.yaw:
+            c, s = math.cos(body.yaw), math.sin(body.yaw)
+            turn = casadi.DM([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ turn
+        return turn, self._rows[child][10:13], casadi.SX(casadi.DM(axis))
+
+
+def _carried(omega: Symbol, alpha: Symbol, lever: Symbol) -> Symbol:
+    """Acceleration of a point at `lever` over that of the origin."""
+    return casadi.cross(alpha, lever) + casadi.cross(omega, casadi.cross(omega, lever))
+
+
+def _tensor(inertia: Inertia) -> Vector:
+    xx, xy, xz, yy, yz, zz = inertia.tensor
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _symmetric(six: Symbol) -> Symbol:
+    xx, xy, xz, yy, yz, zz = (six[i] for i in range(6))
+    return casadi.vertcat(casadi.horzcat(xx, xy, xz), casadi.horzcat(xy, yy, yz), casadi.horzcat(xz, yz, zz))
+
+
+def _numbers(chain: Sequence[Body]) -> Vector:
+    return np.array([(body.mass, *body.moment, *body.inertia, *body.origin) for body in chain])

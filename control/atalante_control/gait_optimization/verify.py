@@ -1,0 +1,235 @@
+"""An independent judgement of a gait: `gait, patient -> Pinocchio -> what it demands of joints, ground and impact`.
+
+Nothing is shared with the optimiser: polynomials by de Casteljau, the model through its URDF, the pelvis as a floating base
+whose motion is reconstructed from the stance foot at rest, torques and ground wrench from recursive Newton-Euler on that
+base, and the impact as the KKT system of the floating robot. And it looks every few milliseconds, where the optimiser
+looked at its nodes alone.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pinocchio
+
+from atalante_control.gait.gait import SIGN, SWAP, Gait
+from atalante_control.model import BASE_LINK, LEG_LINKS, ExoskeletonParameters, Patient, pinocchio_model, urdf
+from atalante_hal.robot import SIDES, Robot
+
+Vector = npt.NDArray[np.float64]
+
+_LEFT, _RIGHT = (f"{side}_{LEG_LINKS['HA']}" for side in SIDES)
+_SAMPLES = 201  # over a step
+_LOCAL = pinocchio.ReferenceFrame.LOCAL
+_EXACT = 1e-6  # SI units, for what an optimiser claims to have met exactly
+_SLIDING = 1.0  # Ns, that friction need not hold at the impact: with all the mass behind it some millimetres a second
+_SINKING = 1e-3  # m, of the foot that leaves, in its first moments
+
+
+class Check(NamedTuple):
+    """One demand on a gait: the largest value found and what is allowed."""
+
+    name: str
+    value: float
+    limit: float
+    unit: str
+
+    @property
+    def holds(self) -> bool:
+        """Whether it is met."""
+        return self.value <= self.limit
+
+
+class _Motion(NamedTuple):
+    """Samples of a step; shape (n, 12) [rad, rad/s, rad/s2]."""
+
+    q: Vector
+    qd: Vector
+    qdd: Vector
+
+
+class Verifier:
+    """A patient in the exoskeleton, on a floating base."""
+
+    def __init__(self, robot: Robot, patient: Patient) -> None:
+        """Build the Pinocchio model from the URDF."""
+        self._robot, self._exo = robot, ExoskeletonParameters()
+        self._articulated = pinocchio_model(urdf(self._exo, robot, patient), fixed_base=False)
+        model = self._articulated.model
+        self._data: Any = model.createData()
+        self._left, self._right, self._pelvis = (model.getFrameId(name) for name in (_LEFT, _RIGHT, BASE_LINK))
+        self.weight = pinocchio.computeTotalMass(model) * 9.81  # N
+
+    def verify(self, gait: Gait, kind: str = "periodic") -> tuple[Check, ...]:
+        """Everything a right-stance step has to keep.
+
+        Args:
+            kind: `periodic`, or `start` and `stop`, which rest at one end and do not hit the ground.
+        """
+        motion = _sampled(gait, np.linspace(0.0, 1.0, _SAMPLES))
+        checks = [*self._joints(motion), *self._loads(motion), *self._swing(motion)]
+        return (*checks, *(self._cycle(motion) if kind == "periodic" else self._rest(motion, kind)))
+
+    def loads(self, q: Vector, qd: Vector, qdd: Vector) -> tuple[Vector, Vector]:
+        """Joint torques (12,) [Nm] and ground wrench (6,) [N, Nm] at the stance foot's origin, in its axes."""
+        model, data, place = self._articulated.model, self._data, self._articulated.v
+        configuration, speed, acceleration = self._on_right_foot(q), np.zeros(model.nv), np.zeros(model.nv)
+        speed[place], acceleration[place] = qd, qdd
+        jacobian = pinocchio.computeFrameJacobian(model, data, configuration, self._right, _LOCAL)
+        base = jacobian[:, :6]
+        speed[:6] = -np.linalg.solve(base, jacobian @ speed)
+        pinocchio.forwardKinematics(model, data, configuration, speed, acceleration)
+        drift = pinocchio.getFrameAcceleration(model, data, self._right, _LOCAL).vector
+        acceleration[:6] = -np.linalg.solve(base, drift)
+        demanded = pinocchio.rnea(model, data, configuration, speed, acceleration)
+        wrench = np.linalg.solve(base.T, demanded[:6])
+        return (demanded - jacobian.T @ wrench)[place], wrench
+
+    def impact(self, q: Vector, qd: Vector) -> tuple[Vector, Vector, Vector]:
+        """The left foot lands flat and stays: rates after (12,) [rad/s], impulse (6,) on it, twist (6,) of the right foot.
+
+        Source: [M -J'; J 0] (v+, impulse) = (M v-, 0), J the Jacobian of the foot that lands.
+        """
+        model, data, place = self._articulated.model, self._data, self._articulated.v
+        configuration, before = self._on_right_foot(q), np.zeros(model.nv)
+        before[place] = qd
+        leaving = pinocchio.computeFrameJacobian(model, data, configuration, self._right, _LOCAL).copy()
+        before[:6] = -np.linalg.solve(leaving[:, :6], leaving @ before)
+        landing = pinocchio.computeFrameJacobian(model, data, configuration, self._left, _LOCAL).copy()
+        upper = np.triu(pinocchio.crba(model, data, configuration))
+        mass = upper + np.triu(upper, 1).T
+        system = np.block([[mass, -landing.T], [landing, np.zeros((6, 6))]])
+        outcome = np.linalg.solve(system, np.concatenate([mass @ before, np.zeros(6)]))
+        after = outcome[: model.nv]
+        return after[place], outcome[model.nv :], leaving @ after
+
+    def _joints(self, motion: _Motion) -> list[Check]:
+        robot = self._robot
+        beyond = np.maximum(robot.position_min - motion.q, motion.q - robot.position_max)
+        speed = np.abs(motion.qd) / robot.velocity_max
+        return [
+            Check("beyond the joint limits", float(beyond.max()), 0.0, "rad"),
+            Check("speed over its limit", float(speed.max()), 1.0, ""),
+        ]
+
+    def _loads(self, motion: _Motion) -> list[Check]:
+        loads = [self.loads(*state) for state in zip(*motion, strict=True)]
+        torque = np.array([row[0] for row in loads])
+        wrench = np.array([row[1] for row in loads])
+        exo, force = self._exo, wrench[:, :3]
+        x, z = exo.sole_centre
+        moment = wrench[:, 3:] - np.cross([x, 0.0, z], force)
+        vertical = force[:, 2]
+        slip = np.hypot(force[:, 0], force[:, 1]) / vertical
+        return [
+            Check("torque over its limit", float((np.abs(torque) / self._robot.torque_max).max()), 1.0, ""),
+            Check("weight off the ground", float(1.0 - vertical.min() / self.weight), 0.5, ""),
+            Check("friction needed", float(slip.max()), 0.5, ""),
+            Check(
+                "centre of pressure along the sole",
+                float(np.abs(moment[:, 1] / vertical).max()),
+                exo.sole_size[0] / 2,
+                "m",
+            ),
+            Check("centre of pressure across the sole", float(np.abs(moment[:, 0] / vertical).max()), exo.cell_y, "m"),
+            Check("yaw moment over force", float(np.abs(moment[:, 2] / vertical).max()), 0.05, "m"),
+        ]
+
+    def _swing(self, motion: _Motion) -> list[Check]:
+        heights, apart, tilt = [], [], []
+        forward = self._forward()
+        for q in motion.q:
+            stance, swing, pelvis = self._poses(q)
+            swing, pelvis = stance.actInv(swing), stance.actInv(pelvis)
+            heights.append((swing.rotation @ self._corners().T)[2] + swing.translation[2] - self._exo.sole_centre[1])
+            apart.append((forward.T @ swing.translation)[1])
+            tilt.append(np.abs(pinocchio.log3(forward.T @ pelvis.rotation)).max())
+        return [
+            Check("swing sole in the ground", float(-np.min(heights)), _SINKING, "m"),
+            Check("ankles closer than the feet are wide", self._foot_width() - min(apart), 0.0, "m"),
+            Check("pelvis off upright and forward", max(tilt), math.radians(8.0), "rad"),
+        ]
+
+    def _cycle(self, motion: _Motion) -> list[Check]:
+        """The step closes: landing pose, periodicity, impact map."""
+        after, impulse, leaving = self.impact(motion.q[-1], motion.qd[-1])
+        mirrored_q, mirrored_qd = SIGN * motion.q[0][SWAP], SIGN * motion.qd[0][SWAP]
+        # The landing is so soft that the impulse is about that of a dropped book: what friction lacks is small, not none.
+        sliding = math.hypot(impulse[0], impulse[1]) - 0.5 * impulse[2]
+        sinking = -min(leaving[2] + np.cross(leaving[3:], corner)[2] for corner in self._corners())
+        return [
+            *self._landing(motion.q[-1]),
+            Check("joint angles not periodic", float(np.abs(motion.q[-1] - mirrored_q).max()), _EXACT, "rad"),
+            Check("joint speeds off the impact map", float(np.abs(after - mirrored_qd).max()), _EXACT, "rad/s"),
+            Check("impulse of the impact downwards", float(-impulse[2]), 0.0, "Ns"),
+            Check("impulse beyond friction at the impact", sliding, _SLIDING, "Ns"),
+            Check("sinking speed of the foot that leaves", float(sinking), 0.01 + _EXACT, "m/s"),
+        ]
+
+    def _rest(self, motion: _Motion, kind: str) -> list[Check]:
+        end = 0 if kind == "start" else -1
+        return [
+            *self._landing(motion.q[end]),
+            Check("speed at rest", float(np.abs(motion.qd[end]).max()), _EXACT, "rad/s"),
+            Check("acceleration at rest", float(np.abs(motion.qdd[end]).max()), 1e-3, "rad/s2"),
+        ]
+
+    def _landing(self, q: Vector) -> list[Check]:
+        """The left foot stands flat, turned as the right one's mirror image."""
+        stance, swing, _ = self._poses(q)
+        relative = stance.actInv(swing)
+        turned = self._forward() @ self._forward()
+        return [
+            Check("landing sole over the ground", abs(float(relative.translation[2])), _EXACT, "m"),
+            Check(
+                "landing foot turned", float(np.abs(pinocchio.log3(turned.T @ relative.rotation)).max()), _EXACT, "rad"
+            ),
+        ]
+
+    def _poses(self, q: Vector) -> tuple[Any, Any, Any]:
+        """Right foot, left foot, pelvis."""
+        configuration = pinocchio.neutral(self._articulated.model)
+        configuration[self._articulated.q] = q
+        pinocchio.framesForwardKinematics(self._articulated.model, self._data, configuration)
+        frames = self._data.oMf
+        return frames[self._right].copy(), frames[self._left].copy(), frames[self._pelvis].copy()
+
+    def _on_right_foot(self, q: Vector) -> Vector:
+        """Configuration of the floating robot whose right foot is the world's frame."""
+        stance, _, pelvis = self._poses(q)
+        configuration = pinocchio.neutral(self._articulated.model)
+        configuration[self._articulated.q] = q
+        configuration[:7] = pinocchio.SE3ToXYZQUAT(stance.actInv(pelvis))
+        return np.asarray(configuration)
+
+    def _forward(self) -> Vector:
+        """Walking frame in the stance foot's, which toes out."""
+        return np.asarray(pinocchio.utils.rotate("z", self._exo.toe_out))
+
+    def _corners(self) -> Vector:
+        """Of the sole, in the foot's frame, shape (4, 3) [m]."""
+        x, z = self._exo.sole_centre
+        length, width = self._exo.sole_size
+        return np.array([(x + i * length / 2, j * width / 2, z) for i in (1, -1) for j in (1, -1)])
+
+    def _foot_width(self) -> float:
+        """Distance of the ankles at which the heels, which toe-out brings together, touch [m]."""
+        inner = self._forward().T @ (self._corners() * [1.0, -1.0, 1.0]).T
+        return float(2.0 * inner[1].max())
+
+
+def _sampled(gait: Gait, phases: Vector) -> _Motion:
+    first = np.diff(gait.coefficients, axis=1) * (gait.coefficients.shape[1] - 1) / gait.duration
+    second = np.diff(first, axis=1) * (first.shape[1] - 1) / gait.duration
+    return _Motion(
+        *(np.array([_casteljau(points, s) for s in phases]) for points in (gait.coefficients, first, second))
+    )
+
+
+def _casteljau(points: Vector, s: float) -> Vector:
+    while points.shape[1] > 1:
+        points = (1.0 - s) * points[:, :-1] + s * points[:, 1:]
+    return points[:, 0]

@@ -1,0 +1,1 @@
+"""The virtual guide: shapes, filter, kernel, backup policy and certificate."""

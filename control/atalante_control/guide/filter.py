@@ -1,0 +1,211 @@
+r"""Virtual guide filter of the swing leg's SH and SK, with the exact flow of the backup policy.
+
+`e, e' of both joints -> safe backward image h -> lambda -> u_v`. Each cycle asks where the backup policy would lead the
+two joints over the rest of the step under the worst disturbances, and lets it act the more, the closer that comes to
+the guide. The flow is linear (see `backup_policy`), so the answer is a few products over the horizon for each joint and both
+extremes, not an integration; where the backup policy would saturate the drive, it is piece by piece (`kernel`).
+
+The horizon is a grid of `points` intervals ending at T, the same points all step long, plus `overlap` beyond T: there
+the joint goes on along the next step's nominal and the guide keeps its last width. Without it the last cycles of a
+step look no further than the step's end, and admit any speed there (see `certificate`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_control.gait.gait import PERIOD
+from atalante_control.gait.recentering import Deadbeat
+from atalante_control.guide.backup_policy import BackupPolicy, ForcedResponse, forced_response, free_drift
+from atalante_control.guide.kernel import BOUND, JOINT, P, errors_ahead, tick
+from atalante_control.guide.shapes import GuideShape
+from atalante_hal.compiled import compiled
+
+Vector = npt.NDArray[np.float64]
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class GuideConfig:
+    """What the guide filter needs to know of the two assisted joints, SH then SK.
+
+    Raises:
+        ValueError: a disturbance interval that does not contain zero, or a number out of range.
+    """
+
+    policies: tuple[BackupPolicy, BackupPolicy]
+    disturbance: tuple[tuple[float, float], tuple[float, float]]  # Nm, (u_ext_min, u_ext_max) of each joint
+    points: int = 100  # grid intervals over a step
+    overlap: float = 0.1  # s, horizon beyond the step's end
+    zeta: float = 0.01  # s, gain of the derivative term lambda_d
+    derivative_time: float = 0.005  # s, time constant of the low pass on dh/dt
+    reserve: float = 0.1  # part of the torque limit the rollouts do not count on: it corrects what a cycle is late
+
+    def __post_init__(self) -> None:
+        for low, high in self.disturbance:
+            if not (math.isfinite(low) and math.isfinite(high) and low <= 0.0 <= high):
+                raise ValueError(f"a disturbance bound is (min <= 0, max >= 0) in Nm, not {(low, high)!r}")
+        if self.points < 2:
+            raise ValueError(f"points is at least 2, not {self.points!r}")
+        if not 0.0 <= self.reserve < 1.0:
+            raise ValueError(f"reserve is a part of the torque limit in [0, 1), not {self.reserve!r}")
+        for name in ("overlap", "zeta", "derivative_time"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
+                raise ValueError(f"{name} is not negative and finite, in s, not {getattr(self, name)!r}")
+
+
+class GuideFilter:
+    """The filter on both joints, for one gait and one shape; the same for either swing leg, by symmetry.
+
+    Call `start_step` at each step change, then `tick` once a cycle.
+
+    Attributes:
+        joints, flow, step: what `kernel` works on, SH and SK; h, gate and guide in `joints` are of the last tick.
+        nominal: as given, Bezier control points of SH and SK, shape (2, 8) [rad].
+        cycles, stride, grid, horizon: cycles of a step, of a grid interval, of the grid points, of the horizon's end.
+        time: of every cycle to the horizon's end [s]; `forced`: responses of SH and SK on it that P is made of.
+    """
+
+    def __init__(
+        self,
+        config: GuideConfig,
+        shape: GuideShape,
+        deadbeat: Deadbeat,
+        nominal: Vector,
+        following: Vector,
+        feedforward: Vector | None = None,
+    ) -> None:
+        """Prepare every table of a step.
+
+        Args:
+            nominal: Bezier control points of the swing leg's SH and SK, shape (2, 8) [rad].
+            following: of the same joints in the step after, when the leg stands, shape (2, 8) [rad].
+            feedforward: of u_f where it is applied, shape (2, 8) [Nm].
+
+        Raises:
+            ValueError: a bound of the shape is not finite or is too small at a cycle of the step, see `GuideShape.bounds`.
+        """
+        self.config, self.shape, self.deadbeat, self.nominal = config, shape, deadbeat, nominal
+        self.cycles = round(deadbeat.duration / PERIOD)
+        self.stride = max(1, -(-self.cycles // config.points))
+        beyond = math.ceil(round(config.overlap / PERIOD) / self.stride) * self.stride
+        self.horizon = self.cycles + beyond
+        self.grid = np.arange(self.cycles % self.stride, self.horizon + 1, self.stride)
+        self.time: Vector = np.arange(self.horizon + 1, dtype=np.float64) * PERIOD
+        shape.check(self.time / deadbeat.duration)
+
+        self.forced: list[ForcedResponse] = []
+        tables = []
+        for joint, policy in enumerate(config.policies):
+            uf = None if feedforward is None else feedforward[joint]
+            curve = policy, deadbeat, nominal[joint], following[joint], self.time, uf
+            self.forced.append(forced_response(*curve))
+            tables.append(np.concatenate([self.forced[joint], free_drift(*curve)], axis=2))
+        #: First columns of `step`: of the nominal, per deviation, per rate. Shape (3, 2, horizon + 1, 4).
+        self._parts = np.stack(tables, axis=1)
+        self.flow = np.array([_flow(config, joint, self.time) for joint in (0, 1)])
+        self.step = np.empty((2, self.horizon + 1, 6))
+        self.joints = _joints(config, int(self.grid[0]), self.stride)
+        self._tick = compiled(tick)
+        self.start_step(0.0, (0.0, 0.0), (0.0, 0.0))
+        self._tick(self.joints.copy(), self.flow, self.step, 0, 0.0, 0.0, 0.0, 0.0)
+
+    def start_step(self, xi: float, deviation: Pair, rate: Pair) -> None:
+        """Take the step change: width from Xi, P from what the deadbeat has to undo.
+
+        Args:
+            xi: assistance factor of the whole step.
+            deviation: s(0) of SH and SK [rad].
+            rate: s'(0) of SH and SK [rad/s].
+        """
+        joints, (nominal, per_deviation, per_rate) = self.joints, self._parts
+        if xi != joints["xi"][0]:
+            self.step[:, :, BOUND:] = self.shape.bounds(self.time / self.deadbeat.duration, xi)
+        moved = per_deviation * np.reshape(deviation, (2, 1, 1)) + per_rate * np.reshape(rate, (2, 1, 1))
+        np.add(moved, nominal, out=self.step[:, :, :BOUND])
+        joints["xi"], joints["fresh"] = xi, True
+
+    def tick(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Pair:
+        """u_v of SH and SK [Nm].
+
+        Args:
+            cycle: since the step change; past the step's end it stays there.
+            e_hip, e_knee: q - q_des [rad].
+            ed_hip, ed_knee: q' - q_des' [rad/s].
+        """
+        cycle = min(cycle, self.cycles)
+        return self._tick(self.joints, self.flow, self.step, cycle, e_hip, ed_hip, e_knee, ed_knee)
+
+    @property
+    def tables(self) -> tuple[npt.NDArray[np.void], Vector, Vector]:
+        """`joints`, `flow` and `step`."""
+        return self.joints, self.flow, self.step
+
+    @property
+    def h(self) -> list[float]:
+        """Safe backward image function at the last tick, SH and SK; at least 0 inside it."""
+        return list(self.joints["h"].tolist())
+
+    @property
+    def gates(self) -> list[float]:
+        """lambda + (1 - lambda) lambda_d at the last tick, SH and SK."""
+        return list(self.joints["gate"].tolist())
+
+    @property
+    def bounds(self) -> list[float]:
+        """Guide at the last tick, upper and lower [rad]."""
+        return [float(self.joints[side][0]) for side in ("upper", "lower")]
+
+    @property
+    def stepped(self) -> int:
+        """Rollouts so far that were not linear, because the backup policy saturates along them."""
+        return int(self.joints["stepped"].sum())
+
+    def rollouts(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Vector:
+        """Errors the unsaturated backup policy leads to at the rest of the grid, from the exact flow.
+
+        Returns:
+            Shape (4, n) [rad]: of SH the largest e and the largest -e under the disturbance bounds, then of SK.
+        """
+        points = self.grid[self.grid >= cycle].tolist()
+        rolled = []
+        for joint, (e, ed) in enumerate(((e_hip, ed_hip), (e_knee, ed_knee))):
+            flow, step = self.flow[joint], self.step[joint]
+            y, yd = e - step[cycle, P], ed - step[cycle, P + 1]
+            rolled.append([errors_ahead(flow[point - cycle], step[point], y, yd) for point in points])
+        return np.array(rolled).swapaxes(1, 2).reshape(4, len(points))
+
+    def solution(self) -> Vector:
+        """P of this step on the cycle grid, (e, e') of SH then of SK. Shape (horizon + 1, 4) [rad, rad/s]."""
+        hip, knee = self.step[:, :, P : P + 2]
+        return np.hstack([hip, knee])
+
+
+def _joints(config: GuideConfig, first: int, stride: int) -> npt.NDArray[np.void]:
+    joints, one = np.zeros(2, JOINT), np.array([PERIOD])
+    for i, policy in enumerate(config.policies):
+        joint, (low, high) = joints[i], config.disturbance[i]
+        joint["kp"], joint["kd"], joint["inertia"] = policy.kp, policy.kd, policy.inertia
+        joint["limit"], joint["counted"] = policy.torque_limit, (1.0 - config.reserve) * policy.torque_limit
+        joint["up"], joint["down"] = high, low
+        (joint["phi11"], joint["phi12"]), (joint["phi21"], joint["phi22"]) = policy.transition(one)[0]
+        joint["s1"], joint["s2"] = policy.step_response(one)[0]
+    joints["monotone"] = all(policy.monotone for policy in config.policies)
+    joints["first"], joints["stride"] = first, stride
+    joints["zeta"], joints["smoothing"] = config.zeta, PERIOD / (config.derivative_time + PERIOD)
+    joints["xi"], joints["h"], joints["upper"], joints["lower"] = math.nan, 1.0, math.inf, math.inf
+    return joints
+
+
+def _flow(config: GuideConfig, joint: int, time: Vector) -> Vector:
+    """The joint's `flow` of `kernel`, shape (n, 9)."""
+    policy, (low, high) = config.policies[joint], config.disturbance[joint]
+    phi, (s, rate) = policy.transition(time), policy.step_response(time).T
+    largest, smallest = policy.disturbance(time, low, high)
+    kp, kd = policy.kp, policy.kd
+    added = kp * largest + kd * high * rate, -(kp * smallest + kd * low * rate)
+    return np.column_stack([phi[:, 0], largest, -smallest, kp * phi[:, 0] + kd * phi[:, 1], *added, s])

@@ -1,0 +1,1 @@
+"""Control of the joints: PID, idealization, flat foot and haptics."""

@@ -1,0 +1,1 @@
+"""Walk on the ground: detect contact of the swing foot."""
