@@ -11,8 +11,8 @@ import sys
 import numpy as np
 
 from atalante_hal.types import Command
-from atalante_tools.options import Target
-from atalante_tools.rig import open_hal
+from atalante_tools.console.options import Target
+from atalante_tools.session.rig import open_hal
 
 
 class Spring:

@@ -17,8 +17,8 @@ from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.hal import Hal
 from atalante_hal.loop import LockStep, run
 from atalante_hal.robot import load_robot
-from atalante_tools.body import open_body
-from atalante_tools.pose_hold import PoseHold
+from atalante_tools.session.body import open_body
+from atalante_tools.session.pose_hold import PoseHold
 
 
 class CountingBus(WrappedBus):

@@ -12,8 +12,8 @@ from atalante_control.airwalk.controller import AirwalkController
 from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
 from atalante_control.guide.shapes import GuideShape
 from atalante_hal.robot import load_robot
-from atalante_tools.options import Target
-from atalante_tools.rig import open_hal
+from atalante_tools.console.options import Target
+from atalante_tools.session.rig import open_hal
 
 XI = 0.5  # assistance factor
 

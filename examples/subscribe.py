@@ -1,6 +1,6 @@
 """Subscribe to the joint states of a running HAL. Uses Zenoh and protobuf, and no module of this project.
 
-Run it:  atalante hang --steps 100                          in one terminal
+Run it:  atalante airwalk --steps 100                          in one terminal
          python examples/subscribe.py                       in another one, from the root of the project
          python examples/subscribe.py tcp/192.0.2.7:7447    another endpoint
 

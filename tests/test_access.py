@@ -344,7 +344,7 @@ class TestCommand:
 
             monkeypatch.setattr(TelemetryProcess, "begin_run", subscribe_first)
             out = folder / "run"
-            command = ["hang", "--steps", "2", "--telemetry", str(folder / "telemetry.toml"), "--out", str(out)]
+            command = ["airwalk", "--steps", "2", "--telemetry", str(folder / "telemetry.toml"), "--out", str(out)]
             result = CliRunner().invoke(cli, command)
             assert (result.exit_code, result.exception) == (0, None), result.stderr
             for _ in range(TRIES):

@@ -11,10 +11,10 @@ import pytest
 
 import atalante_dbc
 from atalante_dbc.foreign import Layout, catalogue
-from atalante_hal.bulk import BulkCodec, crc_differences, crc_of_zeros
 from atalante_hal.wire.codec import Codec
 from atalante_hal.wire.e2e import crc, data_id_bytes
 from atalante_hal.wire.frame import Frames, new_frames
+from atalante_tools.canlog.column_codec import BulkCodec, crc_differences, crc_of_zeros
 
 #: DBCs with every kind of layout; each message is compared with cantools.
 COLLECTION = sorted(Path(__file__).with_name("foreign").glob("*.dbc"))

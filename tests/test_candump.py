@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE
-from atalante_tools.validate import log as log_module
-from atalante_tools.validate.candump import MARGIN, Channels, Parsed, parse
-from atalante_tools.validate.chunk import NO_DIRECTION, RECEIVED, SENT, Chunk
-from atalante_tools.validate.log import Log, open_log
+from atalante_tools.canlog.validate import log as log_module
+from atalante_tools.canlog.validate.candump import MARGIN, Channels, Parsed, parse
+from atalante_tools.canlog.validate.chunk import NO_DIRECTION, RECEIVED, SENT, Chunk
+from atalante_tools.canlog.validate.log import Log, open_log
 
 
 def parsed(text: str | bytes) -> tuple[Parsed, list[str]]:

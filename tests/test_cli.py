@@ -28,7 +28,7 @@ from atalante_hal.telemetry.ring import RingError
 from atalante_hal.telemetry.sink import SinkError
 from atalante_tools import cli as cli_module
 from atalante_tools.cli import COMMANDS, Commands, cli
-from atalante_tools.outcome import KNOWN, Failed, FaultLatched
+from atalante_tools.console.outcome import KNOWN, Failed, FaultLatched
 
 #: What a command loads that takes long, and --help must not.
 SLOW = {"numpy", "can", "cantools", "pybullet", "pinocchio", "zenoh", "mcap", "matplotlib", "atalante_dbc"}
@@ -105,7 +105,7 @@ def test_the_list_of_a_group_is_whole_sentences(group: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "names"), [("jog", JOINTS), ("vibrate", MOTORS), ("demo", SHAPES), ("hang", SHAPES)]
+    ("command", "names"), [("jog", JOINTS), ("vibrate", MOTORS), ("demo", SHAPES), ("airwalk", SHAPES)]
 )
 def test_help_says_what_there_is_to_name(command: str, names: Sequence[str]) -> None:
     words = set(re.findall(r"\w+", CliRunner().invoke(cli, [command, "--help"]).stdout))
@@ -347,7 +347,7 @@ main()
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
     imported, first = done.stdout.splitlines()
-    assert {"atalante_tools", "atalante_tools.entry", "atalante_tools.signals"} <= set(imported.split())
+    assert {"atalante_tools", "atalante_tools.entry", "atalante_tools.console.stop_request"} <= set(imported.split())
     assert not set(imported.split()) & {"click", "typing", "threading", "numpy"}
     assert first == "atalante_tools.cli True True"
 

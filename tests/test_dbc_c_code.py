@@ -17,10 +17,11 @@ from click.testing import CliRunner
 from atalante_dbc import DBC_FILE, load
 from atalante_hal.wire.codec import Codec
 from atalante_tools.cli import cli
-from atalante_tools.dbc.c_code import Build, write
+from atalante_tools.console.outcome import Failed
+from atalante_tools.dbc.build import Build
+from atalante_tools.dbc.c_code import write
 from atalante_tools.dbc.e2e_c import crc_table
 from atalante_tools.dbc.host_test import compile_host_test, run_host_test
-from atalante_tools.outcome import Failed
 
 IMAGES = 10_000
 

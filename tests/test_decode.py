@@ -17,8 +17,8 @@ from mcap.reader import make_reader
 
 import atalante_dbc
 from atalante_dbc.foreign import catalogue
+from atalante_tools.canlog.decode.mcap import encode
 from atalante_tools.cli import cli
-from atalante_tools.decode.mcap import encode
 
 COLLECTION = sorted(Path(__file__).with_name("foreign").glob("*.dbc"))
 BEGIN = 1_700_000_000.0
@@ -170,7 +170,7 @@ def test_skipped_frames_of_several_logs_are_counted(tmp_path: Path) -> None:
 
 
 def test_several_chunks_and_channels_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from atalante_tools.validate import log as log_module
+    from atalante_tools.canlog.validate import log as log_module
 
     monkeypatch.setattr(log_module, "_PIECE_BYTES", 4096)
     monkeypatch.setattr(log_module, "_CHUNK_FRAMES", 50)
@@ -260,7 +260,7 @@ def test_failed_write_leaves_the_previous_file(
     def fail(_: object) -> None:
         raise error
 
-    monkeypatch.setattr(f"atalante_tools.decode.{suffix}.{suffix.capitalize()}Sink.flush", fail)
+    monkeypatch.setattr(f"atalante_tools.canlog.decode.{suffix}.{suffix.capitalize()}Sink.flush", fail)
     result = run("decode", log, "--dbc", COLLECTION[0], "-o", out)
     assert result.exit_code == code
     assert result.stderr == (f"atalante: {out} cannot be written: No space left on device\n" if code == 1 else "")

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from atalante_tools import machine as machine_module
 from atalante_tools.cli import cli
-from atalante_tools.doctor import Check, examine
-from atalante_tools.machine import Interface, ThisMachine
+from atalante_tools.commands import machine as machine_module
+from atalante_tools.commands.doctor import Check, examine
+from atalante_tools.commands.machine import Interface, ThisMachine
 
 GOOD = Interface("vcan0", virtual=True, up=True, mtu=72, queue=1000)
 

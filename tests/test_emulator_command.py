@@ -16,11 +16,11 @@ from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.frame import Frames, new_frames
-from atalante_tools import body as body_module
-from atalante_tools import emulator as emulator_module
-from atalante_tools import rig as rig_module
 from atalante_tools.cli import cli
-from atalante_tools.signals import StopRequest
+from atalante_tools.commands import emulator as emulator_module
+from atalante_tools.console.stop_request import StopRequest
+from atalante_tools.session import body as body_module
+from atalante_tools.session import rig as rig_module
 
 
 class OtherProcess:
@@ -65,7 +65,7 @@ def test_a_hal_at_the_other_end_finds_every_node_and_an_operator(
     assert result.exit_code == 130, result.stderr
     assert result.stdout == ""
     assert result.stderr.startswith(
-        "the robot is on pcan test; now, in another terminal: atalante hang -i pcan -c test\n"
+        "the robot is on pcan test; now, in another terminal: atalante airwalk -i pcan -c test\n"
     )
     assert other.active_at is not None
     assert other.hal.missing() == []
@@ -97,7 +97,7 @@ def test_its_legs_are_those_of_the_patient_the_other_side_walks_for(
         assert result.exit_code == 130, result.stderr
     exoskeleton = ExoskeletonParameters()
     assert bodies == [urdf(exoskeleton, robot), urdf(exoskeleton.fitted(Patient(75.0, 1.75)), robot)]
-    assert "atalante hang -i pcan -c test --mass 75 --height 1.75\n" in result.stderr
+    assert "atalante airwalk -i pcan -c test --mass 75 --height 1.75\n" in result.stderr
 
 
 def test_one_seed_is_one_robot(network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,9 +17,9 @@ from atalante_hal.robot import Robot
 from atalante_hal.types import Command, SupervisorState
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.frame import FRAME, Frames, new_frames
-from atalante_tools import emulator_line
-from atalante_tools.emulator import status_line
-from atalante_tools.emulator_line import Line
+from atalante_tools.commands import emulator_line
+from atalante_tools.commands.emulator import status_line
+from atalante_tools.commands.emulator_line import Line
 
 REST = Command(torque=np.zeros(12), vibration=np.zeros(8))
 

@@ -59,7 +59,14 @@ def test_the_fault_test_passes(tmp_path: Path):
 def test_the_subscriber_receives_joint_states_without_our_modules(tmp_path: Path):
     text = (ROOT / "examples" / "subscribe.py").read_text()
     assert not re.search(r"^\s*(import|from) atalante", text, re.MULTILINE)
-    walk = [str(Path(sys.executable).with_name("atalante")), "hang", "--steps", "100", "--out", str(tmp_path / "run")]
+    walk = [
+        str(Path(sys.executable).with_name("atalante")),
+        "airwalk",
+        "--steps",
+        "100",
+        "--out",
+        str(tmp_path / "run"),
+    ]
     with subprocess.Popen(walk, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as hal:
         assert hal.stderr is not None
         try:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from atalante_tools import figures
+from atalante_tools.session import figures
 
 RIGHT, LEFT = 1, 0
 

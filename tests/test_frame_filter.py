@@ -9,7 +9,7 @@ from atalante_dbc import Network
 from atalante_hal.bus.pair import PairBus, lockstep_pair
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_hal.wire.process_image import TransmitImage
-from atalante_tools.frame_filter import FrameFilter
+from atalante_tools.testing.frame_filter import FrameFilter
 
 STATES = ("LEFT_FH_STATE", "LEFT_SK_STATE", "FOOT_LEFT_STATE")
 

@@ -14,10 +14,10 @@ from click.testing import CliRunner, Result
 
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.wire.cia402 import DriveState
-from atalante_tools import rig as rig_module
 from atalante_tools.cli import cli
-from atalante_tools.pose_hold import PEAK, minimum_jerk
-from atalante_tools.rig import Rig
+from atalante_tools.session import rig as rig_module
+from atalante_tools.session.pose_hold import PEAK, minimum_jerk
+from atalante_tools.session.rig import Rig
 
 
 def jog(*arguments: str) -> Result:

@@ -20,13 +20,14 @@ from atalante_hal.robot import Robot
 from atalante_hal.types import Command, SupervisorState
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.frame import FRAME, FRAME_BYTES, Frames
-from atalante_tools import pendant, pendant_session
 from atalante_tools.cli import cli
-from atalante_tools.emulator_line import Line
-from atalante_tools.options import Target
-from atalante_tools.pendant_node import GRACE, PendantNode, Request
-from atalante_tools.pendant_session import Keyboard, Session
-from atalante_tools.signals import StopRequest
+from atalante_tools.commands import pendant
+from atalante_tools.commands.emulator_line import Line
+from atalante_tools.console.options import Target
+from atalante_tools.console.stop_request import StopRequest
+from atalante_tools.session import pendant_session
+from atalante_tools.session.pendant_node import GRACE, PendantNode, Request
+from atalante_tools.session.pendant_session import Keyboard, Session
 
 OFF, READY, ACTIVE, HOLD = (SupervisorState[name] for name in ("OFF", "READY", "ACTIVE", "HOLD"))
 TARGET = Target("pcan", "test", lockstep=False)

@@ -14,8 +14,8 @@ import pytest
 
 # pytester forgets what a run imported; what is here already stays.
 import atalante_emulator.emulator  # noqa: F401
-import atalante_tools.frame_filter
-import atalante_tools.hil  # noqa: F401
+import atalante_tools.testing.frame_filter
+import atalante_tools.testing.hil  # noqa: F401
 
 pytest_plugins = ["pytester"]
 
@@ -37,12 +37,14 @@ def run(pytester: pytest.Pytester):
 
 def test_the_plugin_is_installed_with_the_project():
     (plugin,) = entry_points(group="pytest11", name="atalante")
-    assert plugin.value == "atalante_tools.pytest_plugin"
+    assert plugin.value == "atalante_tools.testing.pytest_plugin"
 
 
 def test_a_pytest_that_does_not_use_it_does_not_pay_for_it():
     heavy = "numpy can cantools pybullet pinocchio atalante_hal atalante_dbc click"
-    program = f"import sys, atalante_tools.pytest_plugin; print(sorted(set({heavy!r}.split()) & set(sys.modules)))"
+    program = (
+        f"import sys, atalante_tools.testing.pytest_plugin; print(sorted(set({heavy!r}.split()) & set(sys.modules)))"
+    )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
 

@@ -28,8 +28,8 @@ from atalante_control.gait_optimization.library import Library, LibraryError
 from atalante_dbc import DBC_FILE, DbcError
 from atalante_hal.robot import JOINTS, LEG_JOINTS, ROBOT_FILE, RobotError, load_robot
 from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
+from atalante_tools.canlog.validate.project import ProjectError, load_project
 from atalante_tools.cli import cli
-from atalante_tools.validate.project import ProjectError, load_project
 
 ROBOT = tomllib.loads(ROBOT_FILE.read_text())
 KEYS = tuple(ROBOT["joints"]["FH"])

@@ -20,11 +20,12 @@ from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import Command, State, SupervisorState
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.frame import Frames, new_frames
-from atalante_tools.body import open_body
-from atalante_tools.options import Target
-from atalante_tools.outcome import Failed, FaultLatched
-from atalante_tools.pose_hold import PoseHold
-from atalante_tools.rig import (
+from atalante_tools.console.options import Target
+from atalante_tools.console.outcome import Failed, FaultLatched
+from atalante_tools.console.stop_request import StopRequest
+from atalante_tools.session.body import open_body
+from atalante_tools.session.pose_hold import PoseHold
+from atalante_tools.session.rig import (
     LOCKSTEP_PATIENCE,
     PATIENCE,
     Rig,
@@ -34,7 +35,6 @@ from atalante_tools.rig import (
     open_hal,
     waiting_for,
 )
-from atalante_tools.signals import StopRequest
 
 EMBEDDED = Target("embedded", "", lockstep=True)
 ACTIVE, HOLD, FAULT = SupervisorState.ACTIVE, SupervisorState.HOLD, SupervisorState.FAULT
@@ -252,7 +252,7 @@ def test_why_a_start_is_refused_is_said(network: Network, robot: Robot, fault: F
 def test_the_wall_clock_asks_for_real_time_rights_and_runs(
     network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("atalante_tools.rig.realtime", lambda: ["memory is not locked"])
+    monkeypatch.setattr("atalante_tools.session.rig.realtime", lambda: ["memory is not locked"])
     wall, fields = Target("embedded", "", lockstep=False), PoseHold.telemetry_fields
     with open_hal(wall, network=network, robot=robot, controller_fields=fields) as rig:
         statistics = rig.run(PoseHold(robot), until=lambda state: state.cycle >= 5)

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from atalante_hal.telemetry.process import Recording
-from atalante_tools.outcome import Failed
-from atalante_tools.run_folder import Result, leave, run_folder
+from atalante_tools.console.outcome import Failed
+from atalante_tools.session.run_folder import Result, leave, run_folder
 
 WALKED = Result("pinched", True, 1.97, 1.18, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0)
 

@@ -9,7 +9,7 @@ import threading
 
 import pytest
 
-from atalante_tools.signals import Stopped, check_stop, ended_by, stop_requested
+from atalante_tools.console.stop_request import Stopped, check_stop, ended_by, stop_requested
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -34,7 +34,7 @@ def test_the_second_ends_the_process_at_once(numbers: tuple[str, str]) -> None:
     first, second = numbers
     program = f"""
 import signal
-from atalante_tools.signals import stop_requested
+from atalante_tools.console.stop_request import stop_requested
 try:
     with stop_requested() as stop:
         signal.raise_signal(signal.{first})

@@ -14,12 +14,12 @@ from atalante_dbc import Network, wire_time
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.frame import FRAME, Frames, new_frames
-from atalante_tools import rig as rig_module
-from atalante_tools import status
 from atalante_tools.cli import cli
-from atalante_tools.observer import NodeReport, Observer, Report, as_json
-from atalante_tools.options import Target
-from atalante_tools.status import render
+from atalante_tools.commands import status
+from atalante_tools.commands.observer import NodeReport, Observer, Report, as_json
+from atalante_tools.commands.status import render
+from atalante_tools.console.options import Target
+from atalante_tools.session import rig as rig_module
 
 TARGET = Target("pcan", "test", lockstep=False)
 
@@ -50,7 +50,7 @@ def traffic(network: Network, robot: Robot, urdf_text: str) -> list[Frames]:
     from atalante_emulator.pendant import Operator
     from atalante_hal.bus.pair import lockstep_pair
     from atalante_hal.hal import Hal
-    from atalante_tools.pose_hold import PoseHold
+    from atalante_tools.session.pose_hold import PoseHold
 
     ours, theirs = lockstep_pair()
     body = PyBulletBody(urdf_text)

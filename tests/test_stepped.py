@@ -12,8 +12,8 @@ from atalante_control.gait.recentering import Deadbeat
 from atalante_control.guide.backup_policy import BackupPolicy
 from atalante_control.guide.filter import GuideConfig, GuideFilter
 from atalante_control.guide.shapes import CONSTANT
-from atalante_control.stepped import SteppedRollouts
 from atalante_hal.robot import load_robot
+from atalante_tools.bench.stepped import SteppedRollouts
 
 GAIT = load_gait(AIRWALK_GAIT, load_robot())
 CONFIG = GuideConfig(

@@ -10,7 +10,7 @@ import math
 import pytest
 
 from atalante_hal import compiled
-from atalante_tools.terminal import LIVE, LOGGED, Patience, Progress, say, show_json, table
+from atalante_tools.console.terminal import LIVE, LOGGED, Patience, Progress, say, show_json, table
 
 
 class Terminal(io.StringIO):

@@ -37,9 +37,9 @@ from atalante_hal.telemetry.process import Recording, TelemetryProcess, Telemetr
 from atalante_hal.telemetry.schema import message_class
 from atalante_hal.types import State, SupervisorState
 from atalante_hal.wire.frame import Frames
-from atalante_tools import trial
 from atalante_tools.cli import cli
-from atalante_tools.run_folder import Result, results_table
+from atalante_tools.session import airwalk as trial
+from atalante_tools.session.run_folder import Result, results_table
 from tests.process.test_telemetry_faults import cycles_without_index
 
 ATALANTE = str(Path(sys.executable).with_name("atalante"))
@@ -228,7 +228,7 @@ def test_at_full_assistance_the_command_frames_are_the_baselines_to_the_last_bit
 )
 def test_bad_input_gets_one_sentence_that_says_what_is_valid(arguments, code, says, tmp_path: Path):
     out = tmp_path / "run"
-    done = CliRunner().invoke(cli, ["hang", "--out", str(out), *arguments])
+    done = CliRunner().invoke(cli, ["airwalk", "--out", str(out), *arguments])
     assert done.exit_code == code, done.stderr
     # Not a word about the guide before: nothing can be promised where nothing runs.
     assert done.stderr.startswith("atalante: ")
@@ -302,7 +302,7 @@ def test_a_recording_with_a_gap_fails_the_run_and_is_counted(tmp_path: Path, mon
                 endpoints.append(telemetry.endpoint)
 
         monkeypatch.setattr(TelemetryProcess, "tend", kill_once)
-        command = ["hang", "--steps", "2", "--record-rate", "1000", "--json", "--out", str(tmp_path)]
+        command = ["airwalk", "--steps", "2", "--record-rate", "1000", "--json", "--out", str(tmp_path)]
         done = CliRunner().invoke(cli, command)
     assert done.exit_code == 1, done.stderr
     walked, recording = (json.loads(line) for line in done.stdout.splitlines())
@@ -323,7 +323,7 @@ def test_a_recording_with_a_gap_fails_the_run_and_is_counted(tmp_path: Path, mon
 
 def test_every_event_is_recorded_of_a_hal_that_keeps_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(fault_memory, "EventLog", functools.partial(fault_memory.EventLog, 1))
-    done = CliRunner().invoke(cli, ["hang", "--steps", "1", "--out", str(tmp_path)])
+    done = CliRunner().invoke(cli, ["airwalk", "--steps", "1", "--out", str(tmp_path)])
     assert done.exit_code == 0, done.stderr
     with (tmp_path / "recording.mcap").open("rb") as file:
         events = [
@@ -335,7 +335,7 @@ def test_every_event_is_recorded_of_a_hal_that_keeps_one(tmp_path: Path, monkeyp
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_in_hold_with_its_code_and_keeps_what_was_walked(number, code, tmp_path: Path):
-    command = [ATALANTE, "hang", "--steps", "1000", "--out", str(tmp_path)]
+    command = [ATALANTE, "airwalk", "--steps", "1000", "--out", str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as airwalk:
         assert airwalk.stderr is not None
         for line in airwalk.stderr:
@@ -377,13 +377,13 @@ def test_a_patient_s_gait_of_the_network_is_walked_inside_a_certified_guide(tmp_
     ],
 )
 def test_a_subject_out_of_range_gets_the_range(arguments, code, says, tmp_path: Path):
-    done = CliRunner().invoke(cli, ["hang", "--out", str(tmp_path), *arguments])
+    done = CliRunner().invoke(cli, ["airwalk", "--out", str(tmp_path), *arguments])
     assert done.exit_code == code, done.stderr
     assert says in done.stderr
     assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize("command", ["hang", "demo"])
+@pytest.mark.parametrize("command", ["airwalk", "demo"])
 @pytest.mark.parametrize(
     ("change", "says"),
     [

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from atalante_tools.bench.measure import Effort, Measurement, WorkError
-from atalante_tools.validate import benchmark
+from atalante_tools.canlog.validate import benchmark
 
 
 @pytest.mark.parametrize("run", [benchmark.judge_log, benchmark.judge_against_mdf])

@@ -12,9 +12,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from atalante_hal.robot import MOTORS
-from atalante_tools import rig as rig_module
 from atalante_tools.cli import cli
-from atalante_tools.rig import Rig
+from atalante_tools.session import rig as rig_module
+from atalante_tools.session.rig import Rig
 
 
 def vibrate(*arguments: str) -> Result:

@@ -10,9 +10,9 @@ from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
 from atalante_control.guide.shapes import SHAPES
 from atalante_emulator.faults import Fault
 from atalante_hal.wire.frame import Frames
-from atalante_tools.embedded import EmbeddedRobot
-from atalante_tools.options import Target
-from atalante_tools.rig import open_hal
+from atalante_tools.console.options import Target
+from atalante_tools.session.embedded import EmbeddedRobot
+from atalante_tools.session.rig import open_hal
 
 
 class Log:
@@ -34,7 +34,7 @@ class Log:
 
 @pytest.fixture
 def log_of(network, robot):
-    def walk(seed: int, cycles: int = 1500, apart: EmbeddedRobot | None = None) -> bytes:
+    def walk(seed: int, cycles: int = 1500, robot_process: EmbeddedRobot | None = None) -> bytes:
         controller = AirwalkController(
             robot, load_gait(AIRWALK_GAIT, robot), SHAPES["pinched"], AirwalkConfig(startup=0.3)
         )
@@ -47,7 +47,7 @@ def log_of(network, robot):
         ]
         with open_hal(
             Target("embedded", "", lockstep=True), network=network, robot=robot, seed=seed, assistance_factor=0.5,
-            controller_fields=fields, tap=log, faults=faults, apart=apart,
+            controller_fields=fields, tap=log, faults=faults, robot_process=robot_process,
         ) as rig:  # fmt: skip
             rig.run(controller, until=lambda state: state.cycle >= cycles)
             assert np.ptp(rig.hal.state.position) > 0.3
@@ -61,4 +61,4 @@ def test_one_seed_gives_the_same_bytes_and_another_does_not(log_of):
     assert len(first) > 1400 * 20 * 12
     assert log_of(7) == first
     assert log_of(8) != first
-    assert log_of(7, apart=EmbeddedRobot()) == first
+    assert log_of(7, robot_process=EmbeddedRobot()) == first

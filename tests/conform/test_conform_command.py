@@ -23,7 +23,7 @@ from atalante_tools.conform.examination import make_safe, requirements_of
 from atalante_tools.conform.frames import Incoming, Outgoing
 from atalante_tools.conform.requirement import LATE, Outcome, Requirement, Verdict, examine
 from atalante_tools.conform.technician import Action, Person
-from atalante_tools.outcome import Failed
+from atalante_tools.console.outcome import Failed
 
 from .conftest import MakeDesk
 

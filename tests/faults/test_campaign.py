@@ -17,6 +17,7 @@ from click.testing import CliRunner, Result
 from distributed import LocalCluster
 
 from atalante_tools.cli import cli
+from atalante_tools.console.outcome import Failed
 from atalante_tools.faults import campaign, tasks
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.matrix import load_matrix
@@ -24,7 +25,6 @@ from atalante_tools.faults.report import Summary
 from atalante_tools.faults.scenario import Case, Host, Scenario
 from atalante_tools.faults.tasks import HORIZON, CaseTask, Endurance, EnduranceTask, PairTask, PairVerdict, plan
 from atalante_tools.faults.verdict import Verdict
-from atalante_tools.outcome import Failed
 
 OVERRUN = [CaseTask("F44", index) for index in range(len(SCENARIOS["F44"].cases))]
 

@@ -35,7 +35,7 @@ from atalante_hal.robot import Robot, load_robot
 from atalante_hal.types import Command, SupervisorState
 from atalante_hal.wire.frame import FLAG_FDF, FRAME_BYTES, Frames, as_words, header_word, new_frames
 from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
-from atalante_tools.terminal import Progress, say
+from atalante_tools.console.terminal import Progress, say
 
 SWEEP = 2048 * 65 * 8  # identifiers, lengths, flags (BRS, ESI, FDF)
 #: Frames one `receive` of HAL and emulator can take.

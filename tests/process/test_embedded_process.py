@@ -16,12 +16,12 @@ from atalante_emulator.faults import Fault
 from atalante_emulator.pendant import Operator
 from atalante_hal.robot import Robot
 from atalante_hal.types import SupervisorState
-from atalante_tools.embedded import EmbeddedRobot, halves
-from atalante_tools.options import Target
-from atalante_tools.outcome import Failed
-from atalante_tools.pose_hold import PoseHold
-from atalante_tools.rig import Watch, open_hal
-from atalante_tools.signals import StopRequest
+from atalante_tools.console.options import Target
+from atalante_tools.console.outcome import Failed
+from atalante_tools.console.stop_request import StopRequest
+from atalante_tools.session.embedded import EmbeddedRobot, halves
+from atalante_tools.session.pose_hold import PoseHold
+from atalante_tools.session.rig import Watch, open_hal
 
 EMBEDDED = Target("embedded", "", lockstep=True)
 LONG = 60.0
@@ -43,18 +43,18 @@ def gone_now(pid: int) -> bool:
 
 
 def test_a_robot_apart_becomes_active_and_is_gone_afterwards(network: Network, robot: Robot) -> None:
-    apart = EmbeddedRobot()
+    robot_process = EmbeddedRobot()
     fields = PoseHold.telemetry_fields
-    with open_hal(EMBEDDED, network=network, robot=robot, controller_fields=fields, apart=apart) as rig:
+    with open_hal(EMBEDDED, network=network, robot=robot, controller_fields=fields, robot_process=robot_process) as rig:
         assert rig.emulator is None
         assert rig.operator is None
-        assert not gone_now(apart.pid)
+        assert not gone_now(robot_process.pid)
         controller = PoseHold(robot)
         watch = Watch(rig, StopRequest(), lambda state: controller.elapsed >= 0.02, lambda state: "")
         rig.run(controller, until=watch)
         watch.conclude()
         assert rig.hal.state.supervisor is SupervisorState.HOLD
-    assert gone_now(apart.pid)
+    assert gone_now(robot_process.pid)
 
 
 def test_robot_and_hal_share_no_core_while_one_is_there() -> None:
@@ -80,14 +80,14 @@ def test_the_cores_are_halved(cores: set[int], kept: set[int], given: set[int]) 
 
 
 def test_a_killed_robot_ends_the_run_in_one_sentence(network: Network, robot: Robot) -> None:
-    apart = EmbeddedRobot()
+    robot_process = EmbeddedRobot()
     fields = PoseHold.telemetry_fields
-    with open_hal(EMBEDDED, network=network, robot=robot, controller_fields=fields, apart=apart) as rig:
+    with open_hal(EMBEDDED, network=network, robot=robot, controller_fields=fields, robot_process=robot_process) as rig:
         controller = PoseHold(robot)
 
         def kill(state: object) -> bool:
             if rig.hal.state.cycle == 400:
-                os.kill(apart.pid, signal.SIGKILL)
+                os.kill(robot_process.pid, signal.SIGKILL)
             return False
 
         watch = Watch(rig, StopRequest(), kill, lambda state: "")
@@ -100,24 +100,24 @@ def test_a_robot_that_cannot_be_made_says_why(network: Network, robot: Robot) ->
     wrong = [0.0] * 11
     with (
         pytest.raises(Failed, match=r"^embedded: the robot's process failed with ValueError: "),
-        open_hal(EMBEDDED, network=network, robot=robot, pose=wrong, apart=EmbeddedRobot()),
+        open_hal(EMBEDDED, network=network, robot=robot, pose=wrong, robot_process=EmbeddedRobot()),
     ):
         raise AssertionError("made")
 
 
 def test_an_operator_of_this_process_is_refused(network: Network, robot: Robot) -> None:
-    apart = EmbeddedRobot()
+    robot_process = EmbeddedRobot()
     with (
         pytest.raises(ValueError, match="the operator of a robot in a process of its own is there, too"),
-        open_hal(EMBEDDED, network=network, robot=robot, operator=Operator(), apart=apart),
+        open_hal(EMBEDDED, network=network, robot=robot, operator=Operator(), robot_process=robot_process),
     ):
         raise AssertionError("made")
-    assert gone_now(apart.pid)
+    assert gone_now(robot_process.pid)
 
 
 def test_faults_reach_it(network: Network, robot: Robot) -> None:
     lost = Fault("drop", "LEFT_SK_STATE", start=150, cycles=3)
-    with open_hal(EMBEDDED, network=network, robot=robot, faults=[lost], apart=EmbeddedRobot()) as rig:
+    with open_hal(EMBEDDED, network=network, robot=robot, faults=[lost], robot_process=EmbeddedRobot()) as rig:
         row = rig.hal.messages.index("LEFT_SK_STATE")
         ages = []
         for _ in range(160):
@@ -130,13 +130,13 @@ def test_faults_reach_it(network: Network, robot: Robot) -> None:
 @pytest.mark.parametrize("begun", [True, False])
 def test_it_ends_when_its_hal_is_killed(begun: bool) -> None:
     program = (
-        "from atalante_tools.embedded import EmbeddedRobot\n"
-        "from atalante_tools.options import Target\n"
-        "from atalante_tools.rig import open_hal\n"
-        "apart = EmbeddedRobot()\n"
-        "print(apart.pid, flush=True)\n"
+        "from atalante_tools.session.embedded import EmbeddedRobot\n"
+        "from atalante_tools.console.options import Target\n"
+        "from atalante_tools.session.rig import open_hal\n"
+        "robot_process = EmbeddedRobot()\n"
+        "print(robot_process.pid, flush=True)\n"
         f"if not {begun}: import time; time.sleep(3600)\n"
-        "with open_hal(Target('embedded', '', lockstep=True), apart=apart) as rig:\n"
+        "with open_hal(Target('embedded', '', lockstep=True), robot_process=robot_process) as rig:\n"
         "    rig.hal.read()\n"
         "    print('walking', flush=True)\n"
         "    while True: rig.hal.read(); rig.hal.hold()\n"

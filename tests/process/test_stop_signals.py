@@ -67,8 +67,8 @@ def watch_cycles():
 
     Hal.read = read_and_log
 
-sys.meta_path.insert(0, At("atalante_tools.jog", lambda: signal.set_wakeup_fd(wakeup, warn_on_full_buffer=False)))
-sys.meta_path.insert(0, At("atalante_tools.rig", watch_cycles))
+sys.meta_path.insert(0, At("atalante_tools.commands.jog", lambda: signal.set_wakeup_fd(wakeup, warn_on_full_buffer=False)))
+sys.meta_path.insert(0, At("atalante_tools.session.rig", watch_cycles))
 kind, _, module = point.partition(" ")
 acts = {"import": send, "callback": send_in_callback, "except": send_in_except}
 if kind in acts:
@@ -143,12 +143,12 @@ def assert_never_started(run: Run, number: int) -> list[Cycle]:
     ("point", "number"),
     [
         ("import click", signal.SIGINT),
-        ("import atalante_tools.jog", signal.SIGTERM),
+        ("import atalante_tools.commands.jog", signal.SIGTERM),
         ("import pybullet", signal.SIGINT),
-        ("callback atalante_tools.pose_hold", signal.SIGINT),
+        ("callback atalante_tools.session.pose_hold", signal.SIGINT),
         ("callback numba", signal.SIGTERM),
         ("callback pybullet", signal.SIGINT),
-        ("except atalante_tools.rig", signal.SIGTERM),
+        ("except atalante_tools.session.rig", signal.SIGTERM),
     ],
 )
 def test_a_signal_before_the_first_cycle_ends_the_command(point: str, number: int, tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_a_signal_before_ready_ends_the_command(number: signal.Signals, tmp_path
     "command",
     [
         ("vibrate", "left_thigh_front", "0.5", "--for", "100"),
-        ("hang", "--steps", "1000", "--out", "run"),
+        ("airwalk", "--steps", "1000", "--out", "run"),
         ("demo", "--steps", "1000", "--out", "run"),
     ],
     ids=lambda command: command[0],

@@ -24,7 +24,7 @@ from atalante_hal.bus.socketcan import SocketCanBus, require_channel
 from atalante_hal.hal import Hal
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, new_frames
-from atalante_tools.pose_hold import PoseHold
+from atalante_tools.session.pose_hold import PoseHold
 
 #: Ends a candump log: an identifier the robot's network does not use.
 END_ID = 0x7FF

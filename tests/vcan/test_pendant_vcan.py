@@ -13,8 +13,8 @@ from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.frame import new_frames
-from atalante_tools.observer import Observer
-from atalante_tools.pendant_node import PendantNode, Request
+from atalante_tools.commands.observer import Observer
+from atalante_tools.session.pendant_node import PendantNode, Request
 from tests.vcan.conftest import PATIENCE, Loop, repeated
 
 

@@ -7,27 +7,27 @@ from typing import Any
 
 import click
 
+from atalante_tools.console.outcome import INTERRUPTED, InvalidUsage, failure_of
 from atalante_tools.entry import main as main
-from atalante_tools.outcome import INTERRUPTED, Misused, failure_of
 
-#: Command -> its line in the list. Each is the attribute `command` of the module of that name.
+#: Command -> the module below `atalante_tools` whose attribute `command` it is, and its line in the list.
 COMMANDS = {
-    "demo": "Everything at once: the emulated robot walks in the air behind each virtual guide.",
-    "hang": "The controller of the demo on any bus: steps in the air with the virtual guide.",
-    "emulator": "Be the robot on a bus, for a HAL in another process.",
-    "jog": "Move one joint to an angle.",
-    "vibrate": "Run one vibration motor.",
-    "pendant": "Be the operator: start, stop, hold, assistance factor.",
-    "status": "Listen to a bus and say what every node says.",
-    "doctor": "Is this machine ready, and what to type if not.",
-    "validate": "Judge CAN logs or a live bus by everything the DBC says.",
-    "decode": "The signals of CAN logs as Parquet or MCAP.",
-    "conform": "An acceptance test of one node, with this computer in the place of the HAL.",
-    "faults": "The fault matrix, and runs of the walking robot that prove it.",
-    "dbc": "Check, print and compare network descriptions, and make C code of one.",
-    "model": "The patient-exoskeleton model: its links, checks, URDF and picture.",
-    "gait": "Solve gaits, collect them in a library, fit the network that walks them.",
-    "bench": "How fast the stack is, with the baseline beside each figure.",
+    "demo": ("commands.demo", "Everything at once: the emulated robot walks in the air behind each virtual guide."),
+    "airwalk": ("commands.airwalk", "The controller of the demo on any bus: steps in the air with the virtual guide."),
+    "emulator": ("commands.emulator", "Be the robot on a bus, for a HAL in another process."),
+    "jog": ("commands.jog", "Move one joint to an angle."),
+    "vibrate": ("commands.vibrate", "Run one vibration motor."),
+    "pendant": ("commands.pendant", "Be the operator: start, stop, hold, assistance factor."),
+    "status": ("commands.status", "Listen to a bus and say what every node says."),
+    "doctor": ("commands.doctor", "Is this machine ready, and what to type if not."),
+    "validate": ("canlog.validate", "Judge CAN logs or a live bus by everything the DBC says."),
+    "decode": ("canlog.decode", "The signals of CAN logs as Parquet or MCAP."),
+    "conform": ("conform", "An acceptance test of one node, with this computer in the place of the HAL."),
+    "faults": ("faults", "The fault matrix, and runs of the walking robot that prove it."),
+    "dbc": ("dbc", "Check, print and compare network descriptions, and make C code of one."),
+    "model": ("model", "The patient-exoskeleton model: its links, checks, URDF and picture."),
+    "gait": ("gait", "Solve gaits, collect them in a library, fit the network that walks them."),
+    "bench": ("bench", "How fast the stack is, with the baseline beside each figure."),
 }
 
 
@@ -42,14 +42,14 @@ class Commands(click.Group):
         """Import the command."""
         if cmd_name not in COMMANDS:
             return None
-        command = importlib.import_module(f"atalante_tools.{cmd_name}").command
+        command = importlib.import_module(f"atalante_tools.{COMMANDS[cmd_name][0]}").command
         assert isinstance(command, click.Command)
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """The list without importing."""
         with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
+            formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; an error that has a message for the user ends in that message."""
@@ -61,7 +61,7 @@ class Commands(click.Group):
             raise  # a group named alone: its help is the answer
         except click.UsageError as error:
             where = error.ctx.command_path if error.ctx else ctx.command_path
-            raise Misused(f"{error.format_message().rstrip('.')}; see `{where} --help`") from error
+            raise InvalidUsage(f"{error.format_message().rstrip('.')}; see `{where} --help`") from error
         except Exception as error:
             failure = failure_of(error)
             if failure is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from atalante_tools.signals import Stopped, interruptible
+from atalante_tools.console.stop_request import Stopped, interruptible
 
 TYPE_CHECKING = False  # as `typing.TYPE_CHECKING`, without importing `typing`
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ def main() -> NoReturn:
     with interruptible() as stop:
         try:
             from atalante_tools.cli import cli
-            from atalante_tools.terminal import Patience
+            from atalante_tools.console.terminal import Patience
 
             Patience.begin()
             cli(prog_name="atalante")

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from atalante_tools.names import find
-from atalante_tools.options import json_option
-from atalante_tools.outcome import Failed
-from atalante_tools.signals import check_stop
-from atalante_tools.terminal import Progress, say, show_json, table
+from atalante_tools.console.names import find
+from atalante_tools.console.options import json_option
+from atalante_tools.console.outcome import Failed
+from atalante_tools.console.stop_request import check_stop
+from atalante_tools.console.terminal import Progress, say, show_json, table
 
 if TYPE_CHECKING:
     from atalante_tools.bench.catalogue import Benchmark

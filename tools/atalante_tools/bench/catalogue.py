@@ -8,7 +8,7 @@ from typing import Final
 
 from atalante_tools.bench import gait_solve, gaits, motion, startup, wire
 from atalante_tools.bench.measure import Effort, Measurement
-from atalante_tools.validate import benchmark
+from atalante_tools.canlog.validate import benchmark
 
 _UNITS: Final = {"us": 1e6, "s": 1.0}
 

@@ -14,15 +14,15 @@ import numpy as np
 
 from atalante_control.airwalk.controller import AirwalkController
 from atalante_control.guide.shapes import CONSTANT
-from atalante_control.stepped import SteppedRollouts
 from atalante_hal.hal import PERIOD
 from atalante_hal.telemetry.ring import RingWriter
 from atalante_hal.types import State, SupervisorState
 from atalante_tools.bench.measure import Effort, Measurement, require, timed
 from atalante_tools.bench.nodes import ASSISTANCE, ERROR, ERROR_RATE, walk
-from atalante_tools.embedded import EmbeddedRobot
-from atalante_tools.options import EMBEDDED, Target
-from atalante_tools.rig import Rig, open_hal
+from atalante_tools.bench.stepped import SteppedRollouts
+from atalante_tools.console.options import EMBEDDED, Target
+from atalante_tools.session.embedded import EmbeddedRobot
+from atalante_tools.session.rig import Rig, open_hal
 
 #: Exact flow and step-by-step integration agree within this [rad].
 AGREEMENT: Final = 1e-6
@@ -155,7 +155,7 @@ class _Stack:
 
 
 @contextmanager
-def _stack(apart: EmbeddedRobot | None) -> Iterator[_Stack]:
+def _stack(robot_process: EmbeddedRobot | None) -> Iterator[_Stack]:
     """With the robot in a process of its own, or in this one."""
     walking = walk()
     controller = AirwalkController(walking.robot, walking.gait, CONSTANT)
@@ -168,7 +168,7 @@ def _stack(apart: EmbeddedRobot | None) -> Iterator[_Stack]:
             assistance_factor=ASSISTANCE,
             controller_fields=controller.telemetry_fields,
             gait_hash=walking.gait.hash32,
-            apart=apart,
+            robot_process=robot_process,
         ) as rig,
         RingWriter(rig.hal.record.nbytes) as ring,
     ):

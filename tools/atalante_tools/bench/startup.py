@@ -11,8 +11,8 @@ from typing import Final
 from atalante_tools.bench.measure import Effort, Measurement, require
 
 _FIRST_CYCLE: Final = """
-from atalante_tools.options import EMBEDDED, Target
-from atalante_tools.rig import open_hal
+from atalante_tools.console.options import EMBEDDED, Target
+from atalante_tools.session.rig import open_hal
 with open_hal(Target(EMBEDDED, "", lockstep=True)) as rig:
     print(rig.hal.read().cycle)
 """

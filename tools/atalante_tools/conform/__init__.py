@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from atalante_tools.options import Between, Target, json_option, target_options
-from atalante_tools.outcome import FAILED
-from atalante_tools.signals import check_stop, ended_by
-from atalante_tools.terminal import say, show_json
+from atalante_tools.console.options import Between, Target, json_option, target_options
+from atalante_tools.console.outcome import FAILED
+from atalante_tools.console.stop_request import check_stop, ended_by
+from atalante_tools.console.terminal import say, show_json
 
 if TYPE_CHECKING:
     from atalante_tools.conform.bench import Bench
@@ -88,7 +88,7 @@ def command(
 
 
 def _chosen(requirements: list[Requirement], only: tuple[str, ...], without: tuple[str, ...]) -> list[Requirement]:
-    from atalante_tools.names import find
+    from atalante_tools.console.names import find
 
     ids = [requirement.id for requirement in requirements]
     places = sorted({find(name, ids, "requirement") for name in only}) if only else range(len(ids))
@@ -102,14 +102,14 @@ def _bench(name: str, target: Target, torque: float, patience: float) -> Iterato
     from atalante_hal.robot import load_robot
     from atalante_tools.conform.bench import Bench, Limits, LockStep, WallClock
     from atalante_tools.conform.technician import EmulatorTechnician, Person
-    from atalante_tools.names import find
+    from atalante_tools.console.names import find
 
     network, robot, limits = atalante_dbc.load(), load_robot(), Limits(torque)
     nodes = [node for node in network.nodes if node.kind != "master"]
     node = nodes[find(name, [node.name for node in nodes], "node")]
     if target.embedded:
         from atalante_hal.bus.pair import lockstep_pair
-        from atalante_tools.body import open_body
+        from atalante_tools.session.body import open_body
 
         with open_body(robot) as body:
             from atalante_emulator.emulator import Emulator

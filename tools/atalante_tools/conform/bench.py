@@ -17,7 +17,7 @@ from atalante_hal.robot import Robot
 from atalante_hal.wire.frame import Frames, as_words, new_frames
 from atalante_tools.conform.frames import Heard, Incoming, Outgoing
 from atalante_tools.conform.technician import Action, Technician
-from atalante_tools.outcome import Failed
+from atalante_tools.console.outcome import Failed
 
 if TYPE_CHECKING:
     from atalante_emulator.emulator import Emulator

@@ -6,7 +6,7 @@ from enum import Enum
 from typing import TYPE_CHECKING, Protocol
 
 from atalante_hal.robot import JOINTS
-from atalante_tools.terminal import say
+from atalante_tools.console.terminal import say
 
 if TYPE_CHECKING:
     from atalante_emulator.emulator import Emulator

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from atalante_tools.options import SEED, Between, json_option
-from atalante_tools.outcome import FAILED, Failed
-from atalante_tools.terminal import say, show_json, table
+from atalante_tools.console.options import SEED, Between, json_option
+from atalante_tools.console.outcome import FAILED, Failed
+from atalante_tools.console.terminal import say, show_json, table
 
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 #: A DBC, by default the robot's.
@@ -128,7 +128,8 @@ def c_code(
     file: Path | None, output: Path, node: str | None, check: bool, images: int, seed: int, as_json: bool
 ) -> None:
     """C code for FILE: pack, unpack, E2E protect and check, test vectors, and a host test that proves it equal to Python."""
-    from atalante_tools.dbc.c_code import Build, write
+    from atalante_tools.dbc.build import Build
+    from atalante_tools.dbc.c_code import write
     from atalante_tools.dbc.host_test import compile_host_test, run_host_test
 
     build = Build.of(file or _own(), node)

@@ -7,64 +7,21 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import cantools
 from cantools.database.can import Database
-from cantools.database.can.c_source import camel_to_snake_case, generate
+from cantools.database.can.c_source import generate
 
-import atalante_dbc
-from atalante_dbc import Message, Network, Signal
+from atalante_tools.dbc.build import Build
 from atalante_tools.dbc.e2e_c import e2e_header, e2e_source
 from atalante_tools.dbc.host_test import makefile, source
 from atalante_tools.dbc.vectors import Vectors
-from atalante_tools.names import find
 
 #: Images in the vector file of the folder: enough for a test without Python.
 _IMAGES: Final = 100
 _HOST_TEST, _VECTORS, _EXAMPLES, _MAKEFILE = "host_test.c", "vectors.bin", "vectors.json", "Makefile"
-
-
-@dataclass(frozen=True)
-class Build:
-    """What is generated: a whole network, or one node's share of it."""
-
-    network: Network
-    text: str  # of the DBC
-    name: str  # prefix of every C name
-    node: str | None
-
-    @classmethod
-    def of(cls, path: Path, node: str | None) -> Build:
-        """Read a DBC.
-
-        Raises:
-            DbcError: the strict loader refuses it.
-            click.UsageError: there is no such node.
-        """
-        network = atalante_dbc.load(path)
-        names = [n.name for n in network.nodes]
-        node = names[find(node, names, "node")] if node is not None else None
-        return cls(network, path.read_text("cp1252"), camel_to_snake_case(path.stem), node)
-
-    @property
-    def messages(self) -> tuple[Message, ...]:
-        """Messages with any C code, in DBC order."""
-        return tuple(m for m in self.network.messages if self.sends(m) or self.received(m))
-
-    def sends(self, message: Message) -> bool:
-        """Whether there is a pack function."""
-        return self.node in (None, message.sender)
-
-    def received(self, message: Message) -> tuple[Signal, ...]:
-        """Signals the unpack function fills; empty: there is none."""
-        return tuple(s for s in message.signals if self.node is None or self.node in s.receivers)
-
-    def c_name(self, message: Message) -> str:
-        """What the C names of a message begin with, and behind an underscore the signal."""
-        return f"{self.name}_{camel_to_snake_case(message.name)}"
 
 
 def write(build: Build, folder: Path, seed: int) -> list[Path]:

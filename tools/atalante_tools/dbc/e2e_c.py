@@ -13,7 +13,7 @@ from atalante_dbc import Message, Signal
 from atalante_hal.wire.e2e import CRC_BYTES, CRC_START, MAX_DELTA, Check
 
 if TYPE_CHECKING:
-    from atalante_tools.dbc.c_code import Build
+    from atalante_tools.dbc.build import Build
 
 
 def crc_table() -> list[int]:

@@ -15,12 +15,12 @@ from cantools.database.can.c_source import camel_to_snake_case
 
 from atalante_dbc import Message, Signal
 from atalante_hal.wire.e2e import check_counter
+from atalante_tools.console.outcome import Failed
 from atalante_tools.dbc.e2e_c import invalid_name
 from atalante_tools.dbc.vectors import MAGIC, Vectors, behind_header
-from atalante_tools.outcome import Failed
 
 if TYPE_CHECKING:
-    from atalante_tools.dbc.c_code import Build
+    from atalante_tools.dbc.build import Build
 
 #: Contraction would round once where the codec rounds twice: values are compared to the last bit.
 FLAGS: Final = (

@@ -25,7 +25,7 @@ from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES
 from atalante_hal.wire.process_image import TransmitImage
 
 if TYPE_CHECKING:
-    from atalante_tools.dbc.c_code import Build
+    from atalante_tools.dbc.build import Build
 
 MAGIC: Final = b"ATVEC\x00\x00\x01"
 HEADER: Final = Struct("<8sII")

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from atalante_tools.names import find
-from atalante_tools.options import json_option
-from atalante_tools.outcome import Failed, Misused
-from atalante_tools.signals import check_stop
-from atalante_tools.terminal import Progress, say, show_json, table
+from atalante_tools.console.names import find
+from atalante_tools.console.options import json_option
+from atalante_tools.console.outcome import Failed, InvalidUsage
+from atalante_tools.console.stop_request import check_stop
+from atalante_tools.console.terminal import Progress, say, show_json, table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -73,11 +73,15 @@ def run(id_: str, name: str, as_json: bool) -> None:
 
     row = _row(id_)
     if row.id not in SCENARIOS:
-        raise Misused(f"{row.id} is proved by tests alone; type `pytest {' '.join(f'tests/{t}' for t in row.tests)}`")
+        raise InvalidUsage(
+            f"{row.id} is proved by tests alone; type `pytest {' '.join(f'tests/{t}' for t in row.tests)}`"
+        )
     cases = SCENARIOS[row.id].cases
     tasks = [CaseTask(row.id, index) for index, case in enumerate(cases) if name in case.name]
     if not tasks:
-        raise Misused(f"no case of {row.id} has {name!r} in its name; there are {', '.join(c.name for c in cases)}")
+        raise InvalidUsage(
+            f"no case of {row.id} has {name!r} in its name; there are {', '.join(c.name for c in cases)}"
+        )
     summary = Summary.of(verdicts := [v for v in _done(tasks) if isinstance(v, Verdict)])
     if as_json:
         show_json(asdict(summary.lines[0]))
@@ -122,7 +126,7 @@ def campaign_(
 
     chosen = [_row(id_).id for id_ in ids] or list(SCENARIOS)
     if without := [id_ for id_ in chosen if id_ not in SCENARIOS]:
-        raise Misused(f"{without[0]} has no scenario; `atalante faults list` says what proves it")
+        raise InvalidUsage(f"{without[0]} has no scenario; `atalante faults list` says what proves it")
     tasks = plan(chosen, endurance=endurance, pairs=pairs and not ids)
     out.mkdir(parents=True, exist_ok=True)  # what cannot be written is told before, not after some minutes
     begun = time.monotonic()

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 from atalante_control.gait_optimization.parallel import FanOutError, fan_out
+from atalante_tools.console.outcome import Failed
 from atalante_tools.faults.tasks import Result, Task, run_task
-from atalante_tools.outcome import Failed
 
 #: Seconds after which a campaign that got no result is said to hang.
 HANGS: Final = 300.0

@@ -24,12 +24,12 @@ from atalante_emulator.faults import Fault
 from atalante_hal.loop import run
 from atalante_hal.robot import Robot, load_robot
 from atalante_hal.types import State, SupervisorState
+from atalante_tools.console.options import EMBEDDED, Target
 from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, Moment
 from atalante_tools.faults.observation import Observation
 from atalante_tools.faults.scenario import Case, Host, Press
 from atalante_tools.faults.witness import Commands, Witness
-from atalante_tools.options import EMBEDDED, Target
-from atalante_tools.rig import Rig, open_hal
+from atalante_tools.session.rig import Rig, open_hal
 
 if TYPE_CHECKING:
     from atalante_emulator.pendant import Operator

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import click
 
+from atalante_tools.console.options import SEED, OutputFile, json_option
+from atalante_tools.console.outcome import FAILED, Failed
+from atalante_tools.console.stop_request import stop_requested
+from atalante_tools.console.terminal import Progress, say, show_json, table
 from atalante_tools.gait.extra import extra
 from atalante_tools.gait.solve import solve
-from atalante_tools.options import SEED, Written, json_option
-from atalante_tools.outcome import FAILED, Failed
-from atalante_tools.signals import stop_requested
-from atalante_tools.terminal import Progress, say, show_json, table
 
 _FOLDER = click.Path(file_okay=False, path_type=Path)
 _FILE = click.Path(dir_okay=False, path_type=Path)
@@ -109,7 +109,7 @@ def library(
 
 @command.command()
 @click.option("--library", "folder", type=_FOLDER, required=True, metavar="DIR", help="What `gait library` made.")
-@click.option("--out", type=Written(".npz"), required=True, metavar="FILE", help="The network, .npz.")
+@click.option("--out", type=OutputFile(".npz"), required=True, metavar="FILE", help="The network, .npz.")
 @json_option
 def fit(folder: Path, out: Path, as_json: bool) -> None:
     """Fit the gait network to a library; takes a minute. The same library gives the same network.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from atalante_tools.outcome import Failed
+from atalante_tools.console.outcome import Failed
 
 
 @contextmanager

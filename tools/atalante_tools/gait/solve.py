@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from atalante_tools.console.options import OutputFile, json_option, subject_options
+from atalante_tools.console.outcome import Failed
+from atalante_tools.console.stop_request import stop_requested
+from atalante_tools.console.terminal import Progress, say, show_json, table
 from atalante_tools.gait.extra import extra
-from atalante_tools.options import Written, json_option, subject_options
-from atalante_tools.outcome import Failed
-from atalante_tools.signals import stop_requested
-from atalante_tools.terminal import Progress, say, show_json, table
 
 if TYPE_CHECKING:
     from atalante_control.gait.subject import Subject
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
     show_default=True,
     help="The step that repeats, the one from rest into it, or the one from it to rest.",
 )
-@click.option("--out", type=Written(".json"), metavar="FILE", help="Write the gait, .json.")
+@click.option("--out", type=OutputFile(".json"), metavar="FILE", help="Write the gait, .json.")
 @click.option(
     "--plot",
-    type=Written(".png", ".svg", ".pdf"),
+    type=OutputFile(".png", ".svg", ".pdf"),
     metavar="FILE",
     help="Angles, torques, centre of pressure, clearance: .png, .svg, .pdf.",
 )
-@click.option("--animate", type=Written(".gif"), metavar="FILE", help="The step as a stick figure, .gif.")
+@click.option("--animate", type=OutputFile(".gif"), metavar="FILE", help="The step as a stick figure, .gif.")
 @json_option
 def solve(
     subject: Subject | None, kind: Kind, out: Path | None, plot: Path | None, animate: Path | None, as_json: bool

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from atalante_tools.options import Written, json_option, patient_options
-from atalante_tools.outcome import Failed
-from atalante_tools.terminal import say, show_json, table
+from atalante_tools.console.options import OutputFile, json_option, patient_options
+from atalante_tools.console.outcome import Failed
+from atalante_tools.console.terminal import say, show_json, table
 
 if TYPE_CHECKING:
     from atalante_control.model import Link, Patient
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 @click.option(
     "--urdf",
     "urdf_file",
-    type=Written(".urdf", ".xml"),
+    type=OutputFile(".urdf", ".xml"),
     metavar="FILE",
     help="Write the URDF, for PyBullet, Pinocchio and viewers.",
 )
 @click.option(
     "--show",
     "picture",
-    type=Written(".png", ".svg", ".pdf"),
+    type=OutputFile(".png", ".svg", ".pdf"),
     is_flag=False,
     flag_value=Path("model.png"),
     metavar="[FILE]",

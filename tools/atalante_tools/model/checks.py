@@ -11,7 +11,7 @@ import pinocchio
 
 from atalante_control.model import ExoskeletonParameters, Patient, links, pinocchio_model, urdf
 from atalante_hal.robot import Robot
-from atalante_tools.body import no_banner
+from atalante_tools.session.body import no_banner
 
 #: Random states the two engines are compared in, and the largest difference relative to the largest entry.
 STATES, AGREEMENT = 100, 1e-6

@@ -1,0 +1,1 @@
+"""CAN logs: decode and validate them."""

@@ -1,0 +1,111 @@
+"""Command `atalante decode`: convert the signals of CAN logs to Parquet or MCAP.
+
+Data flow, chunk by chunk: log -> bulk codec -> columns -> file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from atalante_tools.console.outcome import FAILED, Failed
+from atalante_tools.console.terminal import Progress, say
+
+if TYPE_CHECKING:
+    from atalante_tools.canlog.decode.signals import Sink
+    from atalante_tools.canlog.validate.plan import Plan
+
+_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+
+
+@click.command()
+@click.argument("logs", nargs=-1, required=True, metavar="LOG...", type=click.Path(path_type=Path))
+@click.option(
+    "-o", "--out", required=True, type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
+    help="Output file: .parquet (one row per value) or .mcap (protobuf, one topic per message).",
+)  # fmt: skip
+@click.option("--dbc", type=_FILE, default=None, help="DBC of the logs.  [default: the DBC of the robot]")
+def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
+    """Decode CAN logs (.log of candump, .asc, .blf, .mf4, .trc, .csv) to signals in physical units.
+
+    No rule is checked; use `atalante validate` for that. Frames with an unknown identifier or a payload that is too short are
+    counted and skipped.
+
+    \b
+    Example: atalante decode night.log -o night.parquet
+             atalante decode drive.blf --dbc vehicle.dbc -o drive.mcap
+    """
+    if out.suffix.lower() not in (".parquet", ".mcap"):
+        raise click.UsageError(f"--out must end in .parquet or .mcap, got {out}")
+    from atalante_dbc import DBC_FILE
+    from atalante_dbc.foreign import catalogue
+    from atalante_tools.canlog.decode.signals import Decoder
+    from atalante_tools.canlog.validate.log import open_log
+    from atalante_tools.canlog.validate.plan import Plan
+
+    plan = Plan(catalogue(dbc or DBC_FILE))
+    for refused in plan.refused:
+        say(f"{refused.name} is not decoded: {refused.reason}")
+    sources = [open_log(path) for path in logs]
+    decoder = Decoder(plan)
+    progress = Progress()
+    with _complete_file(out) as part, closing(_sink(part, out.suffix.lower(), plan)) as sink:
+        for source in sources:
+            for chunk in source.chunks():
+                for piece in decoder.decode(chunk):
+                    sink.write(piece, source.channels.names)
+                sink.flush()
+                if progress.due():
+                    share = 100.0 * source.position / max(1, source.size)
+                    progress.show(f"{source.path.name}: {share:.0f} %, {decoder.frames} frames, {sink.values} values")
+            progress.clear()
+            for remark in source.remarks:
+                say(remark.sentence)
+    say(f"{out}: {sink.values} values of {decoder.decoded} frames")
+    if decoder.left_out:
+        say(f"skipped: {decoder.left_out}")
+    if not decoder.decoded:
+        raise SystemExit(FAILED)
+
+
+@contextmanager
+def _complete_file(out: Path) -> Iterator[Path]:
+    """Provide a temporary path, and rename it to `out` after the `with` block.
+
+    If the block raises an exception, the temporary file is removed and an existing `out` is unchanged.
+
+    Raises:
+        Failed: If the file cannot be written.
+    """
+    part = out.with_name(f"{out.name}.part")
+    try:
+        yield part
+        part.replace(out)
+    except OSError as error:
+        raise Failed(f"{out} cannot be written: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _sink(out: Path, suffix: str, plan: Plan) -> Sink:
+    """Open the output file in the format of the suffix.
+
+    Raises:
+        Failed: If a package for the format is not installed.
+    """
+    try:
+        if suffix == ".parquet":
+            from atalante_tools.canlog.decode.parquet import ParquetSink
+
+            return ParquetSink(out, plan)
+        if suffix == ".mcap":
+            from atalante_tools.canlog.decode.mcap import McapSink
+
+            return McapSink(out, plan)
+    except ModuleNotFoundError as error:
+        raise Failed(f"a {suffix} file needs {error.name}: type `pip install 'atalante-hal[decode]'`") from error
+    raise AssertionError(f"suffix must be .parquet or .mcap, got {suffix}")

@@ -1,0 +1,250 @@
+"""Command `atalante validate`: check the frames of CAN logs or a live bus against the DBC.
+
+Data flow: log -> validator (rules) -> findings -> report.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from atalante_tools.console.options import Between, OutputFile, json_option, options_as
+from atalante_tools.console.outcome import FAILED, INTERRUPTED, Failed
+from atalante_tools.console.stop_request import stop_requested
+from atalante_tools.console.terminal import Progress, say, show_json
+
+if TYPE_CHECKING:
+    from atalante_tools.canlog.validate.plan import Plan
+    from atalante_tools.canlog.validate.project import Project
+    from atalante_tools.canlog.validate.report import Report
+
+_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of `atalante validate`."""
+
+    interface: str  # interface of python-can; empty: read logs
+    channel: str  # channels of the interface
+    seconds: float | None  # duration of listening [s]; None: until Ctrl-C
+    dbc: Path | None  # None: the DBC of the robot
+    node: str | None  # the only node whose messages are expected; None: all nodes
+    rules_file: Path | None
+    list_rules: bool
+    junit: Path | None
+    html_file: Path | None
+    as_json: bool
+
+
+_options = options_as(
+    "options",
+    Options,
+    [
+        click.option(
+            "-i",
+            "--interface",
+            default="",
+            metavar="NAME",
+            help="Check a live bus instead of logs: socketcan, pcan, kvaser, ...",
+        ),
+        click.option(
+            "-c",
+            "--channel",
+            default="",
+            metavar="CHANNEL",
+            help="Channel of the live bus: can0, or several: left_leg=can0,right_leg=can1.",
+        ),
+        click.option(
+            "--for",
+            "seconds",
+            type=Between(0.1),
+            default=None,
+            metavar="SECONDS",
+            help="Duration of listening to the live bus, s.  [default: until Ctrl-C]",
+        ),
+        click.option("--dbc", type=_FILE, default=None, help="DBC to check against.  [default: the DBC of the robot]"),
+        click.option(
+            "--node",
+            default=None,
+            metavar="NODE",
+            help="Expect only the messages of this node, for a test bench with one node.  [default: all nodes]",
+        ),
+        click.option(
+            "--rules",
+            "rules_file",
+            type=_FILE,
+            default=None,
+            help="TOML file with thresholds, silenced rules and channel names of a project.",
+        ),
+        click.option("--list-rules", is_flag=True, help="Print every rule with its source and thresholds, then exit."),
+        click.option(
+            "--junit", type=OutputFile(), default=None, metavar="FILE", help="Write the results as JUnit XML."
+        ),
+        click.option(
+            "--html",
+            "html_file",
+            type=OutputFile(),
+            default=None,
+            metavar="FILE",
+            help="Write the report with plots as HTML.",
+        ),
+        json_option,
+    ],
+)
+
+
+@click.command()
+@click.argument("logs", nargs=-1, metavar="LOG...", type=click.Path(path_type=Path))
+@_options
+def command(logs: tuple[Path, ...], options: Options) -> None:
+    """Check CAN logs (.log of candump, .asc, .blf, .mf4, .trc, .csv) or a live bus against the DBC.
+
+    The rules cover cycle time, jitter, timeout, alive counter, CRC with Data ID, length, flags, range, value table, reserved
+    bits, order, bus load, plausibility and drive state. The report lists the findings, the silenced findings and the signals
+    that no rule checked. The exit code is 1 if there are findings or no frame was checked.
+
+    \b
+    Example: atalante validate night.log --html night.html
+             atalante validate -i socketcan -c can0 --node LEFT_FH --for 10
+             atalante validate drive.blf --dbc vehicle.dbc --rules vehicle.toml --junit result.xml
+    """
+    from atalante_tools.canlog.validate.report import rules_json, rules_text
+
+    if options.list_rules:
+        if options.as_json:
+            for rule in rules_json():
+                show_json(rule)
+        else:
+            click.echo(rules_text())
+        return
+    if bool(logs) == bool(options.interface):
+        raise click.UsageError("name one or more logs, or a live bus: -i socketcan -c can0")
+    if options.interface and not options.channel:
+        raise click.UsageError(f"{options.interface} needs a channel: -c can0")
+    plan, project = _prepare(options)
+    results, code = _listen(options, plan, project) if options.interface else _read(logs, plan, project, options.node)
+    for result in results:
+        _show(result, options.as_json)
+    _write(results, options.junit, options.html_file)
+    if any(result.findings or not result.validator.frames for result in results):
+        raise SystemExit(FAILED)
+    if code:
+        raise SystemExit(code)
+
+
+def _prepare(options: Options) -> tuple[Plan, Project]:
+    """Load the DBC and the rules file.
+
+    Raises:
+        click.UsageError: If the DBC has no message of the node or lacks a bus that the rules file names.
+    """
+    from atalante_dbc import DBC_FILE
+    from atalante_dbc.foreign import catalogue
+    from atalante_tools.canlog.validate.plan import Plan
+    from atalante_tools.canlog.validate.project import Project, load_project
+
+    plan = Plan(catalogue(options.dbc or DBC_FILE))
+    project = Project() if options.rules_file is None else load_project(options.rules_file)
+    if options.node is not None and options.node not in plan.senders:
+        raise click.UsageError(
+            f"--node must be a sender in the DBC ({', '.join(plan.senders) or 'it has none'}), got {options.node!r}"
+        )
+    if unknown := sorted(set(project.channels.values()) - set(plan.buses)):
+        raise click.UsageError(
+            f"[channels] must name buses of the DBC ({', '.join(plan.buses) or 'it has none'}), got {unknown[0]!r}"
+        )
+    return plan, project
+
+
+def _read(logs: Sequence[Path], plan: Plan, project: Project, node: str | None) -> tuple[list[Report], int]:
+    """Check the logs one after the other; log an error for each one that cannot be opened.
+
+    Returns:
+        The reports of the logs that could be opened, and the exit code.
+    """
+    from atalante_tools.canlog.validate.log import LogError
+    from atalante_tools.canlog.validate.run import validate_log
+
+    results, code = [], 0
+    for path in logs:
+        progress = Progress()
+
+        def show(share: float, frames: int, path: Path = path, progress: Progress = progress) -> None:
+            if progress.due():
+                progress.show(f"{path.name}: {100.0 * share:.0f} %, {frames} frames")
+
+        try:
+            results.append(validate_log(path, plan, project, node=node, progress=show))
+        except LogError as error:
+            say(f"atalante: {error}")
+            code = FAILED
+        progress.clear()
+    return results, code
+
+
+def _listen(options: Options, plan: Plan, project: Project) -> tuple[list[Report], int]:
+    """Check a live bus until the time is over or a stop signal arrives.
+
+    Returns:
+        The report, and the exit code; Ctrl-C is the normal end and gives 0.
+    """
+    from atalante_tools.canlog.validate.run import listen, open_channels
+
+    buses = open_channels(options.interface, options.channel)
+    progress = Progress()
+    end = None if options.seconds is None else time.monotonic() + options.seconds
+
+    def show(frames: int) -> None:
+        if progress.due():
+            progress.show(f"{frames} frames" + ("; Ctrl-C ends and prints the report" if end is None else ""))
+
+    try:
+        with stop_requested() as stop:
+            result = listen(
+                buses,
+                plan,
+                project,
+                name=f"{options.interface} {options.channel}",
+                stopped=lambda: stop.wanted or (end is not None and time.monotonic() >= end),
+                node=options.node,
+                progress=show,
+            )
+    finally:
+        for bus in buses.values():
+            bus.close()
+    progress.clear()
+    if stop.exit_code == INTERRUPTED:
+        stop.settle()
+    return [result], stop.exit_code
+
+
+def _show(result: Report, as_json: bool) -> None:
+    """Print a report: as text on stdout, or the findings as JSON on stdout and the text on stderr."""
+    from atalante_tools.canlog.validate.report import text
+
+    if as_json:
+        for finding in result.findings:
+            show_json(finding.as_json())
+        say(text(result))
+    else:
+        click.echo(text(result))
+
+
+def _write(results: Sequence[Report], junit: Path | None, html_file: Path | None) -> None:
+    """Write the JUnit and HTML reports that were requested."""
+    from atalante_tools.canlog.validate.html import write_html
+    from atalante_tools.canlog.validate.report import write_junit
+
+    for path, write in ((junit, write_junit), (html_file, write_html)):
+        if path is None:
+            continue
+        try:
+            write(results, path)
+        except OSError as error:
+            raise Failed(f"{path} cannot be written: {error.strerror}") from error

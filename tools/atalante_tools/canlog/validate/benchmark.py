@@ -1,0 +1,257 @@
+"""Benchmarks of `atalante bench`: time to check a log, with other decoders as baselines.
+
+The log is a run of the emulated robot in ACTIVE, repeated to 1.3 million frames. Alive counters and CRCs are computed again for
+the repeated frames, so that no rule reports a finding.
+"""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.wire.e2e import COUNTER_BYTE, CRC_BYTES
+from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES, Frames, new_frames
+from atalante_tools.bench.measure import Block, Effort, Measurement, require
+from atalante_tools.canlog.column_codec import crc_differences, crc_of_zeros
+from atalante_tools.canlog.validate.plan import Plan
+from atalante_tools.canlog.validate.project import Project
+
+#: Recorded cycles and number of repetitions: together 50,000 cycles, 1.3 million frames. The recording holds whole periods of
+#: every message and is long enough for the joints to come to rest.
+_CYCLES, _REPEATED = 2000, 25
+_QUICK_CYCLES, _QUICK_REPEATED = 300, 2
+#: Frames in a block of the baseline python-can with cantools, which is slow.
+_SLICE = 30_000
+_MS = 1_000_000  # ns
+_BEGIN = 1_700_000_000 * 1000 * _MS
+_LENGTHS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64])
+
+
+def judge_log(effort: Effort) -> Measurement:
+    """Measure reading, decoding and checking a candump log by all rules.
+
+    The baseline reads and decodes the same log with python-can and cantools.
+
+    Args:
+        effort: number of rounds, and whether the log is short.
+
+    Returns:
+        CPU seconds per frame.
+    """
+    import can
+    import cantools
+    from cantools.database.can import Database
+
+    with _log(effort) as (path, frames):
+        database = cantools.database.load_file(_dbc())
+        assert isinstance(database, Database)
+
+        def baseline() -> float:
+            begin, count = time.process_time(), 0
+            with can.LogReader(path) as reader:
+                for message in itertools.islice(reader, _SLICE):
+                    database.decode_message(message.arbitration_id, bytes(message.data))
+                    count += 1
+            return (time.process_time() - begin) / count
+
+        return effort.interleave(_validation(path, frames), baseline, share=0.02)
+
+
+def judge_against_mdf(effort: Effort) -> Measurement:
+    """Measure the work of `judge_log` against asammdf.
+
+    The baseline decodes the same frames from MF4. It parses no text and checks no rule.
+
+    Args:
+        effort: number of rounds, and whether the log is short.
+
+    Returns:
+        CPU seconds per frame.
+    """
+    try:
+        from asammdf import MDF
+    except ImportError:
+        return Measurement(None, None, ("asammdf and canmatrix are not installed: pip install asammdf canmatrix",))
+    with _log(effort) as (path, frames):
+        mdf = path.with_suffix(".mf4")
+        _write_mdf(mdf, frames)
+
+        def baseline() -> float:
+            begin = time.process_time()
+            source = MDF(mdf)
+            found = source.extract_bus_logging({"CAN": [(_dbc(), 0)]})
+            require(len(found.groups) > 40, f"asammdf must find more than 40 messages, got {len(found.groups)}")
+            elapsed = time.process_time() - begin
+            found.close()
+            source.close()
+            return elapsed / len(frames)
+
+        return effort.interleave(_validation(path, frames), baseline, share=0.02)
+
+
+def _validation(path: Path, frames: Frames) -> Block:
+    """Return a block that checks the log and requires a report without findings."""
+    from atalante_dbc.foreign import catalogue
+    from atalante_tools.canlog.validate.run import validate_log
+
+    plan = Plan(catalogue(_dbc()))
+
+    def block() -> float:
+        begin = time.process_time()
+        result = validate_log(path, plan, Project())
+        elapsed = time.process_time() - begin
+        require(
+            result.validator.frames == len(frames), f"{result.validator.frames} of {len(frames)} frames were checked"
+        )
+        require(not result.findings, f"the log must have no findings, got {[f.as_json() for f in result.findings][:3]}")
+        return elapsed / len(frames)
+
+    return block
+
+
+def _dbc() -> Path:
+    from atalante_dbc import DBC_FILE
+
+    return DBC_FILE
+
+
+# -- the log ---------------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _log(effort: Effort) -> Iterator[tuple[Path, Frames]]:
+    """Provide the path of a candump log in a temporary folder, and its frames."""
+    cycles, repeated = (_QUICK_CYCLES, _QUICK_REPEATED) if effort.quick else (_CYCLES, _REPEATED)
+    frames, cycle, sent = _repeat(*_record(cycles), cycles, repeated)
+    with tempfile.TemporaryDirectory(prefix="atalante-bench-") as folder:
+        path = Path(folder) / "run.log"
+        _write(path, frames, _BEGIN + cycle * _MS, sent)
+        yield path, frames
+
+
+class _Tap:
+    """Recorder of every frame that the HAL sends or receives, with cycle and direction."""
+
+    def __init__(self) -> None:
+        self.cycle = 0
+        self.taken: list[tuple[Frames, int, bool]] = []
+
+    def sent(self, frames: Frames) -> None:
+        self.taken.append((frames.copy(), self.cycle, True))
+
+    def received(self, frames: Frames, count: int) -> None:
+        self.taken.append((frames[:count].copy(), self.cycle, False))
+
+
+@cache
+def _record(cycles: int) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    """Record the robot while it holds its pose in ACTIVE.
+
+    The hold compensates gravity, so the joints come to rest at their first position and a repetition begins without a jump.
+
+    Args:
+        cycles: number of cycles in ACTIVE.
+
+    Returns:
+        The frames, the cycle of each frame from 0, and which frames the HAL sent; shapes (n,).
+    """
+    from atalante_hal.types import SupervisorState
+    from atalante_tools.console.options import EMBEDDED, Target
+    from atalante_tools.session.pose_hold import PoseHold
+    from atalante_tools.session.rig import open_hal
+
+    tap = _Tap()
+    with open_hal(Target(EMBEDDED, "", True), tap=tap) as rig:
+        hal, held = rig.hal, 0
+        controller = PoseHold(hal.robot)
+        while held < cycles:
+            tap.cycle = held
+            state = hal.read()
+            if state.supervisor is SupervisorState.ACTIVE:
+                if not held:
+                    controller.reset(state)
+                hal.write(controller.update(state))
+                held += 1
+            else:
+                hal.hold()
+                tap.taken.clear()
+            require(
+                hal.state.cycle < cycles + 2000,
+                f"the robot must be ACTIVE within 2000 cycles, got {hal.state.supervisor.name}",
+            )
+    taken = tap.taken
+    frames = np.concatenate([f for f, _, _ in taken])
+    counts = [len(f) for f, _, _ in taken]
+    return frames, np.repeat([c for _, c, _ in taken], counts), np.repeat([s for _, _, s in taken], counts)
+
+
+def _repeat(
+    frames: Frames, cycle: npt.NDArray[np.int64], sent: npt.NDArray[np.bool_], cycles: int, times: int
+) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    """Repeat the recording, with alive counters and CRCs of one continuous run. Shapes (n,) to (times * n,)."""
+    whole = new_frames(len(frames) * times)
+    whole.view("<u8").reshape(times, -1)[:] = frames.view("<u8")
+    octets = whole.view(np.uint8).reshape(-1, FRAME_BYTES)
+    from atalante_dbc import load
+
+    for message in load().messages:
+        rows = np.flatnonzero(whole["can_id"] == message.frame_id)
+        if not len(rows):
+            continue
+        of = octets[rows]
+        of[:, HEADER_BYTES + COUNTER_BYTE] = np.arange(len(rows))
+        of[:, HEADER_BYTES : HEADER_BYTES + CRC_BYTES] = 0
+        crcs = crc_differences(of.reshape(-1).view(whole.dtype), message.length)
+        crcs ^= np.uint16(crc_of_zeros(message.length, message.data_id))
+        of[:, HEADER_BYTES : HEADER_BYTES + CRC_BYTES] = crcs[:, None].view(np.uint8)
+        octets[rows] = of
+    offset = np.repeat(np.arange(times) * cycles, len(frames))
+    return whole, np.tile(cycle, times) + offset, np.tile(sent, times)
+
+
+def _write(path: Path, frames: Frames, stamps: npt.NDArray[np.int64], sent: npt.NDArray[np.bool_]) -> None:
+    """Write frames in the format of candump, with one channel per bus; `stamps` are in ns."""
+    from atalante_dbc import load
+
+    head = {m.frame_id: f"{m.bus} {m.frame_id:03X}##1" for m in load().messages}
+    data, lines = frames["data"].tobytes().hex().upper(), []
+    columns = (frames["can_id"].tolist(), frames["len"].tolist(), stamps.tolist(), sent.tolist())
+    for row, (can_id, length, stamp, is_sent) in enumerate(zip(*columns, strict=True)):
+        seconds, rest = divmod(stamp // 1000, 10**6)
+        payload = data[128 * row : 128 * row + 2 * length]
+        lines.append(f"({seconds}.{rest:06d}) {head[can_id]}{payload} {'T' if is_sent else 'R'}\n")
+    path.write_text("".join(lines))
+
+
+def _write_mdf(path: Path, frames: Frames) -> None:
+    """Write frames as MF4 bus logging, in the layout of python-can."""
+    from asammdf import MDF, Signal
+    from asammdf.blocks.v4_blocks import SourceInformation
+    from asammdf.blocks.v4_constants import BUS_TYPE_CAN, SOURCE_BUS
+    from can.io.mf4 import STD_DTYPE
+
+    samples = np.zeros(len(frames), STD_DTYPE)
+    for name, column in (
+        ("BusChannel", 1),
+        ("ID", frames["can_id"]),
+        ("DataLength", frames["len"]),
+        ("DLC", np.searchsorted(_LENGTHS, frames["len"])),
+        ("DataBytes", frames["data"]),
+        ("EDL", 1),
+        ("BRS", 1),
+    ):
+        samples[f"CAN_DataFrame.{name}"] = column
+    file = MDF(version="4.10")
+    source = SourceInformation(source_type=SOURCE_BUS, bus_type=BUS_TYPE_CAN)
+    stamps = np.arange(len(frames)) * 4e-5
+    file.append(Signal(name="CAN_DataFrame", samples=samples, timestamps=stamps, source=source))
+    file.save(path, overwrite=True)
+    file.close()

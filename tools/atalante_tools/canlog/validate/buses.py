@@ -1,0 +1,80 @@
+"""Assignment of the channels of a log to the buses of the DBC, and of each message to its channel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_tools.canlog.validate.chunk import Chunk
+from atalante_tools.canlog.validate.plan import UNKNOWN, Plan, Rows
+
+#: Minimum share of the known frames of a channel that belong to one bus for the channel to be assigned to that bus.
+_MAJORITY = 0.9
+
+
+class ChannelMap:
+    """Bus of each channel and expected channel of each message, derived from the frames.
+
+    A channel is assigned to the bus of its name, otherwise to the bus that most of its messages belong to. A channel with
+    messages of several buses (all four buses on one vcan0) is assigned to none. The expected channel of a message is the channel
+    of its bus, otherwise the channel of its first frame.
+    """
+
+    def __init__(self, plan: Plan, named: Mapping[str, str]) -> None:
+        """Create a map without frames.
+
+        Args:
+            plan: compiled DBC.
+            named: name of the bus for each channel that the rules file assigns.
+        """
+        self._plan = plan
+        self._named = dict(named)
+        #: Bus number of each channel received so far; `UNKNOWN` for a channel with messages of several buses.
+        self.bus_of_channel: list[int] = []
+        self._channel_of_row = np.full(len(plan.layouts) + len(plan.refused), UNKNOWN, np.int16)
+
+    def update(self, chunk: Chunk, rows: Rows, names: list[str]) -> None:
+        """Assign the channels and messages that are new in a chunk.
+
+        Args:
+            chunk: next frames of the log.
+            rows: row of the message of each frame, shape (n,).
+            names: channels of the log so far.
+        """
+        known = (rows >= 0) & (rows < len(self._plan.layouts))
+        for channel in range(len(self.bus_of_channel), len(names)):
+            self.bus_of_channel.append(self._bus_of(names[channel], rows[known & (chunk.channels == channel)]))
+        if bool((self._channel_of_row[: len(self._plan.layouts)] != UNKNOWN).all()):
+            return
+        seen, first = np.unique(rows, return_index=True)
+        for row, index in zip(seen.tolist(), first.tolist(), strict=True):
+            if row >= 0 and self._channel_of_row[row] == UNKNOWN:
+                self._channel_of_row[row] = self._expected_channel(row, int(chunk.channels[index]))
+
+    def on_wrong_channel(self, chunk: Chunk, rows: Rows) -> npt.NDArray[np.bool_]:
+        """Return which frames are on another channel than the expected one of their message. Shape (n,)."""
+        if len(self.bus_of_channel) < 2:
+            return np.zeros(len(chunk), np.bool_)
+        known = rows >= 0
+        away: npt.NDArray[np.bool_] = chunk.channels != self._channel_of_row[np.where(known, rows, 0)]
+        return away & known
+
+    def _bus_of(self, name: str, rows: Rows) -> int:
+        buses = self._plan.buses
+        name = self._named.get(name, name)
+        if name in buses:
+            return buses.index(name)
+        if not self._plan.has_buses or not len(rows):
+            return UNKNOWN
+        counts = np.bincount(self._plan.bus_of_row[rows], minlength=len(buses))
+        bus = int(np.argmax(counts))
+        return bus if counts[bus] >= _MAJORITY * len(rows) else UNKNOWN
+
+    def _expected_channel(self, row: int, channel: int) -> int:
+        if self._plan.has_buses and row < len(self._plan.layouts):
+            bus = int(self._plan.bus_of_row[row])
+            if bus in self.bus_of_channel:
+                return self.bus_of_channel.index(bus)
+        return channel

@@ -1,0 +1,366 @@
+"""Parser for the log format of candump (`candump -l`, .log of python-can), with array operations on many lines.
+
+    (1700000000.123456) left_leg 181##15A0F004000000041 R
+     time                channel id fd flags, payload   direction (may be missing)
+
+The array operations accept a line only if it has exactly this format. All other lines (remote frame, raw DLC, other spacing) are
+parsed individually by a regular expression. Lines that are no frame are counted. A damaged line is never read as a shorter frame,
+because the validator would then report a wrong length or a lost frame.
+"""
+
+from __future__ import annotations
+
+import binascii
+import re
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.wire.frame import (
+    FLAG_BRS,
+    FLAG_ESI,
+    FLAG_FDF,
+    FRAME_BYTES,
+    ID_ERROR,
+    ID_EXTENDED,
+    ID_REMOTE,
+    new_frames,
+)
+from atalante_tools.canlog.validate.chunk import NO_DIRECTION, RECEIVED, SENT, Chunk
+
+Text = npt.NDArray[np.uint8]
+Positions = npt.NDArray[np.intp]
+
+#: Bytes that must be readable before and after the text; at least the width of the widest window that is read.
+MARGIN = 160
+_NEWLINE, _RETURN, _SPACE, _OPEN, _CLOSE, _HASH, _DOT = b"\n\r ()#."
+_MAX_CHANNELS = 256
+_NAME_BYTES = 16  # longest channel name that the array operations read; Linux allows 15
+_MAX_DIGITS = 2 * 64  # hexadecimal digits
+_STANDARD, _ALL_BITS = 0x7FF, 0x1FFF_FFFF
+_NOT_HEX = 255
+_HEX = np.full(256, _NOT_HEX, np.uint8)
+_HEX[np.frombuffer(b"0123456789", np.uint8)] = np.arange(10)
+_HEX[np.frombuffer(b"ABCDEF", np.uint8)] = _HEX[np.frombuffer(b"abcdef", np.uint8)] = np.arange(10, 16)
+#: Value of two characters, indexed by their little-endian number; 0xFFFF if they are not two hexadecimal digits.
+_HEX_PAIR = np.full(1 << 16, 0xFFFF, np.uint16)
+_HEX_PAIR.reshape(256, 256)[:] = np.where(
+    (_HEX < 16) & (_HEX < 16)[:, None], _HEX.astype(np.uint16) << 4 | _HEX[:, None], 0xFFFF
+)
+#: Masks of the last k bytes of a word, k = 0..8.
+_TAIL = np.array([0, *((((1 << 8 * k) - 1) << 64 - 8 * k) for k in range(1, 9))], np.uint64)
+_ZEROS = np.uint64(0x3030303030303030)
+_LINE = re.compile(
+    rb"\s*\((\d{1,10})\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
+    rb"(?:(#)([0-9A-Fa-f])((?:[0-9A-Fa-f]{2})*)|([Rr])(\d?)|((?:[0-9A-Fa-f]{2})*))(?:_([9A-Fa-f]))?(?:\s+([RrTt]))?\s*"
+)
+
+
+@dataclass
+class Channels:
+    """Channel names in the order of their first frames."""
+
+    names: list[str] = field(default_factory=list)
+
+    def index(self, name: str) -> int:
+        """Return the index of a channel; a new name is appended.
+
+        Names beyond the 256th share the last index. Only damaged logs have that many.
+
+        Args:
+            name: name of the channel in the log.
+        """
+        if name not in self.names:
+            if len(self.names) == _MAX_CHANNELS:
+                return _MAX_CHANNELS - 1
+            self.names.append(name)
+        return self.names.index(name)
+
+
+@dataclass
+class Parsed:
+    """Frames of a piece of text, and the count of lines that are no frame."""
+
+    chunk: Chunk
+    unreadable: int  # lines
+    first_unreadable: bytes
+
+
+def parse(text: Text, begin: int, end: int, channels: Channels) -> Parsed:
+    """Parse all lines of `text[begin:end]`.
+
+    Args:
+        text: log as bytes, with at least `MARGIN` bytes before `begin` and after `end`.
+        begin: index of the first byte of a line.
+        end: index after the newline of the last line.
+        channels: channel names of the log; new names are appended.
+    """
+    lines = _Lines(text, begin, end)
+    count = len(lines.starts)
+    frames = new_frames(count)
+    chunk = Chunk(frames, np.zeros(count, np.int64), np.zeros(count, np.uint8), np.full(count, NO_DIRECTION, np.int8))
+    if not count:
+        return Parsed(chunk, 0, b"")
+    regular = lines.split()
+    regular &= _times(lines, chunk.stamps)
+    regular &= _channels(lines, chunk.channels, channels)
+    regular &= _identifiers(lines, frames)
+    chunk.sent[:] = lines.sent
+    regular &= _payloads(lines, frames, regular)
+    return _parse_individually(lines, chunk, regular, channels)
+
+
+class _Lines:
+    """Positions of the parts of each line, as indices into the text. Shape (lines,)."""
+
+    def __init__(self, text: Text, begin: int, end: int) -> None:
+        self.text, self.begin, self.end = text, begin, end
+        self.ends: Positions = np.flatnonzero(text[begin:end] == _NEWLINE) + begin
+        self.starts: Positions = np.empty_like(self.ends)
+        if len(self.starts):
+            self.starts[0], self.starts[1:] = begin, self.ends[:-1] + 1
+
+    def window(self, positions: Positions, width: int) -> Text:
+        """Return `width` bytes from each position. Shape (positions, width)."""
+        rows: Text = np.ndarray((len(self.text) - width,), f"V{width}", self.text, strides=(1,))[positions].view(
+            np.uint8
+        )
+        return rows.reshape(len(positions), width)
+
+    def word(self, positions: Positions) -> npt.NDArray[np.uint64]:
+        """Return eight bytes from each position as a little-endian number. Shape (positions,)."""
+        return np.ndarray((len(self.text) - 8,), "<u8", self.text, strides=(1,))[positions]
+
+    def pair(self, positions: Positions) -> npt.NDArray[np.uint16]:
+        """Return two bytes from each position as a little-endian number. Shape (positions,)."""
+        return np.ndarray((len(self.text) - 2,), "<u2", self.text, strides=(1,))[positions]
+
+    def split(self) -> npt.NDArray[np.bool_]:
+        """Find the parts of each line; return which lines have the regular format so far. Shape (lines,)."""
+        stops = self.ends - (self.text[self.ends[0] - 1] == _RETURN)
+        last = self.pair(stops - 2)
+        has_direction = last & 0xFF == _SPACE
+        letter = last >> 8 & 0xDF  # upper case
+        is_sent = letter == ord("T")
+        self.sent = np.where(has_direction, np.where(is_sent, SENT, RECEIVED), NO_DIRECTION).astype(np.int8)
+        regular: npt.NDArray[np.bool_] = ~has_direction | is_sent | (letter == ord("R"))
+        self.stops: Positions = stops - 2 * has_direction
+        self.marks = self._marks(regular)
+        #: Eight characters around the first #. Before it: a blank and three digits. After it: a second #, flags and payload.
+        self.head = self.word(self.marks - 4)
+        self.fd = self.head >> np.uint64(40) & np.uint64(0xFF) == _HASH
+        self.data: Positions = self.marks + 1 + 2 * self.fd
+        self.digits = self.stops - self.data
+        regular &= (self.digits >= 0) & (self.digits <= _MAX_DIGITS) & (self.digits & 1 == 0)
+        self.extended = self.head & np.uint64(0xFF) != _SPACE
+        self.id_starts: Positions = self.marks - 3
+        if bool(self.extended.any()):
+            self.id_starts = self.marks - np.where(self.extended, 8, 3)
+            regular &= self.text[self.id_starts - 1] == _SPACE
+        self.closes = self._closes(regular)
+        return regular
+
+    def _marks(self, regular: npt.NDArray[np.bool_]) -> Positions:
+        """Return the position of the first # of each line. Shape (lines,)."""
+        is_hash = (self.text[self.begin - 1 : self.end] == _HASH).view(np.uint8)
+        return self._one_per_line(np.flatnonzero(is_hash[1:] > is_hash[:-1]) + self.begin, regular)
+
+    def _closes(self, regular: npt.NDArray[np.bool_]) -> Positions:
+        """Return the position of the ) of each line. Shape (lines,).
+
+        The offset of the first line is tried for all lines, because it seldom changes.
+        """
+        text, starts = self.text, self.starts
+        width = int(np.argmax(text[starts[0] : starts[0] + MARGIN] == _CLOSE))
+        closes: Positions = starts + width
+        after = self.pair(closes) == _CLOSE | _SPACE << 8
+        if not bool(after.all()):
+            closes = self._one_per_line(
+                np.flatnonzero(text[self.begin : self.end] == _CLOSE) + self.begin, regular, alone=False
+            )
+            after = self.pair(closes) == _CLOSE | _SPACE << 8
+        regular &= after & (text[starts] == _OPEN) & (closes < self.id_starts)
+        return closes
+
+    def _one_per_line(self, found: Positions, regular: npt.NDArray[np.bool_], *, alone: bool = True) -> Positions:
+        """Select for each line the first of the found positions.
+
+        Args:
+            found: positions in the text, ascending.
+            regular: set to False for a line without a position; shape (lines,).
+            alone: also set `regular` to False for a line with several positions.
+        """
+        if len(found) == len(self.starts) and bool(((found > self.starts) & (found < self.stops)).all()):
+            return found
+        if not len(found):
+            regular[:] = False
+            return self.starts + MARGIN // 8
+        at = np.minimum(np.searchsorted(found, self.starts), len(found) - 1)
+        first: Positions = found[at]
+        inside = (first >= self.starts) & (first < self.stops)
+        if alone:
+            after = found[np.minimum(at + 1, len(found) - 1)]
+            inside &= (at + 1 >= len(found)) | (after >= self.stops)
+        regular &= inside
+        return np.where(inside, first, self.starts + MARGIN // 8)
+
+
+def _times(lines: _Lines, stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """Write the time of each line to `stamps` [ns]; return which lines have a regular time. Shape (lines,)."""
+    text, closes = lines.text, lines.closes
+    decimals = 9 if text[closes[0] - 10] == _DOT else 6
+    dots = closes - decimals - 1
+    count = dots - lines.starts - 1
+    regular: npt.NDArray[np.bool_] = (count >= 1) & (count <= 10)
+    count = np.minimum(np.maximum(count, 1), 10)
+    seconds, ok = _number(lines.word(dots - 8), np.minimum(count, 8))
+    regular &= ok
+    if int(count.max()) > 8:
+        upper, ok = _number(lines.word(dots - 16), np.maximum(count - 8, 0))
+        seconds += upper * np.uint64(10**8)
+        regular &= ok
+    last_eight = lines.word(closes - 8)
+    fraction, ok = _number(last_eight, np.full(1, min(decimals, 8)))
+    regular &= ok
+    if decimals == 6:
+        regular &= last_eight >> np.uint64(8) & np.uint64(0xFF) == _DOT
+        stamps[:] = seconds * np.uint64(10**9) + fraction * np.uint64(1000)
+    else:
+        first = text[dots + 1] - np.uint8(ord("0"))
+        regular &= (text[dots] == _DOT) & (first < 10)
+        stamps[:] = seconds * np.uint64(10**9) + fraction + first * np.uint64(10**8)
+    return regular
+
+
+def _number(
+    word: npt.NDArray[np.uint64], digits: npt.NDArray[np.intp]
+) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.bool_]]:
+    """Return the number in the last `digits` of eight characters, and whether they are all digits. Shapes (lines,)."""
+    tail = _TAIL[digits]
+    word = (word & tail) | (_ZEROS & ~tail)
+    changes = np.flatnonzero(word[1:] != word[:-1]) + 1
+    if len(changes) * 4 > len(word):
+        return _parse_digits(word)
+    runs = np.concatenate([[0], changes])  # the seconds are equal in thousands of consecutive lines
+    number, valid = _parse_digits(word[runs])
+    lengths = np.diff(runs, append=len(word))
+    return number.repeat(lengths), valid.repeat(lengths)
+
+
+def _parse_digits(word: npt.NDArray[np.uint64]) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.bool_]]:
+    """Parse eight digits, the first in the lowest byte: combine pairs, then fours, then all eight."""
+    above, below = word + np.uint64(0x4646464646464646), word - _ZEROS
+    valid: npt.NDArray[np.bool_] = ((above | below) & np.uint64(0x8080808080808080)) == 0
+    word = below * np.uint64(10) + (below >> np.uint64(8))
+    low = (word & np.uint64(0x000000FF000000FF)) * np.uint64(0x000F424000000064)
+    high = ((word >> np.uint64(16)) & np.uint64(0x000000FF000000FF)) * np.uint64(0x0000271000000001)
+    return (low + high) >> np.uint64(32), valid
+
+
+def _channels(lines: _Lines, numbers: npt.NDArray[np.uint8], channels: Channels) -> npt.NDArray[np.bool_]:
+    """Write the channel index of each line to `numbers`; return which lines have a regular name. Shape (lines,)."""
+    stops = lines.id_starts - 1
+    length = stops - lines.closes - 2
+    regular: npt.NDArray[np.bool_] = (length > 0) & (length <= _NAME_BYTES)
+    length = np.minimum(np.maximum(length, 1), _NAME_BYTES)
+    low = lines.word(stops - 8) & _TAIL[np.minimum(length, 8)]
+    high = lines.word(stops - 16) & _TAIL[np.maximum(length - 8, 0)]
+    left = regular.copy()
+    while True:
+        first = int(np.argmax(left))
+        if not left[first]:
+            return regular
+        begin = int(lines.closes[first]) + 2
+        name = lines.text[begin : begin + int(length[first])].tobytes()
+        same = left & (low == low[first]) & (high == high[first])
+        if b" " in name or b"\t" in name:
+            regular &= ~same
+        else:
+            numbers[same] = channels.index(name.decode("ascii", "replace"))
+        left &= ~same
+
+
+def _identifiers(lines: _Lines, frames: npt.NDArray[np.void]) -> npt.NDArray[np.bool_]:
+    """Write identifier, length and flags of each line; return which lines have regular ones. Shape (lines,)."""
+    head = lines.head.view(np.int64)
+    number = _HEX[head >> 8 & 0xFF].astype(np.uint32) << 8 | _HEX_PAIR[head >> 16 & 0xFFFF]
+    regular: npt.NDArray[np.bool_] = number < 16 << 8
+    if bool(lines.extended.any()):
+        codes = _HEX[lines.window(lines.marks - 8, 5)].astype(np.uint32)
+        upper = codes[:, 0] << 28 | codes[:, 1] << 24 | codes[:, 2] << 20 | codes[:, 3] << 16 | codes[:, 4] << 12
+        whole = upper | number
+        errors = (whole & np.uint32(ID_ERROR)) != 0
+        regular &= ~lines.extended | ((codes < 16).all(axis=1) & (whole <= _ALL_BITS | ID_ERROR))
+        wide = np.where(errors, whole, whole | np.uint32(ID_EXTENDED))
+        number = np.where(lines.extended, wide, number)
+    regular &= lines.extended | (number <= _STANDARD)
+    frames["can_id"] = number
+    frames["len"] = np.minimum(np.maximum(lines.digits, 0), _MAX_DIGITS) // 2
+    flags = _HEX[head >> 48 & 0xFF]
+    regular &= ~lines.fd | (flags < 16)
+    frames["flags"] = np.where(lines.fd, flags & (FLAG_BRS | FLAG_ESI) | FLAG_FDF, 0)
+    return regular
+
+
+def _payloads(lines: _Lines, frames: npt.NDArray[np.void], wanted: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Write the payloads, grouped by length; return which lines of `wanted` are hexadecimal. Shape (lines,)."""
+    regular = wanted.copy()
+    digits = np.where(wanted, lines.digits, 0)
+    memory = frames.view(np.uint8)
+    for length in np.flatnonzero(np.bincount(digits)).tolist():
+        if not length:
+            continue
+        chosen = np.flatnonzero(digits == length)
+        window = lines.window(lines.data[chosen], length)
+        try:
+            payload = np.frombuffer(binascii.unhexlify(window.data), f"V{length // 2}")
+        except binascii.Error:
+            good = (_HEX[window] < 16).all(axis=1)
+            regular[chosen[~good]] = False
+            chosen = chosen[good]
+            payload = np.frombuffer(binascii.unhexlify(window[good].data), f"V{length // 2}")
+        target = np.ndarray((len(frames),), f"V{length // 2}", memory, offset=8, strides=(FRAME_BYTES,))
+        target[chosen] = payload
+    return regular
+
+
+def _parse_individually(lines: _Lines, chunk: Chunk, regular: npt.NDArray[np.bool_], channels: Channels) -> Parsed:
+    """Parse the lines that do not have the regular format; remove and count the lines that are no frame."""
+    keep = np.ones(len(regular), np.bool_)
+    unreadable, first = 0, b""
+    for row in np.flatnonzero(~regular).tolist():
+        line = lines.text[lines.starts[row] : lines.ends[row]].tobytes()
+        if not line.strip():
+            keep[row] = False
+        elif not _read_line(line, chunk, row, channels):
+            keep[row] = False
+            first = first if unreadable else line
+            unreadable += 1
+    return Parsed(chunk if bool(keep.all()) else chunk.select(keep), unreadable, first)
+
+
+def _read_line(line: bytes, chunk: Chunk, row: int, channels: Channels) -> bool:
+    """Write the frame of a line in any format of candump to `chunk`; return whether the line is a frame."""
+    match = _LINE.fullmatch(line)
+    if match is None:
+        return False
+    number = int(match[4], 16)
+    data = bytes.fromhex((match[7] or match[10] or b"").decode())
+    if len(data) > 64 or (len(match[4]) == 3 and number > _STANDARD):
+        return False
+    if len(match[4]) == 8:
+        if number > _ALL_BITS | ID_ERROR:
+            return False
+        number |= 0 if number & ID_ERROR else ID_EXTENDED
+    frame = np.zeros(1, chunk.frames.dtype)
+    frame["can_id"] = number | (ID_REMOTE if match[8] else 0)
+    frame["len"] = int(match[9] or 0) if match[8] else len(data)
+    frame["flags"] = FLAG_FDF | int(match[6], 16) & (FLAG_BRS | FLAG_ESI) if match[5] else 0
+    frame["data"][0, : len(data)] = list(data)
+    chunk.frames[row] = frame[0]
+    chunk.stamps[row] = int(match[1]) * 10**9 + int(match[2].ljust(9, b"0"))
+    chunk.channels[row] = channels.index(match[3].decode("ascii", "replace"))
+    letter = (match[12] or b"").upper()
+    chunk.sent[row] = SENT if letter == b"T" else RECEIVED if letter == b"R" else NO_DIRECTION
+    return True

@@ -1,0 +1,185 @@
+"""List of the rules, messages and signals that were not checked in a log, each with the reason.
+
+Without this list, a report without findings would read as approval of everything in the log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from atalante_dbc.foreign import Field, Layout
+from atalante_tools.canlog.validate.judge import Validator
+from atalante_tools.canlog.validate.plan import UNKNOWN
+from atalante_tools.canlog.validate.value_rules import is_enumeration, is_hash, is_limited
+
+_E2E = ("Crc", "Counter")
+
+
+@dataclass(frozen=True)
+class Unchecked:
+    """Items that some rules did not check, with the reason."""
+
+    rules: tuple[str, ...]  # empty: all rules
+    items: tuple[str, ...]  # messages, signals or channels; empty: the whole log
+    reason: str
+
+    def __str__(self) -> str:
+        rules = ", ".join(self.rules) or "all rules"
+        return f"{rules}: {self.reason}" + (f" ({len(self.items)}): {', '.join(self.items)}" if self.items else "")
+
+
+def unchecked(validator: Validator, *, live: bool = False) -> list[Unchecked]:
+    """List everything that was not checked.
+
+    Args:
+        validator: finished validator of the log.
+        live: whether the frames came from a live bus, which counts lost frames.
+    """
+    found = [*_of_the_log(validator, live), *_of_the_network(validator), *_of_messages(validator)]
+    signals = tuple(f"{layout.name}.{name}" for layout, name in unseen_signals(validator))
+    if signals:
+        reason = "every raw value is allowed, so no rule checked the values of these signals"
+        found.append(Unchecked((), signals, reason))
+    return found
+
+
+def _of_the_log(validator: Validator, live: bool) -> Iterator[Unchecked]:
+    frames = validator.frame_rules
+    if not validator.keeps_flags:
+        yield Unchecked(("frame-fdf", "frame-brs", "frame-esi"), (), "this log format does not keep CAN FD flags")
+    if not frames.recorder:
+        reason = "the log marks no frame as sent by the recording node"
+        if frames.recorder == "":
+            reason = "the log marks frames of several nodes as sent, so the recording node is unknown"
+        yield Unchecked(("sender",), (), reason)
+    if not live:
+        yield Unchecked(("dropped",), (), "a log records lost frames only if the CAN controller reported an overflow")
+
+
+def _of_the_network(validator: Validator) -> Iterator[Unchecked]:
+    plan = validator.plan
+    mixed = tuple(
+        name
+        for name, bus in zip(validator.channels, validator.channel_map.bus_of_channel, strict=False)
+        if bus == UNKNOWN and plan.has_buses
+    )
+    if not plan.has_buses:
+        yield Unchecked(
+            ("wrong-bus",),
+            (),
+            "the DBC has no attribute Bus; the channel of the first frame is taken as the bus of a message",
+        )
+    elif mixed:
+        reason = (
+            "these channels carry messages of several buses; assign them in [channels] of a rules file if that is wrong"
+        )
+        yield Unchecked(("wrong-bus",), mixed, reason)
+    if not validator.load.checked:
+        yield Unchecked(("bus-load",), (), "the DBC has neither NominalBitrate nor Baudrate")
+    if not validator.order.buses:
+        yield Unchecked(("sync-order", "state-late"), (), "the DBC has no cyclic message SYNC...")
+    if not validator.drives.drives:
+        yield Unchecked(
+            ("cia402-transition", "cia402-response"), (), f"no message has a signal {validator.drives.state}"
+        )
+    else:
+        uncommanded = tuple(
+            plan.name(drive.row)
+            for drives in validator.drives.drives.values()
+            for drive in drives
+            if drive.command_row == UNKNOWN
+        )
+        if uncommanded:
+            yield Unchecked(
+                ("cia402-response",),
+                uncommanded,
+                f"no message of the DBC carries a {validator.drives.command} for the senders of these messages",
+            )
+    looked = {rule for family in plan.families for rule in validator.motion.checked(family)}
+    absent = tuple(rule for rule in ("velocity", "quaternion-norm", "stuck", "step") if rule not in looked)
+    if absent:
+        yield Unchecked(absent, (), "no signal has a name that these rules use; set other names in a rules file")
+    if plan.refused:
+        reasons = tuple(f"{m.name} ({m.reason})" for m in plan.refused)
+        yield Unchecked((), reasons, "the DBC layout of these messages is not supported")
+
+
+def _of_messages(validator: Validator) -> Iterator[Unchecked]:
+    plan, counts = validator.plan, validator.counts
+    seen = [row for row in range(len(plan.layouts)) if counts[row]]
+    for rules, rows, reason in (
+        (("crc", "crc-data-id", "counter-repeated", "counter-lost", "counter-sequence"),
+         [r for r in seen if not plan.protected[r]],
+         "messages without E2EDataId, or without the signals Crc and Counter of E2E Profile 5"),
+        (("cycle-mean", "cycle-jitter", "cycle-gap", "cycle-fast", "timeout", "recovered"),
+         [r for r in seen if not plan.cycle_ns[r] and r not in validator.shared],
+         "messages that are not cyclic"),
+        (("inhibit",),
+         [r for r in seen if not plan.cycle_ns[r] and not plan.inhibit_ns[r]],
+         "events without GenMsgDelayTime"),
+        (("cycle-mean", "cycle-jitter", "cycle-gap", "cycle-fast", "timeout", "recovered", "inhibit"),
+         sorted(validator.shared),
+         "parameter groups with several sender addresses"),
+        (("cycle-jitter",),
+         [r for r in seen if 0 < validator.timing.intervals[r] < validator.project.number("cycle-jitter", "min_intervals")
+          and plan.cycle_ns[r]],
+         "too few intervals in the log for the 99 % quantile"),
+        (("cycle-mean",),
+         [r for r in seen if validator.timing.intervals[r] < validator.project.number("cycle-mean", "min_intervals")
+          and plan.cycle_ns[r]],
+         "too few intervals in the log"),
+    ):  # fmt: skip
+        if rows:
+            yield Unchecked(rules, _names(validator, rows), reason)
+    absent_rows = [row for row in range(len(plan.layouts)) if not counts[row]]
+    reported = {f.message for f in validator.findings.all() if f.rule == "never-seen"}
+    if unseen := [row for row in absent_rows if plan.name(row) not in reported]:
+        yield Unchecked((), _names(validator, unseen), "messages of the DBC that are not in the log and not required")
+
+
+def unseen_signals(validator: Validator) -> list[tuple[Layout, str]]:
+    """Return the signals of received messages whose values no rule checked, with their layouts."""
+    plan = validator.plan
+    found = []
+    for family in plan.families:
+        motion = {name for names in validator.motion.checked(family).values() for name in names}
+        drives = {validator.drives.state} if family.rows.start in validator.drives.drives else set()
+        for row in family.rows:
+            layout = plan.layouts[row]
+            if not validator.counts[row]:
+                continue
+            commands = _commands(validator, row)
+            covered = motion | drives | commands | (set(_E2E) if plan.protected[row] else set())
+            found += [
+                (layout, f.name)
+                for f in layout.fields
+                if f.name not in covered and not _is_checked(validator, layout, f)
+            ]
+    return found
+
+
+def _is_checked(validator: Validator, layout: Layout, field: Field) -> bool:
+    """Return whether a range, invalid code, value table, hash or multiplexer rule can reject a value of the field."""
+    if is_limited(field) or is_enumeration(field) or field.invalid_raw is not None:
+        return True
+    if is_hash(field, validator.values.hash_signal):
+        return True
+    known = layout.multiplexers.get(field.name)
+    return known is not None and len(known) < 1 << min(field.length, 62)
+
+
+def _commands(validator: Validator, row: int) -> set[str]:
+    codec = next(family.codec for family in validator.plan.families if row in family.rows)
+    return {
+        codec.fields[drive.command_index].name
+        for drives in validator.drives.drives.values()
+        for drive in drives
+        if drive.command_row == row
+    }
+
+
+def _names(validator: Validator, rows: Sequence[int]) -> tuple[str, ...]:
+    return tuple(validator.plan.name(row) for row in np.sort(np.array(rows)).tolist())

@@ -1,0 +1,209 @@
+"""Rules for drive states: only transitions of CiA 402 are legal, and a drive must respond to a controlword in time.
+
+The rules work on changes of state and controlword, because these are few in a log of any length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.wire.cia402 import TRANSITIONS, Controlword, DriveState, next_state
+from atalante_tools.canlog.validate.e2e_rules import Steps
+from atalante_tools.canlog.validate.findings import Findings
+from atalante_tools.canlog.validate.plan import Family, Plan
+from atalante_tools.canlog.validate.project import Project
+from atalante_tools.canlog.validate.stream import Stream
+from atalante_tools.canlog.validate.value_rules import Decoded
+
+_S, _C = DriveState, Controlword
+_STATES = {int(state) for state in DriveState}
+#: Transitions without a command: fault detected, fault reaction finished, boot finished.
+_SPONTANEOUS = {(s, f) for s in DriveState for f in (_S.FAULT_REACTION_ACTIVE, _S.FAULT)} | {
+    (_S.NOT_READY_TO_SWITCH_ON, _S.SWITCH_ON_DISABLED)
+}
+#: Legal transitions: (state, next state).
+LEGAL = {(int(state), int(after)) for (state, _), after in TRANSITIONS.items()} | {
+    (int(a), int(b)) for a, b in _SPONTANEOUS
+}
+#: (state, controlword) without a required response: a quick stop must be acknowledged first, or the fault is still present.
+EXEMPT = {(int(_S.QUICK_STOP_ACTIVE), int(_C.ENABLE_OPERATION)), (int(_S.FAULT), int(_C.FAULT_RESET))}
+_NOTHING = -1
+
+
+def must_respond(state: int, controlword: int) -> bool:
+    """Return whether the controlword requires a drive in this state to change its state.
+
+    Args:
+        state: value of `DriveState`.
+        controlword: received controlword.
+    """
+    if state not in _STATES or (state, controlword) in EXEMPT:
+        return False
+    return next_state(DriveState(state), controlword) != state
+
+
+@dataclass
+class _Drive:
+    """One drive: its state and command messages, and its state at the end of the last chunk."""
+
+    row: int
+    command_row: int  # -1: the DBC has no command for the drive
+    command_index: int  # index of the controlword in the fields of its codec
+    state: int = _NOTHING
+    command: int = _NOTHING
+    since: int = 0  # stamp of the last change of state or command [ns]
+    state_stamp: int = 0  # stamp of the last state frame [ns]
+
+
+class DriveRules:
+    """Rules for the drive states and for the responses to controlwords."""
+
+    def __init__(self, plan: Plan, findings: Findings, project: Project) -> None:
+        self._plan, self._findings = plan, findings
+        self._limit_ns = project.number("cia402-response", "limit_ms") * 1e6
+        state, command = project.text("cia402-transition", "state"), project.text("cia402-response", "command")
+        #: Drives by the first row of their family.
+        self.drives: dict[int, list[_Drive]] = {}
+        for family in plan.families:
+            index = next((p for p, f in enumerate(family.codec.fields) if f.name == state), None)
+            if index is not None:
+                self.drives[family.rows.start] = [self._drive(plan, row, command) for row in family.rows]
+        self.state, self.command = state, command
+
+    @staticmethod
+    def _drive(plan: Plan, row: int, command: str) -> _Drive:
+        """Find the command of a drive.
+
+        The command is a signal that the node receives. Its name is `Controlword`, or `FH_Controlword` for the node LEFT_FH.
+        """
+        node = plan.sender(row)
+        for family in plan.families:
+            for command_row in family.rows:
+                for field in plan.layouts[command_row].fields:
+                    joint, _, quantity = field.name.rpartition("_")
+                    if quantity == command and node in field.receivers and (not joint or node.endswith(f"_{joint}")):
+                        return _Drive(row, command_row, family.codec.index(field.name))
+        return _Drive(row, _NOTHING, _NOTHING)
+
+    @property
+    def command_rows(self) -> set[int]:
+        """Return the rows of the command messages, whose decoded frames `check` needs."""
+        return {drive.command_row for drives in self.drives.values() for drive in drives} - {_NOTHING}
+
+    def check(self, decoded: dict[int, Decoded], family_of: dict[int, Family], stream: Stream, steps: Steps) -> None:
+        """Check a chunk.
+
+        Args:
+            decoded: decoded frames of the families in the chunk, by the first row of the family.
+            family_of: family of each row.
+            stream: frames of the chunk by message, shape (n,).
+            steps: steps of the alive counters, shape (n,).
+        """
+        for first, drives in self.drives.items():
+            states = decoded.get(first)
+            if states is None:
+                continue
+            index = states.family.codec.index(self.state)
+            for drive in drives:
+                self._check_drive(drive, states, index, decoded, family_of, stream, steps)
+
+    def _check_drive(
+        self,
+        drive: _Drive,
+        states: Decoded,
+        index: int,
+        decoded: dict[int, Decoded],
+        family_of: dict[int, Family],
+        stream: Stream,
+        steps: Steps,
+    ) -> None:
+        of = stream.of(drive.row)
+        if of.start == of.stop:
+            return
+        codes = states.codes[index, of.start - states.span.start : of.stop - states.span.start]
+        self._check_transitions(drive, codes, stream.stamps[of], steps[of])
+        changes = _changes(codes, drive.state)
+        events = [(int(stream.indices[of][k]), int(stream.stamps[of][k]), True, int(codes[k])) for k in changes]
+        if drive.command_row != _NOTHING:
+            commands = decoded.get(family_of[drive.command_row].rows.start)
+            span = stream.of(drive.command_row)
+            if commands is not None and span.start != span.stop:
+                words = commands.codes[
+                    drive.command_index, span.start - commands.span.start : span.stop - commands.span.start
+                ]
+                changed = _changes(words, drive.command)
+                events += [
+                    (int(stream.indices[span][k]), int(stream.stamps[span][k]), False, int(words[k])) for k in changed
+                ]
+                events.sort()
+        self._replay_changes(drive, events, stream.indices[of], stream.stamps[of])
+
+    def _check_transitions(
+        self, drive: _Drive, codes: npt.NDArray[np.int64], stamps: npt.NDArray[np.int64], steps: Steps
+    ) -> None:
+        before = np.concatenate([[drive.state], codes[:-1]])
+        for k in np.flatnonzero((codes != before) & (steps <= 1)).tolist():
+            was, now = int(before[k]), int(codes[k])
+            if was in _STATES and now in _STATES and (was, now) not in LEGAL:
+                self._findings.add(
+                    "cia402-transition",
+                    self._plan.name(drive.row),
+                    stamps[k : k + 1],
+                    node=self._plan.sender(drive.row),
+                    signal=self.state,
+                    shown=[f"{DriveState(was).name} to {DriveState(now).name}"],
+                    badness=np.zeros(1),
+                )
+
+    def _replay_changes(
+        self,
+        drive: _Drive,
+        events: list[tuple[int, int, bool, int]],
+        indices: npt.NDArray[np.intp],
+        stamps: npt.NDArray[np.int64],
+    ) -> None:
+        """Apply the changes in order of time and check the response time at each change.
+
+        Args:
+            drive: updated with each change.
+            events: (index in the chunk, stamp [ns], whether it is a state, code) of each change.
+            indices: indices of the state frames in the chunk, shape (k,).
+            stamps: stamps of the state frames [ns], shape (k,).
+        """
+        for index, stamp, is_state, code in events:
+            at = int(np.searchsorted(indices, index)) - 1
+            self._check(drive, int(stamps[at]) if at >= 0 else drive.state_stamp)
+            if is_state:
+                drive.state = code
+            else:
+                drive.command = code
+            drive.since = stamp
+        drive.state_stamp = int(stamps[-1])
+
+    def _check(self, drive: _Drive, until: int) -> None:
+        """Report a drive that has not responded to its command by the stamp `until` [ns]."""
+        waited = until - drive.since
+        if waited > self._limit_ns and must_respond(drive.state, drive.command):
+            self._findings.add(
+                "cia402-response",
+                self._plan.name(drive.row),
+                np.array([drive.since], np.int64),
+                node=self._plan.sender(drive.row),
+                shown=[waited * 1e-6],
+            )
+
+    def finish(self) -> None:
+        """Check the commands without a response at the end of the log."""
+        for drives in self.drives.values():
+            for drive in drives:
+                if drive.state_stamp:
+                    self._check(drive, drive.state_stamp)
+
+
+def _changes(codes: npt.NDArray[np.int64], before: int) -> list[int]:
+    """Return the indices where a column of shape (n,) differs from the previous value; `before` is the value before the first."""
+    changed = np.flatnonzero(codes[1:] != codes[:-1]) + 1
+    return [*([0] if int(codes[0]) != before else []), *changed.tolist()]

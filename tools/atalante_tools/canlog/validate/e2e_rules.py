@@ -1,0 +1,105 @@
+"""Rules for end-to-end protection (E2E): CRC of every frame, and steps of the alive counters."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.wire.e2e import COUNTER_BYTE
+from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES
+from atalante_tools.canlog.column_codec import crc_differences
+from atalante_tools.canlog.validate.findings import Findings
+from atalante_tools.canlog.validate.plan import Plan, Rows
+from atalante_tools.canlog.validate.stream import Stream
+
+Steps = npt.NDArray[np.int64]
+
+#: Counter step of a repeated frame, and mark of a frame without a counter or without a previous frame.
+REPEATED, NO_STEP = 0, -1
+
+
+def counter_steps(counters: npt.NDArray[np.uint8], before: npt.NDArray[np.uint8]) -> Steps:
+    """Return the step of each alive counter since the previous frame: 1 in order, 0 repeated. Shape (n,), 0 to 255."""
+    return np.subtract(counters, before).astype(np.int64)
+
+
+class CrcRules:
+    """Rules for the CRC over payload and Data ID."""
+
+    def __init__(self, plan: Plan, findings: Findings) -> None:
+        self._plan, self._findings = plan, findings
+        lengths = np.where(plan.protected, plan.lengths, 0)
+        #: Rows of the protected messages of each payload length, which are contiguous.
+        self._spans = [
+            range(int(r[0]), int(r[-1]) + 1) for n in np.unique(lengths[lengths > 0]) for r in [_at(plan, n)]
+        ]
+        self._names = {
+            (m.length, int(constant)): m.name
+            for m, constant in zip(plan.layouts, plan.crc_constants.tolist(), strict=True)
+            if m.data_id is not None
+        }
+
+    def check(self, stream: Stream) -> npt.NDArray[np.bool_] | None:
+        """Report damaged frames; return which frames are intact, shape (n,), or None if all are."""
+        intact: npt.NDArray[np.bool_] | None = None
+        for rows in self._spans:
+            span = stream.span(rows)
+            if span.start == span.stop:
+                continue
+            length = int(self._plan.lengths[rows.start])
+            of = stream.rows[span]
+            differences = crc_differences(stream.frames[span], length)
+            wrong = (differences != self._plan.crc_constants[of]) & self._plan.protected[of]
+            if bool(wrong.any()):
+                if intact is None:
+                    intact = np.ones(len(stream), np.bool_)
+                intact[span] = ~wrong
+                self._report(of[wrong], stream.stamps[span][wrong], differences[wrong], length)
+        return intact
+
+    def _report(
+        self, of: Rows, stamps: npt.NDArray[np.int64], differences: npt.NDArray[np.uint16], length: int
+    ) -> None:
+        """Report wrong CRCs.
+
+        A CRC that fits the Data ID of another message identifies that message, so the frame has the wrong identifier.
+
+        Args:
+            of: row of each frame, shape (k,).
+            stamps: stamp of each frame [ns], shape (k,).
+            differences: result of `crc_differences`, shape (k,).
+            length: payload length of the frames, bytes.
+        """
+        names = [self._names.get((length, difference), "") for difference in differences.tolist()]
+        foreign = np.array([bool(name) for name in names])
+        if not bool(foreign.all()):
+            self._findings.add_rows("crc", of[~foreign], stamps[~foreign])
+        if bool(foreign.any()):
+            shown = np.array(names, object)[foreign]
+            self._findings.add_rows(
+                "crc-data-id", of[foreign], stamps[foreign], shown=shown, badness=np.zeros(len(shown))
+            )
+
+
+def _at(plan: Plan, length: int) -> npt.NDArray[np.intp]:
+    return np.flatnonzero(plan.lengths == length)
+
+
+class Counters:
+    """Steps of the alive counters of all messages; keeps the last counter of each message."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._protected = plan.protected
+        self._last = np.zeros(len(plan.layouts), np.uint8)
+        self._seen = np.zeros(len(plan.layouts), np.bool_)
+
+    def steps(self, stream: Stream) -> Steps:
+        """Return the counter step of each frame; `NO_STEP` without a counter or a previous frame. Shape (n,)."""
+        counters = stream.frames.view(np.uint8).reshape(-1, FRAME_BYTES)[:, HEADER_BYTES + COUNTER_BYTE].copy()
+        steps = counter_steps(counters, stream.before(counters, self._last))
+        steps[stream.starts[~self._seen[stream.present]]] = NO_STEP
+        if not bool(self._protected[stream.present].all()):
+            steps[~self._protected[stream.rows]] = NO_STEP
+        stream.last(counters, self._last)
+        self._seen[stream.present] = True
+        return steps

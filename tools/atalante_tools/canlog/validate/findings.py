@@ -1,0 +1,197 @@
+"""Findings: one per rule, message and signal, with count, first, last and worst occurrence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_tools.canlog.validate.plan import Plan
+from atalante_tools.canlog.validate.rules import RULE_OF
+
+Stamps = npt.NDArray[np.int64]
+#: Maximum number of findings of a rule in `_UNBOUNDED`; further ones are combined in one finding, `OTHERS`.
+MAX_UNKNOWN_IDS = 100
+OTHERS = "(others)"
+#: Rules whose number of findings is not bounded by the DBC.
+_UNBOUNDED = ("unknown-id",)
+
+
+@dataclass(kw_only=True)
+class Finding:
+    """All violations of one rule by one signal, message or bus."""
+
+    rule: str
+    message: str
+    node: str
+    signal: str
+    count: int
+    first: int  # ns
+    last: int  # ns
+    worst: str  # value of the worst occurrence, with unit
+    badness: float  # severity of the worst occurrence; larger is worse
+
+    @property
+    def first_s(self) -> float:
+        """Return the stamp of the first occurrence in the log [s]."""
+        return self.first * 1e-9
+
+    @property
+    def last_s(self) -> float:
+        """Return the stamp of the last occurrence in the log [s]."""
+        return self.last * 1e-9
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the finding as a JSON object with the keys rule, message, node, count, first_s, last_s and worst."""
+        return {
+            "rule": self.rule,
+            "message": self.message,
+            "node": self.node,
+            "count": self.count,
+            "first_s": self.first_s,
+            "last_s": self.last_s,
+            "worst": self.worst,
+        }
+
+
+class Findings:
+    """Collection of the findings of one log; the rules add their violations as columns."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        self._found: dict[tuple[str, str, str], Finding] = {}
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+    def all(self) -> list[Finding]:
+        """Return the findings in the order of the rules, then by first occurrence."""
+        order = list(RULE_OF)
+        return sorted(self._found.values(), key=lambda f: (order.index(f.rule), f.first, f.message, f.signal))
+
+    def add(
+        self,
+        rule: str,
+        message: str,
+        stamps: Stamps,
+        *,
+        node: str = "",
+        signal: str = "",
+        shown: Sequence[float | str] | npt.NDArray[Any] | None = None,
+        badness: npt.NDArray[Any] | None = None,
+        unit: str | None = None,
+    ) -> None:
+        """Add violations of a rule by one message.
+
+        Args:
+            rule: identifier of the rule.
+            message: name of the message; a bus for the bus load, an identifier for an unknown message.
+            stamps: stamp of each violation, shape (n,) [ns], n >= 1.
+            node: sender of the message, if known.
+            signal: name of the signal; empty for a rule about the whole frame.
+            shown: value of each violation for the report, shape (n,).
+            badness: severity of each violation, shape (n,), larger is worse.  [default: `shown`]
+            unit: unit of `shown`.  [default: unit of the rule]
+        """
+        if badness is None:
+            badness = np.asarray(shown, np.float64) if shown is not None else np.zeros(len(stamps))
+        at = int(np.argmax(badness))
+        worst = "" if shown is None else _text(shown[at], RULE_OF[rule].worst if unit is None else unit, signal)
+        self._merge(
+            Finding(
+                rule=rule,
+                message=message,
+                node=node,
+                signal=signal,
+                count=len(stamps),
+                first=int(stamps.min()),
+                last=int(stamps.max()),
+                worst=worst,
+                badness=float(badness[at]),
+            )
+        )
+
+    def add_rows(
+        self,
+        rule: str,
+        rows: npt.NDArray[Any],
+        stamps: Stamps,
+        *,
+        signal: str = "",
+        shown: npt.NDArray[Any] | None = None,
+        badness: npt.NDArray[Any] | None = None,
+        unit: str | None = None,
+    ) -> None:
+        """Add violations of a rule by several messages; `rows` are the rows of the messages. Arguments as in `add`."""
+        for row in np.unique(rows).tolist():
+            of_row = rows == row
+            self.add(
+                rule,
+                self._plan.name(row),
+                stamps[of_row],
+                node=self._plan.sender(row),
+                signal=signal,
+                shown=None if shown is None else shown[of_row],
+                badness=None if badness is None else badness[of_row],
+                unit=unit,
+            )
+
+    def add_whole(self, rule: str, row: int, first: int, last: int, *, shown: float, count: int = 1) -> None:
+        """Add a violation of a rule by a message between the stamps `first` and `last` [ns]."""
+        worst = _text(shown, RULE_OF[rule].worst, "")
+        self._merge(
+            Finding(
+                rule=rule,
+                message=self._plan.name(row),
+                node=self._plan.sender(row),
+                signal="",
+                count=count,
+                first=first,
+                last=last,
+                worst=worst,
+                badness=shown,
+            )
+        )
+
+    def add_log(self, rule: str, stamp: int, count: int, sentence: str) -> None:
+        """Add a finding about the log itself; the sentence describes it."""
+        self._merge(
+            Finding(
+                rule=rule,
+                message="",
+                node="",
+                signal="",
+                count=count,
+                first=stamp,
+                last=stamp,
+                worst=sentence,
+                badness=0.0,
+            )
+        )
+
+    def _merge(self, found: Finding) -> None:
+        key = (found.rule, found.message, found.signal)
+        full = sum(rule == found.rule for rule, _, _ in self._found) >= MAX_UNKNOWN_IDS
+        if found.rule in _UNBOUNDED and key not in self._found and full:
+            found.message = OTHERS
+            key = (found.rule, found.message, "")
+        known = self._found.setdefault(key, found)
+        if known is found:
+            return
+        known.count += found.count
+        known.first, known.last = min(known.first, found.first), max(known.last, found.last)
+        if found.badness > known.badness:
+            known.badness, known.worst = found.badness, found.worst
+
+
+def _text(value: Any, unit: str, signal: str) -> str:
+    if isinstance(value, str):
+        text = value
+    else:
+        number = float(value)
+        text = str(int(number)) if number.is_integer() and abs(number) < 1e15 else f"{number:.6g}"
+        text = f"{text} {unit}" if unit and unit != "1" else text
+    return f"{signal} = {text}" if signal else text

@@ -1,0 +1,148 @@
+"""Rules for the order within a cycle: SYNC first, then every state of its bus before the deadline."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_tools.canlog.validate.e2e_rules import Steps
+from atalante_tools.canlog.validate.findings import Findings
+from atalante_tools.canlog.validate.plan import UNKNOWN, Plan
+from atalante_tools.canlog.validate.project import Project
+from atalante_tools.canlog.validate.stream import Stream
+
+Indices = npt.NDArray[np.intp]
+
+#: Prefix of the name of the message that starts the cycle of its bus.
+SYNC = "SYNC"
+
+
+@dataclass
+class _Bus:
+    """One bus with a SYNC message, and its state at the end of the last chunk."""
+
+    sync: int  # row of the SYNC message
+    states: list[int]  # rows of the state messages
+    cycle_ns: float
+    count: int = 0  # SYNC frames so far
+    stamp: int = 0  # stamp of the last SYNC frame [ns]
+    cycle_of: dict[int, int] = field(default_factory=dict)  # row -> cycle of the last state frame
+    jump_of: dict[int, int] = field(default_factory=dict)  # row -> cycles between the last two state frames
+    doubtful: dict[int, int] = field(default_factory=dict)  # row -> stamp of a second state frame in one cycle [ns]
+
+
+class OrderRules:
+    """Rules for the cycle of each state frame and for its delay after the SYNC frame."""
+
+    def __init__(self, plan: Plan, findings: Findings, project: Project) -> None:
+        self._findings = findings
+        self._deadline = project.number("state-late", "deadline")
+        self.buses: list[_Bus] = []
+        for row, layout in enumerate(plan.layouts):
+            if not layout.name.upper().startswith(SYNC) or not plan.cycle_ns[row]:
+                continue
+            same = [
+                r for r, m in enumerate(plan.layouts) if m.bus == layout.bus and plan.cycle_ns[r] == plan.cycle_ns[row]
+            ]
+            states = [r for r in same if plan.sender_of_row[r] not in (UNKNOWN, plan.sender_of_row[row])]
+            self.buses.append(_Bus(row, states, float(plan.cycle_ns[row])))
+
+    @property
+    def checked(self) -> set[int]:
+        """Return the rows that are checked."""
+        return {row for bus in self.buses for row in (bus.sync, *bus.states)}
+
+    def check(self, stream: Stream, steps: Steps) -> None:
+        """Check a chunk.
+
+        Args:
+            stream: frames of the chunk by message, shape (n,).
+            steps: steps of the alive counters, shape (n,).
+        """
+        for bus in self.buses:
+            span = stream.of(bus.sync)
+            indices, stamps = stream.indices[span], stream.stamps[span]
+            begins = np.concatenate([[bus.stamp], stamps])
+            for row in bus.states:
+                of = stream.of(row)
+                if of.start != of.stop:
+                    number = _cycles(indices, stream.indices[of])
+                    self._check_lateness(bus, row, stream.stamps[of], begins[number], number)
+                    self._check_order(bus, row, stream.stamps[of], steps[of], number + bus.count, begins)
+            if len(stamps):
+                bus.count += len(stamps)
+                bus.stamp = int(stamps[-1])
+
+    def _check_lateness(
+        self, bus: _Bus, row: int, stamps: npt.NDArray[np.int64], begins: npt.NDArray[np.int64], number: Indices
+    ) -> None:
+        """Report states after the deadline of their cycle; `_check_order` reports states in the next cycle."""
+        after = stamps - begins
+        late = (after > self._deadline * bus.cycle_ns) & (after < bus.cycle_ns)
+        if not bus.count:
+            late &= number > 0
+        if bool(late.any()):
+            self._report("state-late", row, stamps[late], after[late])
+
+    def _check_order(
+        self,
+        bus: _Bus,
+        row: int,
+        stamps: npt.NDArray[np.int64],
+        steps: Steps,
+        cycles: Indices,
+        begins: npt.NDArray[np.int64],
+    ) -> None:
+        """Report states in the wrong cycle.
+
+        If a cycle has two states and the next cycle has none, the second state came before its SYNC. If a cycle has none and the
+        next cycle has two, the first state was late. A SYNC that is missing in the log also gives two states in one cycle, but
+        then the next cycle has one state.
+
+        Args:
+            bus: bus of the state message.
+            row: row of the state message.
+            stamps: stamp of each state [ns], shape (n,).
+            steps: step of the alive counter of each state, shape (n,).
+            cycles: number of the cycle of each state, shape (n,).
+            begins: stamp of the last SYNC of the previous chunk, then of each SYNC of the chunk [ns], shape (m + 1,).
+        """
+        first = bus.cycle_of.get(row)
+        jumps = np.diff(cycles, prepend=cycles[0] - 1 if first is None else first)
+        before = np.concatenate([[bus.jump_of.get(row, 1)], jumps[:-1]])
+        if (stamp := bus.doubtful.pop(row, None)) is not None and jumps[0] == 2:
+            self._report("sync-order", row, np.array([stamp]), np.zeros(1))
+        bus.cycle_of[row], bus.jump_of[row] = int(cycles[-1]), int(jumps[-1])
+        second = np.flatnonzero((jumps == 0) & (steps == 1))
+        if not len(second):
+            return
+        late = second[before[second] == 2]
+        early = second[before[second] != 2]
+        if len(late):
+            sync = np.maximum(cycles[late] - bus.count - 1, 0)
+            after = stamps[np.maximum(late - 1, 0)] - begins[sync]
+            self._report("state-late", row, stamps[np.maximum(late - 1, 0)], after)
+        if len(early) and early[-1] == len(stamps) - 1:
+            bus.doubtful[row] = int(stamps[-1])
+            early = early[:-1]
+        early = early[jumps[early + 1] == 2]
+        if len(early):
+            self._report("sync-order", row, stamps[early], np.zeros(len(early)))
+
+    def _report(self, rule: str, row: int, stamps: npt.NDArray[np.int64], after: npt.NDArray[np.generic]) -> None:
+        shown = None if rule == "sync-order" else after.astype(np.float64) * 1e-6
+        self._findings.add_rows(rule, np.full(len(stamps), row), stamps, shown=shown)
+
+
+def _cycles(syncs: Indices, states: Indices) -> Indices:
+    """Return the number of SYNC frames before each state frame, shape (n,).
+
+    Args:
+        syncs: indices of the SYNC frames in the chunk, ascending, shape (m,).
+        states: indices of the state frames in the chunk, ascending, shape (n,).
+    """
+    if len(syncs) == len(states) and bool((syncs < states).all()) and bool((states[:-1] < syncs[1:]).all()):
+        return np.arange(1, len(states) + 1)
+    return np.searchsorted(syncs, states)

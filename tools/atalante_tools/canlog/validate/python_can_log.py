@@ -1,0 +1,248 @@
+"""Reader of the logs of python-can (.asc, .blf, .mf4, .trc, .csv) in chunks of frames.
+
+The readers of python-can skip entries that they cannot parse and only log a warning. They return a truncated record as a shorter
+frame, and they leave files open. This module counts the skipped entries, detects truncated records and closes the files.
+"""
+
+from __future__ import annotations
+
+import gc
+import gzip
+import io
+import logging
+import os
+import struct
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from atalante_hal.wire.frame import (
+    FLAG_BRS,
+    FLAG_ESI,
+    FLAG_FDF,
+    FRAME_BYTES,
+    ID_ERROR,
+    ID_EXTENDED,
+    ID_REMOTE,
+    new_frames,
+)
+from atalante_tools.canlog.validate.candump import Channels
+from atalante_tools.canlog.validate.chunk import NO_DIRECTION, RECEIVED, SENT, Chunk, LogError
+
+if TYPE_CHECKING:
+    from atalante_tools.canlog.validate.log import Log
+
+#: Formats with one frame per line; a file without a newline at its end is truncated within a frame.
+_LINE_FORMATS = (".asc", ".trc", ".csv")
+_BLF_HEADER = struct.Struct("<4sLBBBBBBBBQQ")
+#: First bytes of an MDF file.
+_MDF = b"MDF     "
+_RECORD = struct.Struct("<IBB2x64s")
+
+
+def read(log: Log, chunk_frames: int) -> Iterator[Chunk]:
+    """Yield the frames of a log in chunks.
+
+    Args:
+        log: log to read; channels, position and remarks are updated.
+        chunk_frames: number of frames in each chunk but the last.
+
+    Raises:
+        LogError: If the file has no readable frame of its format.
+    """
+    from atalante_hal.bus.replay import UNREADABLE
+
+    batch, count, broken = _Batch(chunk_frames), 0, ""
+    warnings = _Warnings()
+    ends_within = log.suffix in _LINE_FORMATS and not log.compressed and _last_byte(log.path) not in b"\r\n"
+    with _quiet_asammdf(), warnings.captured():
+        try:
+            with _messages(log) as (messages, position):
+                held = next(messages, None)
+                while held is not None:
+                    message, held = held, next(messages, None)
+                    if held is None and ends_within:
+                        break
+                    batch.add(message, log.channels, log.keeps_direction)
+                    count += 1
+                    if batch.count == chunk_frames:
+                        log.position = position()
+                        yield batch.take()
+        except (*UNREADABLE, _mdf_error()) as error:
+            broken = " ".join(str(error).split()) or type(error).__name__
+        if broken and log.suffix == ".mf4":
+            gc.collect()  # delete the half-opened file while `_quiet_asammdf` suppresses its error
+    if batch.count:
+        yield batch.take()
+    _remark(log, count, broken, ends_within, warnings)
+
+
+@contextmanager
+def _messages(log: Log) -> Iterator[tuple[Iterator[Any], Callable[[], int]]]:
+    """Provide the messages of the log, and a function that returns the bytes read so far.
+
+    python-can does not close a file that its reader rejects. Therefore this function opens the file, except for .mf4, which
+    asammdf opens.
+    """
+    import can
+    from can.io.generic import BinaryIOMessageReader
+
+    reader_type = can.io.player.MESSAGE_READERS[log.suffix]
+    if log.suffix == ".mf4":
+        if (kind := _first_bytes(log.path, len(_MDF))) != _MDF:
+            raise ValueError(f"the first bytes must be {_MDF!r}, got {kind!r}")
+        with reader_type(log.path) as reader:
+            yield iter(reader), lambda: 0
+        return
+    with log.path.open("rb") as raw, ExitStack() as stack:
+        file: Any = stack.enter_context(gzip.GzipFile(fileobj=raw)) if log.compressed else raw
+        if not issubclass(reader_type, BinaryIOMessageReader):
+            file = stack.enter_context(io.TextIOWrapper(file, encoding="utf-8", errors="replace"))
+        yield iter(stack.enter_context(reader_type(file))), raw.tell
+
+
+def _remark(log: Log, count: int, broken: str, ends_within: bool, warnings: _Warnings) -> None:
+    if broken and not count:
+        raise LogError(f"{log.path} cannot be read as a {log.suffix} log: {broken}")
+    if broken:
+        log.remark("log-truncated", f"{log.path} cannot be read after frame {count}: {broken}", 1, -1)
+    elif ends_within:
+        log.remark("log-truncated", f"{log.path} ends within a line; its last frame was not checked", 1, -1)
+    elif log.suffix == ".blf" and (missing := _missing_bytes(log.path)):
+        log.remark(
+            "log-truncated",
+            f"{log.path} is truncated: according to its header {missing} bytes are missing; {count} frames were read",
+            1,
+            -1,
+        )
+    if warnings.count:
+        log.remark(
+            "log-unreadable",
+            f"{log.path} has {warnings.count} entries that python-can cannot read and that were not checked; first "
+            f"warning: {warnings.first}",
+            warnings.count,
+            -1,
+        )
+
+
+class _Batch:
+    """Buffer of frames, filled from python-can messages."""
+
+    def __init__(self, capacity: int) -> None:
+        self._frames = new_frames(capacity)
+        self._memory = self._frames.view(np.uint8).data
+        self._stamps: list[int] = []
+        self._channels: list[int] = []
+        self._sent: list[int] = []
+
+    @property
+    def count(self) -> int:
+        return len(self._stamps)
+
+    def add(self, message: Any, channels: Channels, keeps_direction: bool) -> None:
+        data, can_id, flags = bytes(message.data), message.arbitration_id, 0
+        length = len(data)
+        if message.is_error_frame:
+            can_id |= ID_ERROR
+        elif message.is_extended_id:
+            can_id |= ID_EXTENDED
+        if message.is_remote_frame and not message.is_fd:  # the .asc reader marks an empty FD frame as remote
+            can_id, length = can_id | ID_REMOTE, message.dlc
+        if message.is_fd:
+            flags = FLAG_FDF | bool(message.bitrate_switch) * FLAG_BRS | bool(message.error_state_indicator) * FLAG_ESI
+        _RECORD.pack_into(self._memory, self.count * FRAME_BYTES, can_id, min(length, 255), flags, data[:64])
+        self._stamps.append(round(message.timestamp * 1e9))
+        self._channels.append(channels.index("" if message.channel is None else str(message.channel)))
+        self._sent.append((RECEIVED if message.is_rx else SENT) if keeps_direction else NO_DIRECTION)
+
+    def take(self) -> Chunk:
+        count = self.count
+        chunk = Chunk(
+            self._frames[:count].copy(),
+            np.array(self._stamps, np.int64),
+            np.array(self._channels, np.uint8),
+            np.array(self._sent, np.int8),
+        )
+        self._stamps.clear()
+        self._channels.clear()
+        self._sent.clear()
+        return chunk
+
+
+class _Warnings(logging.Handler):
+    """Counter of the warnings that the python-can readers log for skipped entries."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.count = 0
+        self.first = ""
+
+    @contextmanager
+    def captured(self) -> Iterator[None]:
+        """Count the warnings of python-can inside the `with` block."""
+        logging.getLogger("can").addHandler(self)
+        try:
+            yield
+        finally:
+            logging.getLogger("can").removeHandler(self)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.first = self.first or " ".join(record.getMessage().split())
+        self.count += 1
+
+
+@contextmanager
+def _quiet_asammdf() -> Iterator[None]:
+    """Suppress the traceback of a file object of asammdf that failed to open.
+
+    Its destructor raises an exception, which Python prints.
+    """
+    before = sys.unraisablehook
+
+    def hook(failure: sys.UnraisableHookArgs) -> None:
+        if getattr(failure.object, "__qualname__", "") != "MDF4.__del__":
+            before(failure)
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
+
+
+def _mdf_error() -> type[Exception]:
+    """Return the exception type that asammdf raises for a damaged file; `EOFError` if asammdf is not installed."""
+    try:
+        from asammdf.blocks.utils import MdfException
+    except ImportError:
+        return EOFError
+    found: type[Exception] = MdfException
+    return found
+
+
+def _first_bytes(path: Path, count: int) -> bytes:
+    with path.open("rb") as file:
+        return file.read(count)
+
+
+def _last_byte(path: Path) -> bytes:
+    with path.open("rb") as file:
+        file.seek(0, os.SEEK_END)
+        if not file.tell():
+            return b"\n"
+        file.seek(-1, os.SEEK_END)
+        return file.read(1)
+
+
+def _missing_bytes(path: Path) -> int:
+    """Return the number of bytes that a .blf file lacks according to its header."""
+    with path.open("rb") as file:
+        header = file.read(_BLF_HEADER.size)
+    if len(header) < _BLF_HEADER.size:
+        return 0
+    size: int = _BLF_HEADER.unpack(header)[-2]
+    return max(0, size - path.stat().st_size)

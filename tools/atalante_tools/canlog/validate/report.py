@@ -1,0 +1,174 @@
+"""Report of one log: text for the terminal, JUnit XML for a CI server, and the list of all rules."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from atalante_tools.canlog.validate.coverage import Unchecked, unchecked
+from atalante_tools.canlog.validate.findings import Finding
+from atalante_tools.canlog.validate.judge import Validator
+from atalante_tools.canlog.validate.project import Silence
+from atalante_tools.canlog.validate.rules import RULE_OF, RULES
+from atalante_tools.console.terminal import table
+
+#: Maximum number of names per reason in the text report; the HTML report lists all names.
+_NAMES = 12
+
+
+@dataclass(frozen=True)
+class Report:
+    """Result of one log or live bus."""
+
+    name: str  # name of the log or the bus
+    validator: Validator
+    findings: tuple[Finding, ...]
+    silenced: tuple[tuple[Finding, Silence], ...]
+    unchecked: tuple[Unchecked, ...]
+
+    @property
+    def duration_s(self) -> float:
+        """Return the time from the first frame to the last [s]."""
+        return 0.0 if self.validator.begin is None else (self.validator.end - self.validator.begin) * 1e-9
+
+
+def report(name: str, validator: Validator, *, live: bool = False) -> Report:
+    """Separate the findings of a finished validator from the silenced ones.
+
+    Args:
+        name: name of the log or of the bus.
+        validator: validator after `finish`.
+        live: whether the frames came from a live bus.
+    """
+    findings, silenced = [], []
+    for finding in validator.findings.all():
+        silence = validator.project.silence(finding.rule, finding.message)
+        if silence is None:
+            findings.append(finding)
+        else:
+            silenced.append((finding, silence))
+    return Report(name, validator, tuple(findings), tuple(silenced), tuple(unchecked(validator, live=live)))
+
+
+# -- text ---------------------------------------------------------------------------------------------------------------
+
+
+def text(result: Report) -> str:
+    """Return the report as text: the log, the findings, the silenced findings and the items that were not checked."""
+    validator = result.validator
+    channels = ", ".join(name or "without a name" for name in validator.channels) or "none"
+    lines = [
+        f"{result.name}: {validator.frames} frames in {result.duration_s:.3f} s on {len(validator.channels)} channels "
+        f"({channels}), "
+        f"checked by {len(RULES)} rules against {validator.plan.catalogue.path.name} ({validator.plan.catalogue.hash32:08X})"
+    ]
+    if result.findings:
+        lines += ["", _table(result.findings), ""]
+        found = {finding.rule for finding in result.findings}
+        lines += [f"{rule.id}: {rule.meaning} [{rule.source}]" for rule in RULES if rule.id in found]
+    if result.silenced:
+        lines += ["", "Silenced by the project:"]
+        lines += [f"  {f.rule} {_where(f)}, {f.count} times: {silence.reason}" for f, silence in result.silenced]
+    if result.unchecked:
+        lines += ["", "Not checked:", *(f"  {_short(item)}" for item in result.unchecked)]
+    lines += ["", verdict(result)]
+    return "\n".join(lines)
+
+
+def verdict(result: Report) -> str:
+    """Return the result in one line."""
+    if result.findings:
+        count = sum(finding.count for finding in result.findings)
+        findings = "1 finding" if len(result.findings) == 1 else f"{len(result.findings)} findings"
+        return f"{findings} ({count} {'occurrence' if count == 1 else 'occurrences'})"
+    if not result.validator.frames:
+        return "no frame was checked"
+    silenced = f", {len(result.silenced)} silenced" if result.silenced else ""
+    return f"no findings{silenced}; see above for the items that were not checked"
+
+
+def _table(findings: Sequence[Finding]) -> str:
+    head = ("rule", "message", "node", "count", "first s", "last s", "worst")
+    rows = [
+        (f.rule, f.message or "-", f.node or "-", str(f.count), f"{f.first_s:.6f}", f"{f.last_s:.6f}", f.worst or "-")
+        for f in findings
+    ]
+    return table([head, *rows])
+
+
+def _where(finding: Finding) -> str:
+    return f"{finding.message}.{finding.signal}" if finding.signal else finding.message or "log"
+
+
+def _short(item: Unchecked) -> str:
+    if len(item.items) <= _NAMES:
+        return str(item)
+    shown = Unchecked(item.rules, (*item.items[:_NAMES], "..."), item.reason)
+    return str(shown).replace(f"({len(shown.items)})", f"({len(item.items)})")
+
+
+# -- JUnit -----------------------------------------------------------------------------------------------------------------
+
+
+def write_junit(results: Sequence[Report], path: Path) -> None:
+    """Write JUnit XML with one test suite per log and one test case per rule.
+
+    A test case is skipped if the rule is silenced or was not checked.
+    """
+    suites = ET.Element("testsuites", name="atalante validate")
+    for result in results:
+        suite = ET.SubElement(
+            suites, "testsuite", name=result.name, tests=str(len(RULES)), time=f"{result.duration_s:.3f}"
+        )
+        failures = skipped = 0
+        for rule in RULES:
+            case = ET.SubElement(suite, "testcase", classname="atalante.validate", name=rule.id)
+            of_rule = [finding for finding in result.findings if finding.rule == rule.id]
+            reason = _skipped(result, rule.id)
+            if of_rule:
+                failures += 1
+                failure = ET.SubElement(case, "failure", message=f"{rule.meaning} [{rule.source}]")
+                failure.text = "\n".join(
+                    f"{_where(f)} ({f.node or 'no sender'}): {f.count} times, first {f.first_s:.6f} s, last {f.last_s:.6f} s, "
+                    f"worst {f.worst or '-'}"
+                    for f in of_rule
+                )
+            elif reason:
+                skipped += 1
+                ET.SubElement(case, "skipped", message=reason)
+        suite.set("failures", str(failures))
+        suite.set("skipped", str(skipped))
+    ET.indent(suites)
+    ET.ElementTree(suites).write(path, encoding="utf-8", xml_declaration=True)
+
+
+def _skipped(result: Report, rule: str) -> str:
+    """Return why a rule was silenced or not checked; empty if it was checked."""
+    reasons = [f"silenced for {_where(f)}: {s.reason}" for f, s in result.silenced if f.rule == rule]
+    reasons += [f"not checked: {item.reason}" for item in result.unchecked if rule in item.rules and not item.items]
+    return "; ".join(reasons)
+
+
+def rules_text() -> str:
+    """Return every rule with its thresholds as a table, for `--list-rules`."""
+    rows = [("rule", "meaning", "source", "thresholds")]
+    for rule in RULE_OF.values():
+        thresholds = ", ".join(f"{name} = {_toml(value)}" for name, value in rule.thresholds.items())
+        rows.append((rule.id, rule.meaning, rule.source, thresholds or "-"))
+    return table(rows)
+
+
+def rules_json() -> list[dict[str, object]]:
+    """Return every rule with its thresholds as JSON objects, for `--list-rules --json`."""
+    return [
+        {"rule": rule.id, "meaning": rule.meaning, "source": rule.source, "thresholds": dict(rule.thresholds)}
+        for rule in RULE_OF.values()
+    ]
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, tuple):
+        return "[" + ", ".join(f'"{item}"' for item in value) + "]"
+    return f'"{value}"' if isinstance(value, str) else f"{value:g}"

@@ -1,0 +1,187 @@
+"""Loops that pass the frames of a log or a live bus to the validator and return the report."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from atalante_hal.bus import Bus, BusError, open_bus
+from atalante_hal.wire.frame import WORDS, new_frames
+from atalante_tools.canlog.validate.chunk import NO_DIRECTION, Chunk
+from atalante_tools.canlog.validate.judge import Validator
+from atalante_tools.canlog.validate.log import Log, open_log
+from atalante_tools.canlog.validate.plan import Plan
+from atalante_tools.canlog.validate.project import Project
+from atalante_tools.canlog.validate.report import Report, report
+
+#: Period of the checks of a live bus, and longest wait for a frame [s].
+_CHECK_PERIOD, _RECEIVE_TIMEOUT = 0.5, 0.02
+_LIVE_FRAMES = 4096  # size of the receive buffer
+
+
+def validate_log(
+    path: Path,
+    plan: Plan,
+    project: Project,
+    *,
+    node: str | None = None,
+    progress: Callable[[float, int], None] = lambda share, frames: None,
+) -> Report:
+    """Check one log.
+
+    Args:
+        path: file of the log.
+        plan: compiled DBC.
+        project: thresholds, silenced rules and channel names.
+        node: the only node whose messages are expected; None: all nodes.
+        progress: called after each chunk with the share of the log that has been read, 0 to 1, and the frames so far.
+
+    Raises:
+        LogError: If the file cannot be opened as a log.
+    """
+    log = open_log(path)
+    validator = Validator(plan, project, node=node, keeps_flags=log.keeps_flags)
+    for chunk, share in _read_ahead(log):
+        validator.check(chunk, log.channels.names)
+        progress(share, validator.frames)
+    validator.finish(log.remarks)
+    return report(str(path), validator)
+
+
+def _read_ahead(log: Log) -> Iterator[tuple[Chunk, float]]:
+    """Yield the chunks of a log, each with the share of the log that has been read, 0 to 1.
+
+    A thread reads the next chunk while the caller checks the current one. numpy releases the interpreter lock in both.
+    """
+    ready: queue.Queue[tuple[Chunk, float] | BaseException | None] = queue.Queue(maxsize=1)
+    abandoned = threading.Event()
+
+    def offer(item: tuple[Chunk, float] | BaseException | None) -> None:
+        while not abandoned.is_set():
+            try:
+                ready.put(item, timeout=0.1)
+            except queue.Full:
+                continue
+            return
+
+    def read() -> None:
+        try:
+            for chunk in log.chunks():
+                offer((chunk, log.position / max(1, log.size)))
+                if abandoned.is_set():
+                    return
+        except BaseException as error:  # noqa: BLE001 - raised again in the thread of the caller
+            offer(error)
+        else:
+            offer(None)
+
+    reader = threading.Thread(target=read, name="log reader", daemon=True)
+    reader.start()
+    try:
+        while (item := ready.get()) is not None:
+            if isinstance(item, BaseException):
+                raise item
+            yield item
+    finally:
+        abandoned.set()
+        reader.join()
+
+
+def listen(
+    buses: Mapping[str, Bus],
+    plan: Plan,
+    project: Project,
+    *,
+    name: str,
+    stopped: Callable[[], bool],
+    node: str | None = None,
+    progress: Callable[[int], None] = lambda frames: None,
+) -> Report:
+    """Check the frames of one or more open buses until `stopped()` or a bus error. Nothing is sent.
+
+    Args:
+        buses: channel name -> open bus.
+        plan: compiled DBC.
+        project: thresholds, silenced rules and channel names.
+        name: name of the report.
+        stopped: called in every iteration; True ends the loop.
+        node: the only node whose messages are expected; None: all nodes.
+        progress: called after each check with the frames so far.
+    """
+    validator = Validator(plan, project, node=node)
+    names, scratch = list(buses), new_frames(_LIVE_FRAMES)
+    pieces: list[Chunk] = []
+    next_time = time.monotonic() + _CHECK_PERIOD
+    failure = ""
+    while not stopped() and not failure:
+        for channel, bus in enumerate(buses.values()):
+            try:
+                count = bus.receive(scratch, _RECEIVE_TIMEOUT if len(buses) == 1 else 0.0)
+            except BusError as error:
+                failure = str(error)
+                break
+            if count:
+                pieces.append(_piece(bus, scratch[:count], channel))
+        if len(buses) > 1 and not pieces:
+            time.sleep(_RECEIVE_TIMEOUT / 10)
+        if time.monotonic() >= next_time:
+            next_time += _CHECK_PERIOD
+            _check_pieces(validator, pieces, names)
+            progress(validator.frames)
+    _check_pieces(validator, pieces, names)
+    validator.finish((), dropped=sum(bus.dropped for bus in buses.values()))
+    if failure:
+        validator.findings.add_log("log-truncated", validator.end, 1, f"listening ended with a bus error: {failure}")
+    return report(name, validator, live=True)
+
+
+def _piece(bus: Bus, frames: np.ndarray, channel: int) -> Chunk:
+    count = len(frames)
+    stamps = bus.stamps[:count].copy()
+    return Chunk(frames.copy(), stamps, np.full(count, channel, np.uint8), np.full(count, NO_DIRECTION, np.int8))
+
+
+def _check_pieces(validator: Validator, pieces: list[Chunk], names: list[str]) -> None:
+    if not pieces:
+        return
+    frames = new_frames(sum(map(len, pieces)))
+    words = [piece.frames.view("<u8").reshape(-1, WORDS) for piece in pieces]
+    np.concatenate(words, out=frames.view("<u8").reshape(-1, WORDS))
+    chunk = Chunk(
+        frames,
+        np.concatenate([piece.stamps for piece in pieces]),
+        np.concatenate([piece.channels for piece in pieces]),
+        np.concatenate([piece.sent for piece in pieces]),
+    )
+    pieces.clear()
+    validator.check(chunk.select(np.argsort(chunk.stamps, kind="stable")), names)
+
+
+def open_channels(interface: str, channels: str) -> dict[str, Bus]:
+    """Open one or more channels of a CAN interface.
+
+    Args:
+        interface: interface of python-can.
+        channels: one channel, `can0`, or several with names, `left_leg=can0,right_leg=can1`.
+
+    Returns:
+        Open buses by the name of the channel.
+
+    Raises:
+        BusAbsent: If a channel cannot be opened; the channels that are already open are closed.
+    """
+    opened: dict[str, Bus] = {}
+    try:
+        for entry in channels.split(","):
+            name, _, channel = entry.strip().rpartition("=")
+            opened[name or channel] = open_bus(interface, channel)
+    except BusError:
+        for bus in opened.values():
+            bus.close()
+        raise
+    return opened

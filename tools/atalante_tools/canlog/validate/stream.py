@@ -1,0 +1,110 @@
+"""Valid frames of a chunk in one array, sorted by message, so that each message is a slice.
+
+Differences between consecutive frames (counter steps, intervals) are computed for all messages in one operation. The first frame
+of each slice is compared with the last frame of the message in the previous chunks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.wire.frame import FRAME, WORDS, Frames
+from atalante_tools.canlog.validate.chunk import Chunk
+from atalante_tools.canlog.validate.plan import Family, Rows
+
+_Column = TypeVar("_Column", bound=npt.NDArray[Any])
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Frames sorted by row, in the order of the log within a row. Shapes (n,), and (m,) for the m messages in the chunk."""
+
+    rows: Rows  # row of each frame
+    stamps: npt.NDArray[np.int64]  # ns
+    indices: npt.NDArray[np.intp]  # index of each frame in the chunk
+    frames: Frames
+    present: npt.NDArray[np.intp]  # rows that have frames, ascending
+    starts: npt.NDArray[np.intp]  # first frame of each present row
+    stops: npt.NDArray[np.intp]  # index after the last frame of each present row
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def before(self, column: _Column, carried: npt.NDArray[Any]) -> _Column:
+        """Return the value of the previous frame of the same message. Shape (n,).
+
+        Args:
+            column: value of each frame, shape (n,).
+            carried: last value of each row in the previous chunks, shape (rows,).
+        """
+        shifted: Any = np.empty_like(column)
+        shifted[1:] = column[:-1]
+        shifted[self.starts] = carried[self.present]
+        found: _Column = shifted
+        return found
+
+    def last(self, column: npt.NDArray[Any], carried: npt.NDArray[Any]) -> None:
+        """Store the last value of each message.
+
+        Args:
+            column: value of each frame, shape (n,).
+            carried: last value of each row, updated for the rows in the chunk, shape (rows,).
+        """
+        carried[self.present] = column[self.stops - 1]
+
+    def span(self, rows: range) -> slice:
+        """Return the slice of the frames of contiguous rows."""
+        first, end = self.present.searchsorted((rows.start, rows.stop)).tolist()
+        if first == end:
+            return slice(0, 0)
+        return slice(int(self.starts[first]), int(self.stops[end - 1]))
+
+    def of(self, row: int) -> slice:
+        """Return the slice of the frames of one row."""
+        return self.span(range(row, row + 1))
+
+    def bounds(self, family: Family) -> list[tuple[int, int, int]]:
+        """Return (row, first, end) of each message in the chunk, as indices into the frames of the family."""
+        first, end = self.present.searchsorted((family.rows.start, family.rows.stop)).tolist()
+        if first == end:
+            return []
+        offset = int(self.starts[first])
+        return [
+            (row, start - offset, stop - offset)
+            for row, start, stop in zip(
+                self.present[first:end].tolist(),
+                self.starts[first:end].tolist(),
+                self.stops[first:end].tolist(),
+                strict=True,
+            )
+        ]
+
+    def select(self, keep: npt.NDArray[np.bool_]) -> Stream:
+        """Return the frames where the mask of shape (n,) is True."""
+        return _stream(self.rows[keep], self.stamps[keep], self.indices[keep], self.frames[keep])
+
+
+def sort(chunk: Chunk, rows: Rows, indices: npt.NDArray[np.intp] | None) -> Stream:
+    """Sort the frames of a chunk by message.
+
+    Args:
+        chunk: frames of the log, n of them.
+        rows: row of each frame, shape (n,).
+        indices: indices of the frames to keep, shape (k,); None: all frames.
+    """
+    wanted = rows if indices is None else rows[indices]
+    order = np.argsort(wanted, kind="stable")
+    if indices is not None:
+        order = indices[order]
+    words = chunk.frames.view("<u8").reshape(-1, WORDS).take(order, axis=0)
+    return _stream(rows[order], chunk.stamps[order], order, words.reshape(-1).view(FRAME))
+
+
+def _stream(rows: Rows, stamps: npt.NDArray[np.int64], indices: npt.NDArray[np.intp], frames: Frames) -> Stream:
+    starts = np.flatnonzero(np.diff(rows, prepend=np.int16(-1)))
+    stops = np.append(starts[1:], len(rows)) if len(rows) else starts
+    return Stream(rows, stamps, indices, frames, rows[starts].astype(np.intp), starts, stops)

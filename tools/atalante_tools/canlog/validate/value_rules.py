@@ -1,0 +1,289 @@
+"""Rules for payloads: ranges, codes for "no value", value tables, reserved bits, multiplexers.
+
+The messages of a family are checked together. Each field costs two reductions (smallest and largest raw code). Only a column that
+fails is checked value by value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_dbc.foreign import Field, Layout
+from atalante_tools.canlog.column_codec import BulkCodec, Mask, Words, payload_words, raw_range
+from atalante_tools.canlog.validate.findings import Findings
+from atalante_tools.canlog.validate.plan import Family, Plan
+from atalante_tools.canlog.validate.project import Project
+from atalante_tools.canlog.validate.stream import Stream
+
+#: Longest field with a lookup table of its named values, bits.
+_TABLE_BITS = 16
+_WORD = 64
+_HASH_BITS = 32
+
+
+@dataclass
+class Decoded:
+    """Raw codes of the frames of a family, with marks for invalid values."""
+
+    family: Family
+    span: slice  # frames of the family in the stream
+    raw: Words  # shape (fields, n)
+    bad: dict[int, Mask] = field(default_factory=dict)  # index of a field -> frames with an invalid value
+
+    @property
+    def codes(self) -> npt.NDArray[np.int64]:
+        """Return the raw codes as signed integers. Shape (fields, n)."""
+        return self.raw.view(np.int64)
+
+
+class ValueRules:
+    """Rules for the payloads of each family."""
+
+    def __init__(self, plan: Plan, findings: Findings, project: Project) -> None:
+        self._findings = findings
+        self._hash = plan.catalogue.hash32
+        pattern = project.number("reserved-bits", "value")
+        self.hash_signal = project.text("dbc-hash", "signal")
+        self._checks = {
+            family.rows.start: _FamilyChecks(family.codec, pattern, self.hash_signal) for family in plan.families
+        }
+
+    def check(self, family: Family, stream: Stream) -> Decoded | None:
+        """Decode and check the frames of a family; return None if the chunk has none."""
+        span = stream.span(family.rows)
+        if span.start == span.stop or not family.codec.fields:
+            return None
+        words = payload_words(stream.frames[span], family.length)
+        decoded = Decoded(family, span, family.codec.extract(words))
+        checks = self._checks[family.rows.start]
+        self._check_multiplexers(decoded, stream)
+        self._check_limits(checks, decoded, stream)
+        self._check_tables(checks, decoded, stream)
+        self._check_reserved(checks, words, decoded, stream)
+        for index in checks.hashes:
+            wrong = decoded.codes[index] != self._hash
+            if bool(wrong.any()):
+                hashes = np.array([f"{code:08X}" for code in decoded.codes[index].tolist()], object)
+                self._report("dbc-hash", decoded, stream, wrong, index, shown=hashes, badness=np.zeros(len(hashes)))
+        return decoded
+
+    def _report(
+        self,
+        rule: str,
+        decoded: Decoded,
+        stream: Stream,
+        wrong: Mask,
+        index: int,
+        *,
+        shown: npt.NDArray[np.generic],
+        badness: npt.NDArray[np.generic] | None = None,
+        unit: str | None = None,
+    ) -> None:
+        self._findings.add_rows(
+            rule,
+            stream.rows[decoded.span][wrong],
+            stream.stamps[decoded.span][wrong],
+            signal=decoded.family.codec.fields[index].name,
+            shown=shown[wrong],
+            badness=None if badness is None else badness[wrong],
+            unit=unit,
+        )
+        known = decoded.bad.get(index)
+        decoded.bad[index] = wrong if known is None else known | wrong
+
+    def _check_multiplexers(self, decoded: Decoded, stream: Stream) -> None:
+        codec = decoded.family.codec
+        for name in codec.layout.multiplexers:
+            undefined = codec.undefined(decoded.raw, name)
+            if bool(undefined.any()):
+                index = codec.index(name)
+                self._report("multiplexer", decoded, stream, undefined, index, shown=decoded.codes[index])
+
+    def _check_limits(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream) -> None:
+        if len(checks.limited):
+            codes = decoded.codes[checks.limited] if len(checks.limited) < len(decoded.raw) else decoded.codes
+            outside = (codes.min(axis=1) < checks.low) | (codes.max(axis=1) > checks.high)
+            for at in np.flatnonzero(outside).tolist():
+                self._check_limit(checks, decoded, stream, int(checks.limited[at]))
+        for index in checks.special:
+            self._check_special(decoded, stream, index)
+        for index, code in checks.coded.items():
+            outside = decoded.codes[index] == code
+            if bool(outside.any()):
+                self._check_outside(decoded, stream, index, outside, decoded.codes[index].astype(np.float64))
+
+    def _check_limit(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream, index: int) -> None:
+        """Check a column in which at least one code is outside the range."""
+        codec, codes = decoded.family.codec, decoded.codes[index]
+        low, high = checks.bounds[index]
+        outside = (codes < low) | (codes > high)
+        self._check_outside(decoded, stream, index, outside, codec.values(decoded.raw, index).astype(np.float64))
+
+    def _check_special(self, decoded: Decoded, stream: Stream, index: int) -> None:
+        """Check a float or 64-bit field by its physical value, because its raw codes are not ordered as int64."""
+        values = decoded.family.codec.values(decoded.raw, index).astype(np.float64)
+        limits = decoded.family.codec.fields[index]
+        low = -math.inf if limits.minimum is None else limits.minimum
+        high = math.inf if limits.maximum is None else limits.maximum
+        margin = 1e-9 * max(abs(x) for x in (low, high, 1.0) if math.isfinite(x))
+        outside = ~((values >= low - margin) & (values <= high + margin))
+        self._check_outside(decoded, stream, index, outside, values)
+
+    def _check_outside(
+        self, decoded: Decoded, stream: Stream, index: int, outside: Mask, values: npt.NDArray[np.float64]
+    ) -> None:
+        """Report the values outside the range as "no value" or out of range; named special values are valid.
+
+        Args:
+            decoded: decoded frames of the family; invalid values are marked.
+            stream: frames of the chunk by message.
+            index: index of the field.
+            outside: frames whose value is outside the range, shape (n,).
+            values: physical values of the field, shape (n,).
+        """
+        codec, codes = decoded.family.codec, decoded.codes[index]
+        limits = codec.fields[index]
+        present = codec.present(decoded.raw, index)
+        if present is not None:
+            outside = outside & present
+        invalid = np.zeros(len(codes), np.bool_)
+        if limits.invalid_raw is not None:
+            invalid = outside & (codes == _as_signed(limits, limits.invalid_raw))
+            if bool(invalid.any()):
+                self._report("invalid-code", decoded, stream, invalid, index, shown=codes)
+        wrong = outside & ~invalid
+        if limits.choices and bool(wrong.any()):
+            wrong &= ~np.isin(codes, list(limits.choices))
+        if bool(wrong.any()):
+            low, high = limits.minimum or 0.0, limits.maximum or 0.0
+            distance = np.maximum(low - values, values - high)
+            distance = np.nan_to_num(distance, nan=np.inf)
+            self._report("range", decoded, stream, wrong, index, shown=values, badness=distance, unit=limits.unit)
+
+    def _check_tables(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream) -> None:
+        for index, table in checks.tables.items():
+            codes = decoded.codes[index]
+            limits = decoded.family.codec.fields[index]
+            known = table.take(codes & len(table) - 1) if isinstance(table, np.ndarray) else np.isin(codes, table)
+            if bool(known.all()):
+                continue
+            wrong = ~known
+            if (present := decoded.family.codec.present(decoded.raw, index)) is not None:
+                wrong &= present
+            if (bad := decoded.bad.get(index)) is not None:
+                wrong &= ~bad
+            if limits.invalid_raw is not None:
+                wrong &= codes != _as_signed(limits, limits.invalid_raw)
+            if bool(wrong.any()):
+                self._report("value-table", decoded, stream, wrong, index, shown=codes)
+
+    def _check_reserved(self, checks: _FamilyChecks, words: Words, decoded: Decoded, stream: Stream) -> None:
+        set_bits = np.zeros(0, np.uint64)
+        for word, mask in checks.reserved.items():
+            column = (words[word] ^ checks.pattern) & mask
+            if bool(np.bitwise_or.reduce(column)):
+                counted = np.bitwise_count(column).astype(np.uint64)
+                set_bits = counted if not len(set_bits) else set_bits + counted
+        if len(set_bits):
+            wrong = set_bits > 0
+            self._findings.add_rows(
+                "reserved-bits",
+                stream.rows[decoded.span][wrong],
+                stream.stamps[decoded.span][wrong],
+                shown=set_bits[wrong],
+            )
+
+
+class _FamilyChecks:
+    """Compiled checks of the payloads of a family."""
+
+    def __init__(self, codec: BulkCodec, pattern: float, hash_signal: str) -> None:
+        fields = list(enumerate(codec.fields))
+        ranged = [(p, f) for p, f in fields if is_limited(f)]
+        self.special = [p for p, f in ranged if f.kind == "float" or f.length == _WORD]
+        self.bounds = {p: raw_bounds(f) for p, f in ranged if p not in self.special}
+        self.limited = np.array(list(self.bounds), np.intp)
+        self.low = np.array([low for low, _ in self.bounds.values()], np.int64)
+        self.high = np.array([high for _, high in self.bounds.values()], np.int64)
+        #: Codes for "no value" of fields without a range.
+        self.coded = {
+            p: _as_signed(f, f.invalid_raw) for p, f in fields if f.invalid_raw is not None and (p, f) not in ranged
+        }
+        self.tables = {p: _table(f) for p, f in fields if is_enumeration(f)}
+        self.hashes = [p for p, f in fields if is_hash(f, hash_signal)]
+        self.pattern = np.uint64(2**64 - 1 if pattern else 0)
+        unused = reserved_bits(codec.layout)
+        self.reserved = {
+            word: np.uint64(mask)
+            for word in range((codec.layout.length + 7) // 8)
+            if (mask := sum(1 << bit % _WORD for bit in unused if bit // _WORD == word))
+        }
+
+
+def reserved_bits(layout: Layout) -> list[int]:
+    """Return the payload bits without a signal, numbered from the least significant bit of byte 0."""
+    used = {bit for f in layout.fields for bit in f.bits}
+    return [bit for bit in range(8 * layout.length) if bit not in used]
+
+
+def is_limited(limits: Field) -> bool:
+    """Return whether a raw code of the field can be outside its range."""
+    if limits.minimum is None or limits.maximum is None or limits.factor == 0:
+        return False
+    if limits.kind == "float":
+        return True
+    low, high = raw_bounds(limits)
+    codes = raw_range(limits)
+    return low > codes[0] or high < codes[-1]
+
+
+def raw_bounds(limits: Field) -> tuple[int, int]:
+    """Return the smallest and largest raw code inside the range, with a tolerance for rounded decimals in the DBC."""
+    assert limits.minimum is not None
+    assert limits.maximum is not None
+    raw = sorted((x - limits.offset) / limits.factor for x in (limits.minimum, limits.maximum))
+    codes = raw_range(limits)
+    low, high = math.ceil(raw[0] - 1e-6), math.floor(raw[1] + 1e-6)
+    return max(low, codes[0]), min(high, codes[-1])
+
+
+def is_enumeration(named: Field) -> bool:
+    """Return whether the value table lists all valid values of the field, not only a few special values of a number.
+
+    With a range, the table must have names for both ends of the range. Without a range, it must have at least two names, one of
+    them for 0. A table with a name for every code returns False, because no value can be wrong.
+    """
+    if len(named.choices) < 2 or named.kind == "float" or named.factor != 1 or named.offset != 0:
+        return False
+    if all(code in named.choices for code in raw_range(named)[: len(named.choices) + 1]):
+        return False
+    if named.minimum is None or named.maximum is None:
+        return 0 in named.choices
+    return int(named.minimum) in named.choices and int(named.maximum) in named.choices
+
+
+def is_hash(field: Field, signal: str) -> bool:
+    """Return whether a node reports the hash of its DBC in this field; `signal` is the name of such fields."""
+    return field.name == signal and field.length == _HASH_BITS and field.kind == "unsigned"
+
+
+def _table(named: Field) -> npt.NDArray[np.bool_] | Sequence[int]:
+    if named.length > _TABLE_BITS:
+        return list(named.choices)
+    table = np.zeros(1 << named.length, np.bool_)
+    for code in named.choices:
+        if -len(table) <= code < len(table):
+            table[code] = True
+    return table
+
+
+def _as_signed(limits: Field, raw: int) -> int:
+    """Convert a raw code from unsigned bits to the signed integer in `Decoded.codes`."""
+    if limits.kind == "signed" and raw >> limits.length - 1:
+        return raw - (1 << limits.length)
+    return raw - (1 << _WORD) if raw >= 1 << _WORD - 1 else raw

@@ -1,0 +1,31 @@
+"""`atalante airwalk`: the controller side of the demo on any bus."""
+
+from __future__ import annotations
+
+import click
+
+from atalante_tools.console.options import Target, target_options
+from atalante_tools.session.airwalk import SHAPE_NAMES, Options, run_trial, trial_options
+
+
+@click.command()
+@click.option(
+    "--shape",
+    default="constant",
+    show_default=True,
+    metavar="NAME",
+    help=f"The guide's: {SHAPE_NAMES}.",
+)
+@target_options(embedded=True)
+@trial_options(steps=30, out="runs/airwalk")
+def command(shape: str, target: Target, options: Options, as_json: bool) -> None:
+    """Walk in the air inside one virtual guide, on the robot or emulator of a bus.
+
+    The operator presses START (`atalante pendant start`) and may change the assistance factor at any time. Ends in HOLD:
+    after the steps, on Ctrl-C, and when anything goes wrong.
+
+    \b
+    Example: atalante emulator -i socketcan -c vcan0     (in another terminal)
+             atalante airwalk -i socketcan -c vcan0 --steps 5 --shape pinched
+    """
+    run_trial(target, (shape,), options, as_json=as_json)

@@ -1,0 +1,31 @@
+"""`atalante demo`: the whole stack in one process tree, the emulated robot in the air behind each guide shape."""
+
+from __future__ import annotations
+
+import click
+
+from atalante_tools.console.options import EMBEDDED, Target
+from atalante_tools.session.airwalk import SHAPE_NAMES, Options, run_trial, trial_options
+
+
+@click.command()
+@click.option(
+    "--shape",
+    metavar="NAME",
+    multiple=True,
+    help=f"{SHAPE_NAMES}; may be repeated.  [default: all]",
+)
+@trial_options(steps=30, out="runs/demo")
+def command(shape: tuple[str, ...], options: Options, as_json: bool) -> None:
+    """Walk in the air with every guide shape, on an emulated robot, faster than real time.
+
+    HAL, emulator, virtual guide, telemetry (Zenoh, loopback only) and recording all run, on the embedded bus. What each
+    guide promises is said before, how large the error got after; 1.00 is the edge of the guide.
+
+    \b
+    Example: atalante demo
+             atalante demo --shape pinched --xi 0.25 --steps 5 --can-log demo.log
+    """
+    from atalante_control.guide.shapes import SHAPES
+
+    run_trial(Target(EMBEDDED, "", lockstep=True), shape or tuple(SHAPES), options, as_json=as_json)

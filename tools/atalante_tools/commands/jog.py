@@ -1,0 +1,108 @@
+"""`atalante jog`: one joint to an angle, all others stay where they are."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from atalante_tools.console.names import find
+from atalante_tools.console.options import SEED, Target, json_option, target_options
+from atalante_tools.console.outcome import Failed
+from atalante_tools.console.stop_request import stop_requested
+from atalante_tools.console.terminal import say, show_json
+
+if TYPE_CHECKING:
+    from atalante_hal.robot import Robot
+    from atalante_hal.types import State
+
+#: Longest time after the move for the joint to come to rest [s], and the error and speed that count as that.
+SETTLE: Final = 1.0
+RESTED: Final = (math.radians(0.05), math.radians(0.5))
+#: A joint that ends further off did not get there [rad].
+TOLERANCE: Final = math.radians(1.0)
+
+
+@click.command()
+@click.argument("joint")
+@click.option("--to", "degrees", type=float, required=True, metavar="DEG", help="Angle to go to [degrees].")
+@click.option(
+    "--speed", type=float, default=20.0, show_default=True, metavar="DEG_S", help="Fastest on the way [deg/s]."
+)
+@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Of the embedded robot's noise.")
+@target_options(embedded=True)
+@json_option
+def command(joint: str, degrees: float, speed: float, seed: int, target: Target, as_json: bool) -> None:
+    """Move one joint to an angle in degrees; the others hold the pose they are in.
+
+    JOINT is left_ or right_ and FH, TH, SH (hip: frontal, transverse, sagittal), SK (knee), SA or HA (ankle: sagittal, henke).
+    An angle the joint does not reach is answered with its range.
+
+    The operator has to press START (`atalante pendant start`); the embedded robot has one who does. Ends in HOLD.
+
+    \b
+    Example: atalante jog left_SK --to 30
+             atalante jog right_SH --to -20 --speed 10 -i socketcan -c vcan0
+    """
+    from atalante_hal.robot import JOINTS, load_robot
+    from atalante_tools.session.pose_hold import Move, PoseHold
+    from atalante_tools.session.rig import Watch, open_hal
+
+    index = find(joint, JOINTS, "joint")
+    name = JOINTS[index]
+    robot = load_robot()
+    move = Move(index, _angle(robot, index, name, degrees), _speed(robot, index, name, speed))
+    controller = PoseHold(robot, move=move)
+    came_from: list[float] = []
+
+    def done(state: State) -> bool:
+        if not came_from:
+            came_from.append(float(state.position[index]))
+        left = controller.elapsed - controller.duration
+        rested = abs(state.position[index] - move.target) < RESTED[0] and abs(state.velocity[index]) < RESTED[1]
+        return left >= SETTLE or (left >= 0.0 and bool(rested))
+
+    def describe(state: State) -> str:
+        return f"{name} {math.degrees(state.position[index]):7.2f} deg, going to {degrees:.2f} deg"
+
+    fields = controller.telemetry_fields
+    with open_hal(target, robot=robot, seed=seed, controller_fields=fields) as rig, stop_requested() as stop:
+        watch = Watch(rig, stop, done, describe)
+        rig.run(controller, until=watch)
+        watch.conclude()
+        reached = float(rig.hal.state.position[index])
+    result = {
+        "joint": name,
+        "from_deg": round(math.degrees(came_from[0]), 3),
+        "to_deg": degrees,
+        "reached_deg": round(math.degrees(reached), 3),
+        "error_deg": round(math.degrees(reached - move.target), 3),
+        "seconds": round(controller.elapsed, 3),
+    }
+    if as_json:
+        show_json(result)
+    else:
+        click.echo(
+            f"{name}: {result['from_deg']:.2f} -> {result['reached_deg']:.2f} deg in {result['seconds']:.2f} s, "
+            f"{result['error_deg']:+.2f} deg off {degrees:g} deg"
+        )
+    if abs(reached - move.target) > TOLERANCE:
+        raise Failed(f"{name} did not reach {degrees:g} degrees: something is in its way")
+    say("the robot is in HOLD")
+
+
+def _angle(robot: Robot, index: int, name: str, degrees: float) -> float:
+    low, high = math.degrees(robot.position_min[index]), math.degrees(robot.position_max[index])
+    if not low <= degrees <= high:
+        raise click.UsageError(f"{name} goes from {low:.1f} to {high:.1f} degrees, not to {degrees:g}")
+    return math.radians(degrees)
+
+
+def _speed(robot: Robot, index: int, name: str, speed: float) -> float:
+    limit = math.degrees(robot.velocity_max[index])
+    if not 0.0 < speed <= limit:
+        raise click.UsageError(
+            f"{name} moves at more than 0 and at most {limit:.0f} degrees a second, not at {speed:g}"
+        )
+    return math.radians(speed)

@@ -1,0 +1,155 @@
+"""`atalante status`: listen to a bus and say what every node says; nothing is ever sent."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from atalante_tools.console.options import Between, Target, json_option, target_options
+from atalante_tools.console.outcome import Failed, FaultLatched
+from atalante_tools.console.stop_request import StopRequest, stop_requested
+from atalante_tools.console.terminal import show_json, table
+
+if TYPE_CHECKING:
+    from atalante_hal.bus import Bus
+    from atalante_tools.commands.observer import Observer, Report
+
+#: Longest wait for a frame before looking at clock and signals [s].
+LOOK_UP: Final = 0.02
+_BLANK: Final = "-"
+
+
+@click.command()
+@target_options(embedded=False, clock=False)
+@click.option(
+    "--for",
+    "seconds",
+    type=Between(0.05, 60.0),
+    default=1.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="Listen so long before each table [s].",
+)
+@click.option("--watch", is_flag=True, help="Again and again, until Ctrl-C.")
+@json_option
+def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
+    """Listen to a bus and print every node, every joint (degrees, Nm), the supervisor and the load of the buses.
+
+    Sends nothing. Ends with code 1 when nothing was heard, 4 when a fault is latched.
+
+    \b
+    Example: atalante status -i socketcan -c vcan0
+             atalante status -i socketcan -c vcan0 --watch
+    """
+    import atalante_dbc
+    from atalante_hal.robot import load_robot
+    from atalante_tools.commands import observer
+    from atalante_tools.session.rig import join, open_buses
+
+    network, robot = atalante_dbc.load(), load_robot()
+    with stop_requested() as stop:
+        bus = join(network, open_buses(network, target))
+        try:
+            listener = observer.Observer(network, robot, time.monotonic())
+            while True:
+                report = listen(bus, listener, seconds, stop)
+                if stop.wanted:
+                    raise SystemExit(stop.exit_code)
+                if as_json:
+                    show_json(observer.as_json(report))
+                else:
+                    if watch:
+                        click.clear()
+                    click.echo(render(report, target))
+                if not watch:
+                    break
+        finally:
+            bus.close()
+    judge(report, target)
+
+
+def listen(bus: Bus, listener: Observer, seconds: float, stop: StopRequest) -> Report:
+    """Collect frames for a while."""
+    from atalante_hal.wire.frame import new_frames
+
+    frames = new_frames(256)
+    end = time.monotonic() + seconds
+    while (now := time.monotonic()) < end and not stop.wanted:
+        count = bus.receive(frames, min(LOOK_UP, end - now))
+        listener.take(frames, count, time.monotonic())
+    return listener.report(time.monotonic(), bus.dropped)
+
+
+def judge(report: Report, target: Target) -> None:
+    """End the command by what was heard.
+
+    Raises:
+        Failed: nothing.
+        FaultLatched: the supervisor or a drive is in FAULT.
+    """
+    if not report.frames:
+        raise Failed(
+            f"nothing was heard on {target} for {report.seconds:.1f} s: "
+            f"start a robot (atalante emulator {target.arguments}) and a HAL"
+        )
+    faults = [joint.joint for joint in report.joints if joint.drive_state == "FAULT"]
+    if report.supervisor == "FAULT" or faults:
+        raise FaultLatched(f"a fault is latched: {', '.join(faults) or 'in the supervisor'}")
+
+
+def render(report: Report, target: Target) -> str:
+    """The report for a person."""
+    nodes = [("node", "heard", "state", "DBC", "supply V", "degC", "errors", "emergency")]
+    for n in report.nodes:
+        heard = "never" if n.age_ms is None else f"{n.age_ms} ms ago" if n.late else "yes"
+        dbc = _BLANK if n.dbc_ok is None else "same" if n.dbc_ok else "OTHER"
+        flags = _BLANK if n.error_flags is None else f"0x{n.error_flags:04X}" if n.error_flags else "0"
+        state = n.state or _BLANK
+        nodes.append(
+            (
+                n.node,
+                heard,
+                state,
+                dbc,
+                _number(n.supply_v, 1),
+                _number(n.temperature_degc, 0),
+                flags,
+                n.emergency or "",
+            )
+        )
+    joints = [("joint", "deg", "deg/s", "Nm")]
+    joints += [
+        (j.joint, _number(j.position_deg, 2), _number(j.velocity_deg_s, 1), _number(j.torque_nm, 1))
+        for j in report.joints
+    ]
+    loads = [("bus", "load %", "worst case %")]
+    loads += [(bus, f"{100 * used:.1f}", f"{100 * worst:.1f}") for bus, (used, worst) in report.load.items()]
+    counts = f"{report.frames} frames in {report.seconds:.1f} s, {report.crc_errors} CRC errors, {report.dropped} lost"
+    if report.foreign:
+        counts += f", {report.foreign} of no message of this network"
+    return "\n\n".join([_headline(report, target), table(nodes), table(joints), table(loads), counts])
+
+
+def _headline(report: Report, target: Target) -> str:
+    from atalante_tools.commands.observer import GONE
+
+    if report.supervisor is None:
+        return f"{target}: no HAL (no SYNC was heard)"
+    hal = next(n for n in report.nodes if n.kind == "master")
+    if hal.age_ms is not None and hal.age_ms > GONE:
+        return (
+            f"{target}: the HAL has been silent for {hal.age_ms} ms; it was {report.supervisor} in cycle {report.cycle}"
+        )
+    said = [f"{target}: HAL {report.supervisor}, cycle {report.cycle}"]
+    if report.assistance_factor is not None:
+        said.append(f"assistance factor {report.assistance_factor:.2f}")
+        said.append(f"{report.overruns} overruns")
+    if report.dead_man is not None:
+        said.append(f"dead-man {'pressed' if report.dead_man else 'released'}")
+    return ", ".join(said) + (f"\ndiagnostic: {report.diagnostic}" if report.diagnostic else "")
+
+
+def _number(value: float | None, digits: int) -> str:
+    return _BLANK if value is None else f"{value:.{digits}f}"

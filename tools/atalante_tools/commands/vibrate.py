@@ -1,0 +1,79 @@
+"""`atalante vibrate`: run one vibration motor, to feel where it is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import click
+
+from atalante_tools.console.names import find
+from atalante_tools.console.options import Between, Target, json_option, target_options
+from atalante_tools.console.stop_request import stop_requested
+from atalante_tools.console.terminal import say, show_json
+
+if TYPE_CHECKING:
+    from atalante_hal.types import State
+
+
+@click.command()
+@click.argument("motor")
+@click.argument("level", type=Between(0.0, 1.0))
+@click.option(
+    "--for",
+    "seconds",
+    type=Between(0.01, 3600.0),
+    default=1.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="How long [s].",
+)
+@target_options(embedded=True)
+@json_option
+def command(motor: str, level: float, seconds: float, target: Target, as_json: bool) -> None:
+    """Run one vibration motor at a level from 0 (still) to 1 (strongest); all joints hold the pose they are in.
+
+    MOTOR is left_ or right_, thigh_ or shank_, and front or back: left_thigh_front.
+
+    The operator has to press START (`atalante pendant start`); the embedded robot has one who does. Ends in HOLD.
+
+    \b
+    Example: atalante vibrate left_thigh_front 0.5 --for 2
+    """
+    import numpy as np
+
+    from atalante_hal.robot import MOTORS, load_robot
+    from atalante_tools.session.pose_hold import PoseHold
+    from atalante_tools.session.rig import Watch, open_hal
+
+    index = find(motor, MOTORS, "motor")
+    robot = load_robot()
+    levels = np.zeros(len(MOTORS))
+    levels[index] = level
+    controller = PoseHold(robot, vibration=levels)
+    strongest = 0.0
+
+    def done(state: State) -> bool:
+        nonlocal strongest
+        strongest = max(strongest, float(state.vibration[index]))
+        return controller.elapsed >= seconds
+
+    def describe(state: State) -> str:
+        return f"{MOTORS[index]} at {state.vibration[index]:.2f}, {seconds - controller.elapsed:.0f} s left"
+
+    fields = controller.telemetry_fields
+    with open_hal(target, robot=robot, controller_fields=fields) as rig, stop_requested() as stop:
+        watch = Watch(rig, stop, done, describe)
+        rig.run(controller, until=watch)
+        watch.conclude()
+    if as_json:
+        show_json(
+            {
+                "motor": MOTORS[index],
+                "level": level,
+                "measured": round(strongest, 3),
+                "seconds": round(controller.elapsed, 3),
+            }
+        )
+    else:
+        click.echo(f"{MOTORS[index]}: asked for {level:.2f}, measured {strongest:.2f} at most, {seconds:g} s")
+    say("the robot is in HOLD")

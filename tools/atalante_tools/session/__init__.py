@@ -1,0 +1,1 @@
+"""A run of the robot: rig, emulated body, pendant, run folder and figures."""

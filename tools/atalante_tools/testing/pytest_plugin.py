@@ -1,0 +1,227 @@
+"""pytest fixtures for tests against the robot: the emulated one in this process, or the real one with `--can-interface`.
+
+    bus -> faults -> hal -> loop          emulator: the other end          recorded_run: what passed
+
+- `emulator` the emulated robot, `emulator.operator` who holds its pendant;
+- `bus`, `hal` the HAL's end of the line, and the HAL on it;
+- `loop` cycles of the HAL: `loop.until(ACTIVE)`, `loop.run(20)`, `loop.state`, `loop.codes`;
+- `faults` of the wire, by name: `faults.drop("LEFT_SK_STATE", frames=5)`, `delay`, `corrupt`;
+- `recorded_run` every frame that passed; written as a CAN log when the test fails.
+
+A test marked `hil` is for the robot that is on the bus, without emulator. Where the bus a test needs is missing the test fails
+with what to type, unless `--can-missing=skip` says otherwise. This module is loaded into every pytest run: it imports nothing.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Generator, Iterator
+from typing import TYPE_CHECKING, NoReturn
+
+import pytest
+
+if TYPE_CHECKING:
+    from atalante_dbc import Network
+    from atalante_emulator.emulator import Emulator
+    from atalante_hal.bus import Bus
+    from atalante_hal.hal import Hal
+    from atalante_hal.robot import Robot
+    from atalante_tools.testing.frame_filter import FrameFilter
+    from atalante_tools.testing.hil import Recording, Stepper
+
+_EMBEDDED = "embedded"
+_recording_key = pytest.StashKey["Recording"]()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Options."""
+    group = parser.getgroup("atalante", "Atalante HAL")
+    group.addoption(
+        "--can-interface",
+        default=_EMBEDDED,
+        metavar="NAME",
+        help="socketcan, virtual, pcan, ... or embedded: an emulated robot in this process (default)",
+    )
+    group.addoption(
+        "--can-channel",
+        default="",
+        metavar="CHANNEL",
+        help="for all four buses (vcan0), or one each: left_leg=can0,right_leg=can1,left_sense=can2,right_sense=can3",
+    )
+    group.addoption(
+        "--can-missing",
+        choices=("fail", "skip"),
+        default="fail",
+        help="what becomes of a test whose bus is not there (default: fail)",
+    )
+    group.addoption(
+        "--can-log",
+        choices=("failed", "always", "never"),
+        default="failed",
+        help="of which tests the frames are written to a CAN log (default: failed)",
+    )
+    group.addoption(
+        "--can-log-dir", default="runs/can-logs", metavar="DIR", help="folder of the CAN logs (default: %(default)s)"
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Marker, and options that make no sense."""
+    config.addinivalue_line("markers", "hil: for the robot on the bus of --can-interface; without the emulator")
+    interface, channel = config.getoption("--can-interface"), config.getoption("--can-channel")
+    if interface == _EMBEDDED and channel:
+        raise pytest.UsageError(f"--can-channel {channel} needs an interface: --can-interface socketcan")
+    if interface != _EMBEDDED and not channel:
+        raise pytest.UsageError(f"--can-interface {interface} needs a channel: --can-channel vcan0")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Write the CAN log of a test that recorded one, and say where it is."""
+    report = yield
+    recording = item.stash.get(_recording_key, None)
+    wanted = item.config.getoption("--can-log")
+    if recording is None or report.when != "call" or not len(recording) or wanted == "never":
+        return report
+    if report.failed or wanted == "always":
+        _write_log(item, report, recording)
+    return report
+
+
+def _write_log(item: pytest.Item, report: pytest.TestReport, recording: Recording) -> None:
+    from atalante_hal.telemetry.sink import SinkError
+
+    folder = item.config.rootpath / item.config.getoption("--can-log-dir")
+    path = folder / f"{re.sub(r'[^A-Za-z0-9.-]+', '_', item.nodeid).strip('_')}.log"
+    try:
+        recording.save(path)
+    except SinkError as error:
+        report.sections.append(("CAN log", str(error)))
+    else:
+        report.sections.append(("CAN log", f"{len(recording)} frames in {path}"))
+        report.user_properties.append(("can_log", str(path)))
+
+
+def _missing(request: pytest.FixtureRequest, what: str) -> NoReturn:
+    if request.config.getoption("--can-missing") == "skip":
+        pytest.skip(what)
+    pytest.fail(f"{what}; --can-missing=skip leaves such tests out", pytrace=False)
+
+
+def _is_hil(request: pytest.FixtureRequest) -> bool:
+    return request.node.get_closest_marker("hil") is not None
+
+
+@pytest.fixture(scope="session")
+def _atalante_network() -> Network:
+    import atalante_dbc
+
+    return atalante_dbc.load()
+
+
+@pytest.fixture(scope="session")
+def _atalante_robot() -> Robot:
+    from atalante_hal.robot import load_robot
+
+    return load_robot()
+
+
+@pytest.fixture
+def _atalante_line(request: pytest.FixtureRequest, _atalante_network: Network) -> Iterator[tuple[Bus, Bus | None]]:
+    """Both ends of the line."""
+    from atalante_hal.bus import BusAbsent
+    from atalante_tools.console.options import Target
+    from atalante_tools.testing.hil import WireTaken, open_line
+
+    interface, channel = request.config.getoption("--can-interface"), request.config.getoption("--can-channel")
+    target = Target(interface, channel, lockstep=True)
+    if target.embedded and _is_hil(request):
+        _missing(request, "a hil test needs the robot: type --can-interface socketcan --can-channel can0")
+    try:
+        ours, theirs = open_line(_atalante_network, target, emulated=not _is_hil(request))
+    except BusAbsent as error:
+        _missing(request, str(error))
+    except WireTaken as error:
+        pytest.fail(str(error), pytrace=False)
+    yield ours, theirs
+    for end in (ours, theirs):
+        if end is not None:
+            end.close()
+
+
+@pytest.fixture
+def emulator(
+    request: pytest.FixtureRequest,
+    _atalante_line: tuple[Bus, Bus | None],
+    _atalante_network: Network,
+    _atalante_robot: Robot,
+) -> Iterator[Emulator]:
+    """The emulated robot, with an operator who starts it as soon as the HAL is ready."""
+    from atalante_tools.testing.hil import emulated_robot
+
+    theirs = _atalante_line[1]
+    if theirs is None:
+        pytest.fail(f"{request.node.name} is marked hil: the robot is real and there is no emulator", pytrace=False)
+    with emulated_robot(_atalante_network, _atalante_robot, theirs) as robot:
+        yield robot
+
+
+@pytest.fixture
+def recorded_run(request: pytest.FixtureRequest, _atalante_network: Network) -> Recording:
+    """Every frame that passes between HAL and nodes in this test; see `--can-log`."""
+    from atalante_tools.testing.hil import Recording
+
+    recording = Recording(_atalante_network)
+    request.node.stash[_recording_key] = recording
+    return recording
+
+
+@pytest.fixture
+def bus(
+    request: pytest.FixtureRequest,
+    _atalante_line: tuple[Bus, Bus | None],
+    _atalante_network: Network,
+    recorded_run: Recording,
+) -> FrameFilter:
+    """The HAL's end of the line, behind its faults; the robot at the other end."""
+    from atalante_tools.testing.frame_filter import FrameFilter
+    from atalante_tools.testing.hil import answering
+
+    ours = _atalante_line[0]
+    step = None if _is_hil(request) else answering(ours, request.getfixturevalue("emulator"))
+    return FrameFilter(ours, _atalante_network, tap=recorded_run, step=step)
+
+
+@pytest.fixture
+def faults(bus: FrameFilter) -> FrameFilter:
+    """Faults of the wire: `drop`, `delay` and `corrupt` messages and nodes by name."""
+    return bus
+
+
+@pytest.fixture
+def hal(
+    request: pytest.FixtureRequest,
+    bus: FrameFilter,
+    _atalante_network: Network,
+    _atalante_robot: Robot,
+    recorded_run: Recording,
+) -> Iterator[Hal]:
+    """The HAL, in lock-step with the emulated robot; ends in HOLD."""
+    from atalante_hal.hal import Hal
+    from atalante_tools.session.rig import LOCKSTEP_PATIENCE, PATIENCE
+
+    patience = PATIENCE if _is_hil(request) else LOCKSTEP_PATIENCE
+    made = Hal(_atalante_network, _atalante_robot, bus, patience=patience)
+    recorded_run.cycle = lambda: made.state.cycle
+    yield made
+    bus.clear()
+    made.stop()
+
+
+@pytest.fixture
+def loop(request: pytest.FixtureRequest, hal: Hal) -> Stepper:
+    """Cycles of the HAL, with a controller that holds the pose; a real robot gets one a millisecond."""
+    from atalante_hal.loop import LockStep, WallClock
+    from atalante_tools.testing.hil import Stepper
+
+    return Stepper(hal, WallClock() if _is_hil(request) else LockStep())
