@@ -5,30 +5,30 @@ from __future__ import annotations
 _PLAUSIBILITY = ("finding", "encoders", "imus", "legs", "feet", "stillness", "unchecked", "plausibility")
 #: The safety core: files that are judged together, and the tests that have to notice a change of them.
 CORE = {
-    "e2e": (("atalante_hal/wire/e2e.py",), ("test_e2e.py", "test_image.py")),
-    "process_image": (("atalante_hal/wire/process_image.py",), ("test_image.py",)),
+    "e2e": (("atalante_hal/wire/e2e.py",), ("hal/wire/test_e2e.py", "hal/wire/test_process_image.py")),
+    "process_image": (("atalante_hal/wire/process_image.py",), ("hal/wire/test_process_image.py",)),
     "message_monitor": (
         ("atalante_hal/safety/message_monitor.py", "atalante_hal/safety/fault_memory.py"),
-        ("test_judgement.py", "test_fault_memory.py"),
+        ("hal/safety/test_message_monitor.py", "hal/safety/test_fault_memory.py"),
     ),
     "plausibility": (
         tuple(f"atalante_hal/safety/plausibility/{name}.py" for name in _PLAUSIBILITY),
-        ("test_plausibility.py", "test_ridden_through.py"),
+        ("hal/safety/plausibility/test_plausibility.py", "hal/safety/plausibility/test_ridden_through.py"),
     ),
-    "heartbeats": (("atalante_hal/safety/heartbeats.py",), ("test_heartbeats.py",)),
-    "transceiver": (("atalante_hal/transceiver.py",), ("test_transceiver.py",)),
-    "pendant": (("atalante_hal/pendant.py",), ("test_hal_pendant.py",)),
+    "heartbeats": (("atalante_hal/safety/heartbeats.py",), ("hal/safety/test_heartbeats.py",)),
+    "transceiver": (("atalante_hal/transceiver.py",), ("hal/test_transceiver.py",)),
+    "pendant": (("atalante_hal/pendant.py",), ("hal/test_pendant.py",)),
     "state_machine": (
         ("atalante_hal/safety/state_machine.py", "atalante_hal/safety/diagnostics.py", "atalante_hal/wire/cia402.py"),
-        ("test_supervisor.py", "test_diagnostics.py", "test_cia402.py"),
+        ("hal/safety/test_state_machine.py", "hal/safety/test_diagnostics.py", "hal/wire/test_cia402.py"),
     ),
-    "limiter": (("atalante_hal/safety/limiter.py",), ("test_limiter.py",)),
+    "limiter": (("atalante_hal/safety/limiter.py",), ("hal/safety/test_limiter.py",)),
     "guide": (
         ("atalante_control/guide/filter.py", "atalante_control/guide/kernel.py"),
-        ("test_guide.py", "test_guide_kernel.py"),
+        ("control/guide/test_filter.py", "control/guide/test_kernel.py"),
     ),
     "drive": (
         ("atalante_emulator/drive.py", "atalante_emulator/emergency.py", "atalante_emulator/collision.py"),
-        ("test_drive.py", "test_emergency.py", "test_collision.py"),
+        ("emulator/test_drive.py", "emulator/test_emergency.py", "emulator/test_collision.py"),
     ),
 }

@@ -12,7 +12,7 @@ from atalante_hal.bus import Bus, BusDown
 from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.socketcan import SocketCanBus
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, new_frames
-from tests.test_bus import BUSES, FrameReceiver, FrameSender, FrameWaiter, network_of, other_frames
+from tests.hal.bus.test_bus import BUSES, FrameReceiver, FrameSender, FrameWaiter, network_of, other_frames
 from tests.vcan.conftest import as_root
 
 

@@ -15,7 +15,7 @@ from atalante_hal.bus.python_can import message_of
 from atalante_hal.bus.replay import ReplayBus
 from atalante_hal.bus.socketcan import SocketCanBus
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, Frames, new_frames
-from tests.test_bus import (
+from tests.hal.bus.test_bus import (
     BUSES,
     FrameReceiver,
     FrameSender,

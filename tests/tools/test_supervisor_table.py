@@ -13,7 +13,7 @@ from atalante_hal.safety.state_machine import next_state
 from atalante_hal.types import SupervisorState
 from atalante_tools.supervisor_table import FACTS, a_diagnostic, page
 
-PAGE = Path(__file__).parents[1] / "SUPERVISOR.md"
+PAGE = Path(__file__).parents[2] / "SUPERVISOR.md"
 
 
 def test_the_page_is_what_the_function_does():

@@ -424,7 +424,7 @@ def test_report_without_findings_lists_the_unchecked_signals(good: Path) -> None
 
 
 def test_j1939_groups_of_several_senders_have_no_timing_findings(tmp_path: Path) -> None:
-    dbc = Path(__file__).with_name("foreign") / "j1939.dbc"
+    dbc = Path(__file__).parents[3] / "foreign" / "j1939.dbc"
     messages = [
         can.Message(
             timestamp=BEGIN + k * 0.005, arbitration_id=0x18FEF100 + k % 2, is_extended_id=True, data=b"\xff" * 8

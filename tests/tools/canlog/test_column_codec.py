@@ -17,7 +17,7 @@ from atalante_hal.wire.frame import Frames, new_frames
 from atalante_tools.canlog.column_codec import BulkCodec, crc_differences, crc_of_zeros
 
 #: DBCs with every kind of layout; each message is compared with cantools.
-COLLECTION = sorted(Path(__file__).with_name("foreign").glob("*.dbc"))
+COLLECTION = sorted(Path(__file__).parents[2].joinpath("foreign").glob("*.dbc"))
 
 HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: A B\n\n'
 FORMATS = (

@@ -20,7 +20,7 @@ import atalante_tools.testing.hil  # noqa: F401
 pytest_plugins = ["pytester"]
 
 #: The fault test of the documentation.
-EXAMPLE = (Path(__file__).parent.parent / "examples" / "test_lost_frames.py").read_text()
+EXAMPLE = (Path(__file__).parents[3] / "examples" / "test_lost_frames.py").read_text()
 VIRTUAL = ("--can-interface", "virtual", "--can-channel")
 
 

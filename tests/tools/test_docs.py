@@ -15,7 +15,7 @@ import pytest
 
 from atalante_tools.cli import COMMANDS, cli
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = {str(page.relative_to(ROOT)): page.read_text() for page in (ROOT / "README.md", *sorted(DOCS.rglob("*.md")))}
 MAKEFILE = (ROOT / "Makefile").read_text()
@@ -26,9 +26,9 @@ NOT_RUN = {
     r"-i socketcan|--can-interface": "needs a CAN interface",
     r"^make ": "builds, installs or runs the whole suite; continuous integration runs it",
     r"^\. ": "the tests run in this environment",
-    r"^python examples/": "tests/test_examples.py runs the examples",
+    r"^python examples/": "tests/project/test_examples.py runs the examples",
     r"^python -m pytest": "runs tests that are part of this suite",
-    r"^atalante airwalk --steps 100": "runs until the reader stops it; tests/test_examples.py runs it with the subscriber",
+    r"^atalante airwalk --steps 100": "runs until the reader stops it; tests/project/test_examples.py runs it with the subscriber",
     r"^atalante gait (library|fit|check)": "takes minutes",
     r"^atalante faults campaign": "takes an hour",
 }

@@ -20,7 +20,7 @@ from atalante_dbc.foreign import catalogue
 from atalante_tools.canlog.decode.mcap import encode
 from atalante_tools.cli import cli
 
-COLLECTION = sorted(Path(__file__).with_name("foreign").glob("*.dbc"))
+COLLECTION = sorted(Path(__file__).parents[3].joinpath("foreign").glob("*.dbc"))
 BEGIN = 1_700_000_000.0
 
 #: (message, signal) -> (time [s], value) in order of time.

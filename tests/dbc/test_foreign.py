@@ -135,7 +135,7 @@ def test_text_in_comments_is_no_message(tmp_path: Path) -> None:
 
 
 def test_selectors_of_nested_multiplexers() -> None:
-    found = catalogue(Path(__file__).with_name("foreign") / "extended_multiplexing.dbc")
+    found = catalogue(Path(__file__).parents[1] / "foreign" / "extended_multiplexing.dbc")
     nested = found.layout("Nested")
     assert nested.field("Deep").selectors == (("Outer", frozenset({0})), ("Inner", frozenset({0, 1, 2, 3})))
     assert nested.multiplexers["Outer"] == frozenset({0, 1, 2, 3, 4, 5, 6, 7, 12})
