@@ -97,7 +97,10 @@ def endless(gait: Gait) -> Gait:
         ),
         (bent((3, 4), 2.0), r"joints\.left_SK must be"),
         (bent((7,), 0.1), r"joints\.\w+_SK jumps by 0\.1 rad at the step change"),
-        (replace(AIRWALK, coefficients=AIRWALK.coefficients[:11]), r"gait 'airwalk': joints must be 64-bit floats of shape \(12, 8\)"),
+        (
+            replace(AIRWALK, coefficients=AIRWALK.coefficients[:11]),
+            r"gait 'airwalk': joints must be 64-bit floats of shape \(12, 8\)",
+        ),
         (endless(AIRWALK), r"joints\.left_SK must be finite, got nan"),
         (pushed(81.9), r"feedforward and gravity of joints\.\w+_HA must be -82 to 82 Nm"),
         (pushed(-81.9), r"feedforward and gravity of joints\.\w+_HA must be -82 to 82 Nm"),

@@ -211,7 +211,10 @@ def test_a_limit_that_is_left_between_two_cycles_is_found():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"coefficients": AIRWALK.coefficients[:11]}, r"joints must be 64-bit floats of shape \(12, 8\), got float64 of shape \(11"),
+        (
+            {"coefficients": AIRWALK.coefficients[:11]},
+            r"joints must be 64-bit floats of shape \(12, 8\), got float64 of shape \(11",
+        ),
         ({"coefficients": AIRWALK.coefficients.astype(np.float32)}, "joints must be 64-bit floats .*, got float32"),
         ({"coefficients": AIRWALK.coefficients.tolist()}, "joints must be 64-bit floats .*, got list"),
         ({"coefficients": None}, "joints must be 64-bit floats .*, got NoneType"),

@@ -28,7 +28,7 @@ NOT_RUN = {
     r"^\. ": "the tests run in this environment",
     r"^python examples/": "tests/project/test_examples.py runs the examples",
     r"^python -m pytest": "runs tests that are part of this suite",
-    r"^atalante airwalk --steps 100": "runs until the reader stops it; tests/project/test_examples.py runs it with the subscriber",
+    r"^atalante airwalk --steps 100": "runs until it is stopped; tests/project/test_examples.py runs it with the subscriber",
     r"^atalante gait (library|fit|check)": "takes minutes",
     r"^atalante faults campaign": "takes an hour",
 }
