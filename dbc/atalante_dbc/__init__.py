@@ -1,4 +1,4 @@
-"""The network as data: `atalante.dbc`, the one source of truth for everything on the wire, and its strict loader."""
+"""CAN network of the robot: `atalante.dbc`, the only definition of all frames, and its strict loader."""
 
 from atalante_dbc.loader import DBC_FILE, DbcError, load
 from atalante_dbc.network import Message, Network, Node, Signal, wire_time

@@ -1,6 +1,6 @@
-"""Attribute values of a DBC text, checked before cantools reads it: `text -> attributes -> loader`.
+"""Check of the attribute values in a DBC text, before cantools parses it: `text -> attributes -> loader`.
 
-cantools takes a value of any kind for an attribute of any kind, and stumbles over it (or not) when somebody asks.
+cantools accepts a value of any type for an attribute of any type. An invalid value then fails later or not at all.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-#: Attributes the network is made of, which need a definition (`BA_DEF_`): a loader must not guess.
+#: Attributes required by the loader. Each needs a definition (`BA_DEF_`) and a default.
 _NEEDED = (
     "NominalBitrate", "DataBitrate", "NodeKind", "NodeNumber", "VFrameFormat", "Bus", "GenMsgSendType", "GenMsgCycleTime",
     "GenMsgDelayTime", "TimeoutTime", "E2EDataId", "InvalidRaw",
@@ -20,7 +20,7 @@ _RAW = re.compile(r"(0[xX][0-9a-fA-F]{1,16}|\d{1,20})?")
 
 
 def wrong_values(text: str) -> Iterator[tuple[int, str]]:
-    """Every attribute that is set without a definition or to what its definition does not allow, as (line, sentence)."""
+    """Yield each attribute that is set without definition or to an invalid value, as (line number, message)."""
     definitions: dict[str, tuple[str, str]] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         if match := _DEFINITION.match(line):
@@ -29,20 +29,28 @@ def wrong_values(text: str) -> Iterator[tuple[int, str]]:
             name, owner, value = match[2], match[3].strip() or "the network", match[4]
             if name not in definitions:
                 yield number, f"the attribute {name} has no definition (BA_DEF_) above this line"
-            elif wanted := _refused(name, *definitions[name], value, by_name=match[1] == "BA_DEF_DEF_"):
-                yield number, f"{name} of {owner} is {value}; valid is {wanted}"
+            elif valid := _valid_values(name, *definitions[name], value, by_name=match[1] == "BA_DEF_DEF_"):
+                yield number, f"{name} of {owner} must be {valid}, got {value}"
 
 
 def missing(text: str) -> Iterator[tuple[int, str]]:
-    """Every attribute of the network without definition or default, as (1, sentence)."""
+    """Yield each required attribute without definition or default, as (1, message)."""
     for name in _NEEDED:
-        for keyword, what in (("BA_DEF_", "definition"), ("BA_DEF_DEF_", "default")):
+        for keyword, part in (("BA_DEF_", "definition"), ("BA_DEF_DEF_", "default")):
             if not re.search(rf'^{keyword}\s+[^"]*"{name}"', text, re.MULTILINE):
-                yield 1, f"the attribute {name} has no {what} ({keyword})"
+                yield 1, f"the attribute {name} has no {part} ({keyword})"
 
 
-def _refused(name: str, kind: str, domain: str, value: str, *, by_name: bool) -> str:
-    """What would be valid, empty if the value is; enumerations are given by name in defaults, elsewhere by number too."""
+def _valid_values(name: str, kind: str, domain: str, value: str, *, by_name: bool) -> str:
+    """Return a description of the valid values if `value` is invalid, else an empty text.
+
+    Args:
+        name: name of the attribute.
+        kind: type in its definition, for example INT or ENUM.
+        domain: rest of its definition, the range or the names.
+        value: value as written in the DBC, with quotes.
+        by_name: True if an enumeration must be given by name (defaults); else its index is also valid.
+    """
     if kind == "INT":
         low, high = [*domain.split(), "0", "0"][:2]
         valid = _INTEGER.fullmatch(value) and int(low) <= int(value) <= int(high)

@@ -1,8 +1,7 @@
-"""Any DBC as data: layouts of messages that are not ours, for the validator and for bulk decoding.
+"""Lenient loader for any DBC: message layouts for the validator and for bulk decoding.
 
-`loader.load` is strict, because its network drives a robot. Here nothing of ours is required: a DBC that cantools reads gives
-a `Catalogue`, our attributes are used where the file carries them, and a message whose layout cannot be decoded without doubt
-is refused by name with the reason, never guessed.
+`loader.load` is strict, because its network controls a robot. This loader accepts every DBC that cantools can parse, and
+uses the attributes of this project if the file has them. A message with an ambiguous layout is rejected with the reason.
 """
 
 from __future__ import annotations
@@ -25,15 +24,15 @@ from cantools.database.errors import Error as CantoolsError
 
 from atalante_dbc.loader import DbcError
 
-#: Longest payload of one frame, CAN FD and classic; longer J1939 messages travel in several.
+#: Longest payload of one CAN FD frame and of one classic CAN frame [byte]; longer J1939 messages use several frames.
 _FRAME_BYTES, _CLASSIC_BYTES = 64, 8
 _WORD = 64
 _FLOAT_BITS = (16, 32, 64)
-#: E2E Profile 5 header: name -> (start bit, bits), as in our own network.
+#: E2E Profile 5 header: name -> (start bit, number of bits), as in `loader`.
 _E2E_HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
-#: Values of GenMsgSendType that promise one frame every GenMsgCycleTime.
+#: Values of GenMsgSendType for one frame per GenMsgCycleTime.
 _CYCLIC = ("", "cyclic", "cyclicx", "periodic", "fixedperiodic", "fixed_periodic")
-#: J1939: the bits of an identifier that name the parameter group; with PF below 240 the next byte is an address.
+#: J1939: masks of the identifier bits for the parameter group. With a PDU format below 240 the next byte is an address.
 _PGN_PEER, _PGN_BROADCAST, _PDU2 = 0x03FF0000, 0x03FFFF00, 240
 _QUOTED = re.compile(r'"[^"]*"')
 _WRITTEN = re.compile(r"\bBO_\s+(\d+)\s+(\w+)\s*:|\bSG_\s+(\w+)\s+(M|m\d+M?)?\s*:")
@@ -41,7 +40,7 @@ _WRITTEN = re.compile(r"\bBO_\s+(\d+)\s+(\w+)\s*:|\bSG_\s+(\w+)\s+(M|m\d+M?)?\s*
 
 @dataclass(frozen=True)
 class Field:
-    """One signal of any DBC; physical = raw * factor + offset."""
+    """Signal of any DBC: physical = raw * factor + offset."""
 
     name: str
     start: int  # Intel: least significant bit; Motorola: most significant bit, in DBC numbering
@@ -50,65 +49,67 @@ class Field:
     kind: str  # "unsigned", "signed" or "float" (IEEE 754)
     factor: int | float
     offset: int | float
-    minimum: float | None  # physical; None: the DBC gives no range
+    minimum: float | None  # physical value; None: no range in the DBC
     maximum: float | None
     unit: str
-    invalid_raw: int | None  # raw code (as unsigned bits) that says "no value"
-    choices: Mapping[int, str]  # raw value -> name; empty when there is no value table
+    invalid_raw: int | None  # raw code (as unsigned bits) for "no value"; None: there is none
+    choices: Mapping[int, str]  # raw value -> name; empty without value table
     receivers: tuple[str, ...]
-    #: Multiplexer signals and the raw values of each at which this signal is in the frame; empty: always.
+    #: Multiplexers, each with its raw values for which this signal is in the frame; empty: always in the frame.
     selectors: tuple[tuple[str, frozenset[int]], ...]
 
     @property
     def first_bit(self) -> int:
-        """Place of the first bit, counted in the direction of the byte order: Intel from the least significant bit of byte 0,
-        Motorola from the most significant."""
+        """Return the index of the first bit in the direction of the byte order.
+
+        Intel counts from the least significant bit of byte 0, Motorola from the most significant bit of byte 0.
+        """
         return self.start ^ 7 if self.big_endian else self.start
 
     @property
     def bits(self) -> range | tuple[int, ...]:
-        """Bits of the payload it occupies, numbered from the least significant bit of byte 0."""
-        places = range(self.first_bit, self.first_bit + self.length)
-        return tuple(place ^ 7 for place in places) if self.big_endian else places
+        """Return the payload bits of the signal, numbered from the least significant bit of byte 0."""
+        bits = range(self.first_bit, self.first_bit + self.length)
+        return tuple(bit ^ 7 for bit in bits) if self.big_endian else bits
 
 
 @dataclass(frozen=True)
 class Layout:
-    """One message of any DBC."""
+    """Message of any DBC."""
 
     name: str
     frame_id: int
     extended: bool  # 29-bit identifier
-    fd: bool | None  # CAN FD frame; None: the DBC does not say
-    bit_rate_switch: bool | None  # None: the DBC does not say
+    fd: bool | None  # CAN FD frame; None: unknown
+    bit_rate_switch: bool | None  # None: unknown
     length: int  # bytes
     sender: str | None
     fields: tuple[Field, ...]
     bus: str | None
-    cyclic: bool  # sent every `cycle_ms`; otherwise on events
+    cyclic: bool  # True: sent every `cycle_ms`; False: event message
     cycle_ms: float | None
     timeout_ms: float | None
-    inhibit_ms: float | None  # least time between two events
+    inhibit_ms: float | None  # minimum time between two frames of an event message
     data_id: int | None  # AUTOSAR E2E Profile 5; None: the message is not protected
-    pgn_mask: int  # bits of the identifier that name it; all of them unless it is a J1939 parameter group
-    #: Multiplexer signal -> raw values for which the DBC has a layout.
+    pgn_mask: int  # identifier bits that select the message; all bits unless it is a J1939 parameter group
+    #: Multiplexer -> raw values for which the DBC defines a layout.
     multiplexers: Mapping[str, frozenset[int]]
 
     def field(self, name: str) -> Field:
-        """The signal of that name.
+        """Return the signal with the given name.
 
         Raises:
-            KeyError: with the names there are.
+            KeyError: If there is no such name; the message lists the valid names.
         """
         for field in self.fields:
             if field.name == name:
                 return field
-        raise KeyError(f"no signal {name!r} in {self.name}: {', '.join(f.name for f in self.fields)}")
+        raise KeyError(f"signal of {self.name} must be one of {', '.join(f.name for f in self.fields)}, got {name!r}")
 
 
 @dataclass(frozen=True)
 class Refused:
-    """A message of the DBC that is not decoded, and why."""
+    """Message of the DBC that is not decoded, with the reason."""
 
     name: str
     frame_id: int
@@ -118,15 +119,15 @@ class Refused:
 
 @dataclass(frozen=True)
 class Catalogue:
-    """What a DBC says about the wire. Layouts are in file order."""
+    """Content of a DBC: layouts in file order, rejected messages, nodes and buses."""
 
     path: Path
     layouts: tuple[Layout, ...]
     refused: tuple[Refused, ...]
-    nodes: Mapping[str, str]  # name -> kind, "" where the DBC has no NodeKind
+    nodes: Mapping[str, str]  # name -> kind; "" without NodeKind in the DBC
     buses: tuple[str, ...]
-    nominal_bitrate: float | None  # bit/s
-    data_bitrate: float | None  # bit/s
+    nominal_bitrate: float | None  # bit/s, arbitration phase
+    data_bitrate: float | None  # bit/s, data phase
     hash32: int  # CRC-32 of the file
 
     @cached_property
@@ -134,24 +135,24 @@ class Catalogue:
         return {layout.name: layout for layout in self.layouts}
 
     def layout(self, name: str) -> Layout:
-        """The message of that name.
+        """Return the layout of the message with the given name.
 
         Raises:
-            KeyError: with the names there are, or the reason why it is refused.
+            KeyError: If the message is rejected (with the reason) or unknown (with the valid names).
         """
         if name in self._by_name:
             return self._by_name[name]
         for refused in self.refused:
             if refused.name == name:
                 raise KeyError(f"the message {name} is not decoded: {refused.reason}")
-        raise KeyError(f"no message {name!r}; there are {', '.join(self._by_name)}")
+        raise KeyError(f"message must be one of {', '.join(self._by_name)}, got {name!r}")
 
 
 def catalogue(path: Path) -> Catalogue:
-    """Layouts of a DBC file; messages that cannot be decoded without doubt are in `refused`.
+    """Load the message layouts of a DBC file; messages with an ambiguous layout are in `refused`.
 
     Raises:
-        DbcError: the file cannot be read or is no DBC.
+        DbcError: If the file cannot be read or is not a DBC.
     """
     try:
         raw = path.read_bytes()
@@ -177,13 +178,13 @@ def catalogue(path: Path) -> Catalogue:
 
 
 class _Written:
-    """What the text says and cantools forgets: repeated identifiers and names, and multiplexer marks."""
+    """Repeated identifiers, repeated names and multiplexer marks of the DBC text, which cantools does not keep."""
 
     def __init__(self, text: str) -> None:
         self.ids: Counter[int] = Counter()
         self.names: Counter[str] = Counter()
         self.signals: dict[int, Counter[str]] = {}
-        self.multiplexed: Counter[int] = Counter()  # signals marked m0, m1, ... a message
+        self.multiplexed: Counter[int] = Counter()  # frame id -> number of signals marked m0, m1, ...
         current = -1
         for match in _WRITTEN.finditer(_QUOTED.sub('""', text)):
             if match[1]:
@@ -197,7 +198,7 @@ class _Written:
 
 
 def _unsupported(message: RawMessage, written: _Written) -> Iterator[str]:
-    """Every reason not to decode a message, as one clause."""
+    """Yield every reason to reject a message."""
     key = message.frame_id | message.is_extended_frame << 31
     if written.ids[key] > 1:
         yield f"its identifier {message.frame_id:#x} is used by {written.ids[key]} messages"
@@ -208,7 +209,7 @@ def _unsupported(message: RawMessage, written: _Written) -> Iterator[str]:
     if repeated := [name for name, count in written.signals.get(key, Counter()).items() if count > 1]:
         yield f"the signal name {repeated[0]} is used twice"
     if written.multiplexed[key] != sum(bool(s.multiplexer_ids) for s in message.signals):
-        yield "a multiplexed signal has no multiplexer (M) it belongs to; extended multiplexing needs SG_MUL_VAL_"
+        yield "a multiplexed signal has no multiplexer (M); extended multiplexing needs SG_MUL_VAL_"
     for signal in message.signals:
         yield from _unsupported_signal(message, signal)
     yield from _overlaps(message)
@@ -217,32 +218,32 @@ def _unsupported(message: RawMessage, written: _Written) -> Iterator[str]:
 def _unsupported_signal(message: RawMessage, signal: RawSignal) -> Iterator[str]:
     name, is_float = signal.name, signal.conversion.is_float
     if is_float and signal.length not in _FLOAT_BITS:
-        yield f"{name} is a float of {signal.length} bits; floats have 16, 32 or 64"
+        yield f"{name} is a float of {signal.length} bits, but a float must have 16, 32 or 64 bits"
     if signal.length > _WORD:
-        yield f"{name} has {signal.length} bits; signals of up to 64 are supported"
+        yield f"{name} has {signal.length} bits, but at most 64 are supported"
     first = _first_bit(signal)
     if first + signal.length > 8 * message.length:
-        yield f"{name} ends at bit {first + signal.length}, the message at bit {8 * message.length}"
+        yield f"{name} ends at bit {first + signal.length}, after the end of the message at bit {8 * message.length}"
     if not all(math.isfinite(x) for x in (signal.scale, signal.offset)):
-        yield f"{name} has the factor {signal.scale} and offset {signal.offset}"
+        yield f"factor and offset of {name} must be finite, got {signal.scale} and {signal.offset}"
     if signal.is_multiplexer and (is_float or signal.scale != 1 or signal.offset != 0):
-        yield f"the multiplexer {name} is scaled or a float; it must be a plain integer"
+        yield f"the multiplexer {name} is scaled or a float, but must be an integer with factor 1 and offset 0"
 
 
 def _overlaps(message: RawMessage) -> Iterator[str]:
-    """Bits claimed twice by signals that can be in the same frame."""
+    """Yield an overlap of two signals that can be in the same frame."""
     owners: dict[int, list[tuple[str, dict[str, frozenset[int]]]]] = {}
     selectors = _selectors(message)
     for signal in message.signals:
-        mine = dict(selectors[signal.name])
+        own = dict(selectors[signal.name])
         first = _first_bit(signal)
         for bit in range(first, first + signal.length):
-            place = bit ^ 7 if signal.byte_order == "big_endian" else bit
-            for other, theirs in owners.setdefault(place, []):
-                if all(mine[m] & theirs[m] for m in mine.keys() & theirs.keys()):
+            index = bit ^ 7 if signal.byte_order == "big_endian" else bit
+            for other, others in owners.setdefault(index, []):
+                if all(own[m] & others[m] for m in own.keys() & others.keys()):
                     yield f"{signal.name} overlaps {other}"
                     return
-            owners[place].append((signal.name, mine))
+            owners[index].append((signal.name, own))
 
 
 def _first_bit(signal: RawSignal) -> int:
@@ -250,7 +251,7 @@ def _first_bit(signal: RawSignal) -> int:
 
 
 def _selectors(message: RawMessage) -> dict[str, tuple[tuple[str, frozenset[int]], ...]]:
-    """Per signal: multiplexers from the outermost inwards, and the values of each at which the signal is there."""
+    """Return for each signal its multiplexers, outermost first, with their values for which the signal is in the frame."""
     by_name = {s.name: s for s in message.signals}
 
     def of(signal: RawSignal, depth: int = 0) -> tuple[tuple[str, frozenset[int]], ...]:
@@ -263,7 +264,7 @@ def _selectors(message: RawMessage) -> dict[str, tuple[tuple[str, frozenset[int]
 
 
 def _multiplexers(message: RawMessage) -> dict[str, frozenset[int]]:
-    """Values for which a multiplexer has a layout: its children's, and those its value table names."""
+    """Return for each multiplexer the values with a layout: those of its signals and of its value table."""
     known: dict[str, frozenset[int]] = {}
     for multiplexer in (s for s in message.signals if s.is_multiplexer):
         values = {int(value) for value in multiplexer.choices or {}}
@@ -302,11 +303,11 @@ def _layout(message: RawMessage, data_bitrate: float | None) -> Layout:
 
 
 def _data_id(message: RawMessage) -> int | None:
-    """E2E Data ID of a message that carries the Profile 5 header."""
+    """Return the E2E Data ID of a message with the Profile 5 header; None without header or Data ID."""
     data_id = _number(_of(message, "E2EDataId"))
     header = {s.name: (s.start, s.length) for s in message.signals if s.byte_order == "little_endian"}
-    carries = all(header.get(name) == place for name, place in _E2E_HEADER.items())
-    return int(data_id) if data_id and carries else None
+    has_header = all(header.get(name) == bits for name, bits in _E2E_HEADER.items())
+    return int(data_id) if data_id and has_header else None
 
 
 def _pgn_mask(message: RawMessage) -> int:
@@ -348,7 +349,7 @@ def _definitions(database: Database) -> Mapping[str, Any]:
 
 
 def _of(item: Any, name: str) -> object:
-    """Attribute of a database, node, message or signal; its default when not set, None when not defined."""
+    """Return an attribute of a database, node, message or signal, or its default; None if it is not defined."""
     if item.dbc is None:
         return None
     attributes, definitions = item.dbc.attributes or {}, item.dbc.attribute_definitions or {}
@@ -363,7 +364,7 @@ def _of(item: Any, name: str) -> object:
 
 
 def _number(value: object) -> float | None:
-    """A positive number, None otherwise: 0 in a DBC attribute means "not set"."""
+    """Return the value as a number if it is positive, else None, because 0 in a DBC attribute means "not set"."""
     try:
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):

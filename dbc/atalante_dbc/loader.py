@@ -1,6 +1,6 @@
-"""Reads a DBC through cantools and refuses what a receiver could misread, naming the line.
+"""Strict loader of a DBC: parses with cantools and rejects every ambiguous or unsafe definition, with its line number.
 
-cantools accepts duplicate identifiers and names, factor 0 and signals without a receiver; none may reach a robot.
+cantools accepts duplicate identifiers, duplicate names, factor 0 and signals without receiver. This loader does not.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from atalante_dbc.network import Message, Network, Node, Signal
 
 DBC_FILE = Path(__file__).with_name("atalante.dbc")
 
-#: Payload lengths CAN FD can carry (ISO 11898-1).
+#: Valid payload lengths of CAN FD [byte] (ISO 11898-1).
 _LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
-#: E2E Profile 5 header every frame starts with: name -> (start bit, bits).
+#: E2E Profile 5 header at the start of every frame: name -> (start bit, number of bits).
 _HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
 _FD_FORMATS = ("StandardCAN_FD", "ExtendedCAN_FD")
 _BO = re.compile(r"BO_\s+(\d+)\s+(\w+)\s*:\s*(\d+)\s+(\w+)")
@@ -35,16 +35,19 @@ _SG = re.compile(r"SG_\s+(\w+)\s*(\w*)\s*:")
 
 
 class DbcError(ValueError):
-    """The DBC cannot be trusted; one line of the message a problem, each with its line in the file."""
+    """Invalid DBC. Each line of the message is one problem with its line number in the file."""
 
     code = "DBC_INVALID"
 
 
 def load(path: Path | None = None) -> Network:
-    """The network of a DBC file, checked; without a path the project's own, which is read once a process.
+    """Load and check a DBC file.
+
+    Args:
+        path: DBC file; None: the network of the robot, which is read once per process.
 
     Raises:
-        DbcError: the file cannot be parsed, or breaks a rule (see `_problems`); names each line.
+        DbcError: If the file cannot be parsed or breaks a rule (see `_problems`).
     """
     return _read_once(DBC_FILE) if path is None else _read(path)
 
@@ -54,8 +57,8 @@ def _read(path: Path) -> Network:
         raw = path.read_bytes()
         text = raw.decode("cp1252")
         lines = _Lines(text)
-        # Before cantools, which drops duplicates or stumbles over what follows.
-        _refuse(path, chain(_duplicates(lines), wrong_values(text)))
+        # These checks come first, because cantools drops duplicates and fails on invalid values without a line number.
+        _require_no_problems(path, chain(_duplicates(lines), wrong_values(text)))
         database = cantools.database.load_string(text, database_format="dbc", strict=False)
     except DbcError:
         raise
@@ -64,8 +67,8 @@ def _read(path: Path) -> Network:
     except (ValueError, CantoolsError) as error:
         raise DbcError(f"{path}: {error}") from error
     assert isinstance(database, Database)
-    _refuse(path, missing(text))
-    _refuse(path, _problems(database, lines))
+    _require_no_problems(path, missing(text))
+    _require_no_problems(path, _problems(database, lines))
     return Network(
         nodes=tuple(
             Node(n.name, str(_attribute(n, "NodeKind")), int(_attribute(n, "NodeNumber"))) for n in database.nodes
@@ -81,16 +84,16 @@ def _read(path: Path) -> Network:
 _read_once = cache(_read)
 
 
-def _refuse(path: Path, found: Iterator[tuple[int, str]]) -> None:
+def _require_no_problems(path: Path, found: Iterator[tuple[int, str]]) -> None:
     if problems := sorted(set(found)):
-        raise DbcError("\n".join(f"{path}:{line}: {what}" for line, what in problems))
+        raise DbcError("\n".join(f"{path}:{line}: {problem}" for line, problem in problems))
 
 
 class _Lines:
-    """Where messages and signals are written, since cantools forgets it and drops duplicates."""
+    """Line numbers of messages and signals, which cantools does not keep."""
 
     def __init__(self, text: str) -> None:
-        self.messages: list[tuple[int, int, str]] = []  # (line, frame id, name), as often as written
+        self.messages: list[tuple[int, int, str]] = []  # (line, frame id, name), with duplicates
         self.signals: list[tuple[int, str, str, str]] = []  # (line, message, signal, multiplexer mark)
         for number, line in enumerate(text.splitlines(), start=1):
             if match := _BO.match(line):
@@ -108,20 +111,20 @@ class _Lines:
 
 
 def _problems(database: Database, lines: _Lines) -> Iterator[tuple[int, str]]:
-    """Every broken rule as (line, sentence)."""
+    """Yield every broken rule as (line number, message)."""
     data_ids: dict[int, str] = {}
     nodes = {node.name for node in database.nodes}
     for message in database.messages:
         line = lines.message(message)
-        yield from ((line, f"{message.name} {what}") for what in _message_problems(message, nodes))
+        yield from ((line, f"{message.name} {problem}") for problem in _message_problems(message, nodes))
         data_id = int(_attribute(message, "E2EDataId"))
         if other := data_ids.get(data_id):
-            yield line, f"{message.name} has the E2EDataId {data_id} of {other}; give each message its own"
+            yield line, f"{message.name} must have a unique E2EDataId, got {data_id}, which {other} also has"
         data_ids[data_id] = message.name
         for signal in message.signals:
-            where = lines.signal(message, signal)
+            signal_line = lines.signal(message, signal)
             name = f"{message.name}.{signal.name}"
-            yield from ((where, f"{name} {what}") for what in _signal_problems(message, signal, nodes))
+            yield from ((signal_line, f"{name} {problem}") for problem in _signal_problems(message, signal, nodes))
         yield from _overlaps(message, lines)
 
 
@@ -130,84 +133,84 @@ def _duplicates(lines: _Lines) -> Iterator[tuple[int, str]]:
     names: dict[str, int] = {}
     for line, frame_id, name in lines.messages:
         if frame_id in ids:
-            yield line, f"{name} repeats the frame id {frame_id:#x} of line {ids[frame_id]}"
+            yield line, f"{name} must have a unique frame id, got {frame_id:#x}, which line {ids[frame_id]} also has"
         if name in names:
-            yield line, f"the message name {name} is already used in line {names[name]}"
+            yield line, f"the message name {name} must be unique; line {names[name]} has it too"
         ids.setdefault(frame_id, line)
         names.setdefault(name, line)
     signals: dict[tuple[str, str], int] = {}
     for line, message, signal, multiplexer in lines.signals:
         if (message, signal) in signals:
-            yield line, f"{message} already has a signal {signal} in line {signals[message, signal]}"
+            yield line, f"the signal name {message}.{signal} must be unique; line {signals[message, signal]} has it too"
         signals.setdefault((message, signal), line)
         if multiplexer:
-            yield line, f"{message}.{signal} is multiplexed; this network has one layout a message"
+            yield line, f"{message}.{signal} must not be multiplexed; every message has one layout"
 
 
 def _message_problems(message: RawMessage, nodes: set[str]) -> Iterator[str]:
     if message.length not in _LENGTHS:
-        yield f"is {message.length} bytes long; CAN FD carries {', '.join(map(str, _LENGTHS))}"
+        yield f"must have a length of {', '.join(map(str, _LENGTHS))} bytes, got {message.length} bytes"
     if _attribute(message, "VFrameFormat") not in _FD_FORMATS:
-        yield "is not a CAN FD frame; set VFrameFormat to StandardCAN_FD"
+        yield "must be a CAN FD frame; set VFrameFormat to StandardCAN_FD"
     if not set(message.senders) <= nodes or len(message.senders) != 1:
-        yield f"needs one sender out of BU_, not {', '.join(message.senders) or 'none'}"
+        yield f"must have one sender from BU_, got {', '.join(message.senders) or 'none'}"
     for name, (start, length) in _HEADER.items():
         found = next((s for s in message.signals if s.name == name), None)
         if found is None or (found.start, found.length, found.is_signed) != (start, length, False):
-            yield f"needs the unsigned signal {name} : {start}|{length}@1+ of the E2E header"
+            yield f"must have the unsigned signal {name} : {start}|{length}@1+ of the E2E header"
     cyclic = _attribute(message, "GenMsgSendType") == "cyclic"
     if cyclic and not int(_attribute(message, "GenMsgCycleTime")):
-        yield "is cyclic and needs a GenMsgCycleTime"
+        yield "is cyclic and must have a GenMsgCycleTime above 0"
     if cyclic and int(_attribute(message, "TimeoutTime")) <= int(_attribute(message, "GenMsgCycleTime")):
-        yield "is cyclic and needs a TimeoutTime above its cycle time"
+        yield "is cyclic and must have a TimeoutTime above its cycle time"
     if not cyclic and not int(_attribute(message, "GenMsgDelayTime")):
-        yield "is an event and needs a GenMsgDelayTime, which bounds its bus load"
+        yield "is an event and must have a GenMsgDelayTime above 0, which limits its bus load"
     if not int(_attribute(message, "E2EDataId")):
-        yield "needs an E2EDataId"
+        yield "must have an E2EDataId above 0"
 
 
 def _signal_problems(message: RawMessage, signal: RawSignal, nodes: set[str]) -> Iterator[str]:
     if signal.byte_order != "little_endian":
-        yield "is big endian; this network is little endian (@1)"
+        yield "must be little endian (@1), got big endian (@0)"
         return
     if signal.is_float:
-        yield "is a float; this network carries scaled integers"
+        yield "must be a scaled integer, got a float"
     end = signal.start + signal.length
     if end > 8 * message.length:
-        yield f"ends at bit {end}, the message at bit {8 * message.length}"
+        yield f"must end within the {8 * message.length} bits of the message, got end bit {end}"
     if signal.start // 64 != (end - 1) // 64:
-        yield f"crosses the 64-bit word boundary at bit {(end - 1) // 64 * 64}"
+        yield f"must not cross the 64-bit word boundary at bit {(end - 1) // 64 * 64}"
     if not signal.unit:
-        yield 'has no unit; write "1" for a number without one'
+        yield 'must have a unit; write "1" for a number without unit'
     if not signal.receivers or not set(signal.receivers) <= nodes:
-        yield f"needs receivers out of BU_, not {', '.join(signal.receivers) or 'none'}"
+        yield f"must have receivers from BU_, got {', '.join(signal.receivers) or 'none'}"
     if signal.scale == 0 or not math.isfinite(signal.scale) or not math.isfinite(signal.offset):
-        yield f"has factor {signal.scale} and offset {signal.offset}; both are finite, and the factor is not 0"
+        yield f"must have a finite offset and a finite factor other than 0, got factor {signal.scale} and offset {signal.offset}"
         return
     yield from _range_problems(signal)
 
 
 def _range_problems(signal: RawSignal) -> Iterator[str]:
     if signal.minimum is None or signal.maximum is None or not signal.minimum < signal.maximum:
-        yield f"needs a range [min|max] with min < max, not [{signal.minimum}|{signal.maximum}]"
+        yield f"must have a range [min|max] with min < max, got [{signal.minimum}|{signal.maximum}]"
         return
     low, high = (
         (-(1 << signal.length - 1), (1 << signal.length - 1) - 1) if signal.is_signed else (0, (1 << signal.length) - 1)
     )
     raw = sorted(((signal.minimum - signal.offset) / signal.scale, (signal.maximum - signal.offset) / signal.scale))
     if raw[0] < low - 1e-6 or raw[1] > high + 1e-6:
-        yield f"has the range [{signal.minimum}|{signal.maximum}]; {signal.length} bits of {signal.scale} cannot hold it"
+        yield f"must have a range that fits {signal.length} bits of {signal.scale}, got [{signal.minimum}|{signal.maximum}]"
     invalid = _invalid_raw(signal)
     if invalid is not None:
         value = invalid - (1 << signal.length) if signal.is_signed and invalid >> signal.length - 1 else invalid
         if not 0 <= invalid < 1 << signal.length:
-            yield f"has the InvalidRaw {invalid:#x}, which does not fit {signal.length} bits"
+            yield f"must have an InvalidRaw of at most {signal.length} bits, got {invalid:#x}"
         elif raw[0] - 0.5 <= value <= raw[1] + 0.5:
-            yield f"has the InvalidRaw {invalid:#x} inside its valid range"
+            yield f"must have an InvalidRaw outside its valid range, got {invalid:#x}"
 
 
 def _overlaps(message: RawMessage, lines: _Lines) -> Iterator[tuple[int, str]]:
-    """Bits claimed twice; the later signal of the file is named."""
+    """Yield each signal that overlaps an earlier signal of the file."""
     owner: dict[int, RawSignal] = {}
     for signal in sorted(message.signals, key=lambda s: lines.signal(message, s)):
         if signal.byte_order != "little_endian":
@@ -260,7 +263,7 @@ def _invalid_raw(signal: RawSignal) -> int | None:
 
 
 def _attribute(item: Any, name: str) -> int | str:
-    """Attribute of a node, message or signal, its default when not set; enumerations by name."""
+    """Return an attribute of a node, message or signal, or its default. The value of an enumeration is its name."""
     attributes = item.dbc.attributes if item.dbc is not None else {}
     if name in attributes:
         definition, value = attributes[name].definition, attributes[name].value

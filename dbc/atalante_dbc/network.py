@@ -1,4 +1,4 @@
-"""What a DBC says, as frozen data: nodes, messages, signals, and the bus load they add up to."""
+"""Content of a DBC as frozen data: nodes, messages and signals, with the worst-case bus load."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import TypeVar
 
 @dataclass(frozen=True)
 class Signal:
-    """One field of a payload, little endian; physical = raw * factor + offset."""
+    """Signal of a payload, little endian: physical = raw * factor + offset."""
 
     name: str
-    start: int  # bit of the payload, least significant first
+    start: int  # index of its least significant bit in the payload
     length: int  # bits
     signed: bool
     factor: float
@@ -21,45 +21,45 @@ class Signal:
     minimum: float  # smallest valid physical value
     maximum: float  # largest valid physical value
     unit: str
-    invalid_raw: int | None  # raw code (as unsigned bits) that says "no value"
-    choices: Mapping[int, str]  # raw value -> name; empty when the signal is a number
-    receivers: tuple[str, ...]
+    invalid_raw: int | None  # raw code (as unsigned bits) for "no value"; None: there is none
+    choices: Mapping[int, str]  # raw value -> name; empty for a number
+    receivers: tuple[str, ...]  # nodes that read it
 
 
 @dataclass(frozen=True)
 class Message:
-    """One CAN FD frame of the network."""
+    """CAN FD message of the network."""
 
     name: str
-    frame_id: int
+    frame_id: int  # 11-bit CAN identifier
     length: int  # bytes
     sender: str
     signals: tuple[Signal, ...]
     bus: str
     send_type: str  # "cyclic" or "event"
-    cycle_ms: int  # 0 for an event
-    timeout_ms: int  # 0: never times out
-    inhibit_ms: int  # least time between two events
-    data_id: int  # AUTOSAR E2E
+    cycle_ms: int  # ms, 0 for an event message
+    timeout_ms: int  # ms; 0: no timeout
+    inhibit_ms: int  # ms, minimum time between two frames of an event message
+    data_id: int  # AUTOSAR E2E Data ID
     comment: str
 
     def signal(self, name: str) -> Signal:
-        """The signal of that name.
+        """Return the signal with the given name.
 
         Raises:
-            KeyError: with the names there are.
+            KeyError: If there is no such name; the message lists the valid names.
         """
-        return _named(self.signals, name, f"signals of {self.name}")
+        return _named(self.signals, name, f"signal of {self.name}")
 
     @property
     def receivers(self) -> tuple[str, ...]:
-        """Nodes that read at least one signal, in DBC order."""
+        """Return the nodes that read at least one signal, in DBC order."""
         return tuple(dict.fromkeys(node for signal in self.signals for node in signal.receivers))
 
 
 @dataclass(frozen=True)
 class Node:
-    """A participant; `kind` is master, drive, imu, foot, haptics or pendant."""
+    """Node of the network. `kind` is master, drive, imu, foot, haptics or pendant."""
 
     name: str
     kind: str
@@ -68,52 +68,52 @@ class Node:
 
 @dataclass(frozen=True)
 class Network:
-    """The whole DBC. Messages are in file order."""
+    """Whole network. Messages are in file order."""
 
     nodes: tuple[Node, ...]
     messages: tuple[Message, ...]
     buses: tuple[str, ...]
-    nominal_bitrate: int  # bit/s
-    data_bitrate: int  # bit/s
-    hash32: int  # CRC-32 of the file, as nodes report it in their status
+    nominal_bitrate: int  # bit/s, arbitration phase
+    data_bitrate: int  # bit/s, data phase
+    hash32: int  # CRC-32 of the file, reported by nodes in their status
 
     @cached_property
     def _by_name(self) -> dict[str, Message]:
         return {message.name: message for message in self.messages}
 
     def message(self, name: str) -> Message:
-        """The message of that name.
+        """Return the message with the given name.
 
         Raises:
-            KeyError: with the names there are.
+            KeyError: If there is no such name; the message lists the valid names.
         """
         try:
             return self._by_name[name]
         except KeyError:
-            raise KeyError(f"no message {name!r}; there are {', '.join(self._by_name)}") from None
+            raise KeyError(f"message must be one of {', '.join(self._by_name)}, got {name!r}") from None
 
     def node(self, name: str) -> Node:
-        """The node of that name.
+        """Return the node with the given name.
 
         Raises:
-            KeyError: with the names there are.
+            KeyError: If there is no such name; the message lists the valid names.
         """
-        return _named(self.nodes, name, "nodes")
+        return _named(self.nodes, name, "node")
 
     def of_kind(self, kind: str) -> tuple[Node, ...]:
-        """Nodes of a kind, by number."""
+        """Return the nodes of a kind, ordered by number."""
         return tuple(sorted((n for n in self.nodes if n.kind == kind), key=lambda n: n.number))
 
     def sent_by(self, node: str) -> tuple[Message, ...]:
-        """Messages a node sends."""
+        """Return the messages that a node sends."""
         return tuple(m for m in self.messages if m.sender == node)
 
     def received_by(self, node: str) -> tuple[Message, ...]:
-        """Messages of which a node reads at least one signal."""
+        """Return the messages of which a node reads at least one signal."""
         return tuple(m for m in self.messages if node in m.receivers)
 
     def bus_load(self) -> dict[str, float]:
-        """Worst-case share of each bus's time: cyclic messages at their cycle, events at their inhibit time."""
+        """Return the worst-case load of each bus, 0 to 1. Event messages count with their inhibit time as period."""
         load = dict.fromkeys(self.buses, 0.0)
         for message in self.messages:
             period = (message.cycle_ms or message.inhibit_ms) * 1e-3
@@ -125,18 +125,23 @@ _T = TypeVar("_T", Signal, Node)
 
 
 def wire_time(length: int, nominal_bitrate: float = 1e6, data_bitrate: float = 5e6) -> float:
-    """Longest time [s] an 11-bit CAN FD frame of `length` payload bytes can take (ISO 11898-1), stuff bits included.
+    """Return the longest time [s] of a CAN FD frame with 11-bit identifier on the bus (ISO 11898-1), with stuff bits.
 
-    Nominal phase with interframe space 33 bits; data phase s = 5 + 8 n bits, one dynamic stuff bit in four, and the
-    fixed-stuffed CRC with its delimiters, 28 bits (33 above 16 bytes).
+    The nominal phase with interframe space has 33 bits. The data phase has 5 + 8 n bits for n payload bytes, one stuff bit
+    per four bits, and the CRC with fixed stuff bits and delimiters: 28 bits, or 33 bits above 16 bytes.
+
+    Args:
+        length: payload length n [byte].
+        nominal_bitrate: bit rate of the nominal phase [bit/s].
+        data_bitrate: bit rate of the data phase [bit/s].
     """
     stuffed = 5 + 8 * length
     data_bits = stuffed + stuffed // 4 + (33 if length > 16 else 28)
     return 33 / nominal_bitrate + data_bits / data_bitrate
 
 
-def _named(items: tuple[_T, ...], name: str, what: str) -> _T:
+def _named(items: tuple[_T, ...], name: str, kind: str) -> _T:
     for item in items:
         if item.name == name:
             return item
-    raise KeyError(f"no {name!r} in the {what}: {', '.join(item.name for item in items)}")
+    raise KeyError(f"{kind} must be one of {', '.join(item.name for item in items)}, got {name!r}")

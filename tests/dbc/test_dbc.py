@@ -1,4 +1,4 @@
-"""The network: what DESIGN asks of it, and a loader that names the line of everything a receiver could misread."""
+"""Tests of the network and of the strict loader, which rejects each defect of a DBC with its line number."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from atalante_dbc import DBC_FILE, DbcError, load, wire_time
 TEXT = DBC_FILE.read_text()
 
 
-#: What the mutations touch: the first two joint states and the first emergency, each a BO_ line and its signals.
+#: Messages changed by the mutations: the first two joint states and the first emergency.
 MESSAGES = ("BO_ 385 ", "BO_ 386 ", "BO_ 129 ")
 
 
-def test_every_node_of_the_robot_is_there():
+def test_network_has_every_node_of_the_robot():
     network = load()
     kinds = {kind: len(network.of_kind(kind)) for kind in ("master", "drive", "imu", "foot", "haptics", "pendant")}
     assert kinds == {"master": 1, "drive": 12, "imu": 4, "foot": 2, "haptics": 1, "pendant": 1}
 
 
-def test_every_node_but_the_master_reports_status_and_emergency():
+def test_every_node_except_the_master_sends_status_and_emergency():
     network = load()
     for node in network.nodes:
         names = {m.name for m in network.sent_by(node.name)}
@@ -34,7 +34,7 @@ def test_ids_and_data_ids_are_unique_over_all_buses():
     assert len({m.frame_id for m in messages}) == len(messages) == len({m.data_id for m in messages})
 
 
-def test_a_node_lives_on_one_bus():
+def test_every_node_except_the_master_is_on_one_bus():
     network = load()
     for node in network.nodes:
         if node.kind != "master":
@@ -64,7 +64,7 @@ def test_worst_case_load_of_every_bus_is_at_most_sixty_percent():
     assert max(load_of.values()) <= 0.60
 
 
-def test_unknown_names_are_answered_with_the_valid_ones():
+def test_unknown_name_is_rejected_with_the_valid_names():
     network = load()
     with pytest.raises(KeyError, match="LEFT_SK_STATE"):
         network.message("LEFT_KNEE")
@@ -73,7 +73,7 @@ def test_unknown_names_are_answered_with_the_valid_ones():
 
 
 def _signal(name: str, rest: str) -> tuple[str, str]:
-    """A signal of LEFT_FH_STATE as it is written, and as the mutation wants it."""
+    """Return the line of a signal of LEFT_FH_STATE, and its replacement."""
     block = TEXT[TEXT.index("BO_ 385 LEFT_FH_STATE") :]
     old = next(line for line in block.splitlines() if f"SG_ {name} :" in line)
     return old, f" SG_ {name} : {rest}"
@@ -81,29 +81,29 @@ def _signal(name: str, rest: str) -> tuple[str, str]:
 
 MUTATIONS = {
     "overlap": (*_signal("Temperature", '52|8@1+ (1,-40) [-40|214] "degC" HAL'), "overlaps"),
-    "does not fit": (*_signal("Torque", '90|16@1- (0.0125,0) [-400|400] "Nm" HAL'), "ends at bit 106"),
+    "does not fit": (*_signal("Torque", '90|16@1- (0.0125,0) [-400|400] "Nm" HAL'), "got end bit 106"),
     "endless factor": (*_signal("Torque", '80|16@1- (1e999,0) [-400|400] "Nm" HAL'), "factor inf"),
     "factor 0": (*_signal("Torque", '80|16@1- (0,0) [-400|400] "Nm" HAL'), "factor 0"),
-    "range too wide": (*_signal("Torque", '80|16@1- (0.0125,0) [-500|400] "Nm" HAL'), "cannot hold"),
+    "range too wide": (*_signal("Torque", '80|16@1- (0.0125,0) [-500|400] "Nm" HAL'), "range that fits 16 bits"),
     "empty range": (*_signal("Torque", '80|16@1- (0.0125,0) [0|0] "Nm" HAL'), "min < max"),
     "word boundary": (*_signal("Temperature", '60|8@1+ (1,-40) [-40|214] "degC" HAL'), "64-bit word"),
-    "no unit": (*_signal("Torque", '80|16@1- (0.0125,0) [-400|400] "" HAL'), "no unit"),
+    "no unit": (*_signal("Torque", '80|16@1- (0.0125,0) [-400|400] "" HAL'), "must have a unit"),
     "no receiver": (*_signal("Torque", '80|16@1- (0.0125,0) [-400|400] "Nm" Vector__XXX'), "receivers"),
     "no CRC": (*_signal("Crc", '0|15@1+ (1,0) [0|32767] "1" HAL'), "signal Crc"),
     "no counter": (*_signal("Counter", '17|7@1+ (1,0) [0|127] "1" HAL'), "signal Counter"),
     "big endian": (*_signal("Torque", '87|16@0- (0.0125,0) [-400|400] "Nm" HAL'), "big endian"),
     "multiplexed": (
         _signal("Torque", "")[0], ' SG_ Torque m0 : 80|16@1- (0.0125,0) [-400|400] "Nm" HAL', "multiplexed"),
-    "duplicate signal": (_signal("Torque", "")[0], ' SG_ Velocity : 80|16@1- (0.0125,0) [-400|400] "Nm" HAL', "already has"),
-    "duplicate id": ("BO_ 386 LEFT_TH_STATE", "BO_ 385 LEFT_TH_STATE", "repeats the frame id"),
-    "duplicate name": ("BO_ 386 LEFT_TH_STATE", "BO_ 386 LEFT_FH_STATE", "already used"),
+    "duplicate signal": (_signal("Torque", "")[0], ' SG_ Velocity : 80|16@1- (0.0125,0) [-400|400] "Nm" HAL', "must be unique"),
+    "duplicate id": ("BO_ 386 LEFT_TH_STATE", "BO_ 385 LEFT_TH_STATE", "unique frame id, got 0x181"),
+    "duplicate name": ("BO_ 386 LEFT_TH_STATE", "BO_ 386 LEFT_FH_STATE", "name LEFT_FH_STATE must be unique"),
     "illegal length": ("BO_ 385 LEFT_FH_STATE: 12", "BO_ 385 LEFT_FH_STATE: 13", "13 bytes"),
-    "unknown sender": ("BO_ 385 LEFT_FH_STATE: 12 LEFT_FH", "BO_ 385 LEFT_FH_STATE: 12 NOBODY", "sender"),
+    "unknown sender": ("BO_ 385 LEFT_FH_STATE: 12 LEFT_FH", "BO_ 385 LEFT_FH_STATE: 12 UNKNOWN", "sender"),
     "classic frame": ('BA_ "VFrameFormat" BO_ 385 14;', 'BA_ "VFrameFormat" BO_ 385 0;', "CAN FD frame"),
     "no cycle": ('BA_ "GenMsgCycleTime" BO_ 385 1;', "", "GenMsgCycleTime"),
     "no timeout": ('BA_ "TimeoutTime" BO_ 385 5;', "", "TimeoutTime"),
-    "no data id": ('BA_ "E2EDataId" BO_ 385 41345;', "", "needs an E2EDataId"),
-    "shared data id": ('BA_ "E2EDataId" BO_ 386 41346;', 'BA_ "E2EDataId" BO_ 386 41345;', "give each message its own"),
+    "no data id": ('BA_ "E2EDataId" BO_ 385 41345;', "", "must have an E2EDataId"),
+    "shared data id": ('BA_ "E2EDataId" BO_ 386 41346;', 'BA_ "E2EDataId" BO_ 386 41345;', "unique E2EDataId"),
     "unbounded event": ('BA_ "GenMsgDelayTime" BO_ 129 100;', "", "GenMsgDelayTime"),
     "node kind unknown": ('BA_ "NodeKind" BU_ LEFT_FH 1;', 'BA_ "NodeKind" BU_ LEFT_FH 9;', "one of master, drive"),
     "cycle out of range": (
@@ -115,40 +115,40 @@ MUTATIONS = {
     "no definition": ('BA_DEF_ SG_ "InvalidRaw" STRING;', "", "InvalidRaw has no definition"),
     "undefined": ('BA_ "E2EDataId" BO_ 385 41345;', 'BA_ "DataId" BO_ 385 41345;', "DataId has no definition"),
     "invalid code in range": (
-        'BA_ "InvalidRaw" SG_ 385 Torque "0x8000";', 'BA_ "InvalidRaw" SG_ 385 Torque "0x10";', "inside its valid range"),
+        'BA_ "InvalidRaw" SG_ 385 Torque "0x8000";', 'BA_ "InvalidRaw" SG_ 385 Torque "0x10";', "outside its valid range"),
     "invalid code too long": (
-        'BA_ "InvalidRaw" SG_ 385 Torque "0x8000";', 'BA_ "InvalidRaw" SG_ 385 Torque "0x18000";', "does not fit"),
+        'BA_ "InvalidRaw" SG_ 385 Torque "0x8000";', 'BA_ "InvalidRaw" SG_ 385 Torque "0x18000";', "at most 16 bits"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", MUTATIONS)
-def test_a_bad_dbc_is_refused_and_the_line_named(name: str, tmp_path: Path):
+def test_invalid_dbc_is_rejected_with_its_line(name: str, tmp_path: Path):
     old, new, message = MUTATIONS[name]
     assert TEXT.count(old) >= 1
     path = tmp_path / "bad.dbc"
-    # Signal lines repeat from message to message: change the one of LEFT_FH_STATE.
+    # Several messages have the same signal line, so search from LEFT_FH_STATE on.
     start = TEXT.index("BO_ 385 LEFT_FH_STATE") if old.startswith(" SG_") else 0
     text = TEXT[:start] + TEXT[start:].replace(old, new, 1)
     path.write_text(text)
-    with pytest.raises(DbcError, match=message) as refused:
+    with pytest.raises(DbcError, match=message) as rejected:
         load(path)
-    numbers = {int(line.split(":")[1]) for line in str(refused.value).splitlines()}
+    numbers = {int(line.split(":")[1]) for line in str(rejected.value).splitlines()}
     lines = text.splitlines()
     message_lines = [i for i, line in enumerate(lines, start=1) if line.startswith(MESSAGES)]
     named = {line + offset for line in message_lines for offset in range(9)}
-    # An attribute is named where it is set, one without default on the first line.
+    # An attribute error has the line of the value; a missing default has line 1.
     attributes = (i for i, line in enumerate(lines, start=1) if line == new or (not new and '"InvalidRaw"' in line))
     assert numbers <= named | {1, *attributes}
 
 
 @pytest.mark.parametrize("content", ["", "BO_ nonsense", "\x00\x01"])
-def test_a_file_that_is_no_dbc_is_refused_in_a_sentence(content: str, tmp_path: Path):
+def test_file_that_is_not_a_dbc_is_rejected(content: str, tmp_path: Path):
     path = tmp_path / "broken.dbc"
     path.write_text(content)
     with pytest.raises(DbcError, match=r"broken\.dbc"):
         load(path)
 
 
-def test_a_missing_file_is_named(tmp_path: Path):
+def test_missing_file_is_named(tmp_path: Path):
     with pytest.raises(DbcError, match="nowhere"):
         load(tmp_path / "nowhere.dbc")

@@ -1,4 +1,4 @@
-"""The lenient loader: our own network as the strict one reads it, and what other people's attributes mean."""
+"""Tests of the lenient loader: agreement with the strict loader, and attributes of other DBC files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def layout_of(text: str, tmp_path: Path, name: str = "M") -> Layout:
     return catalogue(path).layout(name)
 
 
-def test_our_network_is_the_same_in_both_loaders() -> None:
+def test_both_loaders_agree_on_the_network() -> None:
     strict, lenient = atalante_dbc.load(), catalogue(atalante_dbc.DBC_FILE)
     assert lenient.refused == ()
     assert lenient.hash32 == strict.hash32
@@ -59,7 +59,7 @@ def test_our_network_is_the_same_in_both_loaders() -> None:
             )
 
 
-def test_a_dbc_without_attributes_says_nothing(tmp_path: Path) -> None:
+def test_dbc_without_attributes_gives_unknown_values(tmp_path: Path) -> None:
     layout = layout_of(ONE, tmp_path)
     assert (layout.fd, layout.bit_rate_switch, layout.bus, layout.data_id) == (None, None, None, None)
     assert (layout.cyclic, layout.cycle_ms, layout.timeout_ms, layout.inhibit_ms) == (False, None, None, None)
@@ -87,13 +87,13 @@ def test_a_dbc_without_attributes_says_nothing(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_cycle_time_and_send_type(attributes: str, cyclic: bool, tmp_path: Path) -> None:
+def test_cycle_time_and_send_type_set_cyclic(attributes: str, cyclic: bool, tmp_path: Path) -> None:
     layout = layout_of(ONE + attributes, tmp_path)
     assert layout.cyclic is cyclic
     assert layout.cycle_ms == 5
 
 
-def test_frame_format(tmp_path: Path) -> None:
+def test_frame_format_and_bit_rate_switch(tmp_path: Path) -> None:
     formats = (
         'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","r","J1939PG","r","r","r","r","r","r","r","r","r","r",'
         '"StandardCAN_FD","ExtendedCAN_FD";\nBA_DEF_DEF_ "VFrameFormat" "StandardCAN";\n'
@@ -107,7 +107,7 @@ def test_frame_format(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("frame_id", "mask"), [(0x18FEF100, 0x03FFFF00), (0x18EAFFFE, 0x03FF0000)])
-def test_parameter_groups_are_known_by_part_of_the_identifier(frame_id: int, mask: int, tmp_path: Path) -> None:
+def test_j1939_mask_selects_the_parameter_group(frame_id: int, mask: int, tmp_path: Path) -> None:
     identifier = 1 << 31 | frame_id
     text = (
         f'BO_ {identifier} M: 8 A\n SG_ S : 0|8@1+ (1,0) [0|0] "" B\n\n'
@@ -118,7 +118,7 @@ def test_parameter_groups_are_known_by_part_of_the_identifier(frame_id: int, mas
     assert (layout.extended, layout.frame_id, layout.pgn_mask) == (True, frame_id, mask)
 
 
-def test_e2e_needs_data_id_and_header(tmp_path: Path) -> None:
+def test_data_id_needs_attribute_and_header(tmp_path: Path) -> None:
     data_id = 'BA_DEF_ BO_ "E2EDataId" INT 0 65535;\nBA_DEF_DEF_ "E2EDataId" 0;\nBA_ "E2EDataId" BO_ 256 7;\n'
     header = 'BO_ 256 M: 8 A\n SG_ Crc : 0|16@1+ (1,0) [0|0] "" B\n SG_ Counter : 16|8@1+ (1,0) [0|0] "" B\n\n'
     assert layout_of(ONE + data_id, tmp_path).data_id is None
@@ -126,11 +126,11 @@ def test_e2e_needs_data_id_and_header(tmp_path: Path) -> None:
     assert layout_of(header, tmp_path).data_id is None
 
 
-def test_text_in_comments_is_no_message(tmp_path: Path) -> None:
-    """A comment that quotes DBC lines does not make its message a duplicate."""
+def test_dbc_lines_in_a_comment_are_ignored(tmp_path: Path) -> None:
+    """The comment contains lines of a message and a signal."""
     layout = layout_of(ONE + 'CM_ BO_ 256 "as in BO_ 256 M: 8 A and SG_ S m0 : 0|8";\n', tmp_path)
     assert layout.field("S").length == 8
-    with pytest.raises(KeyError, match=r"no signal 'T' in M: S"):
+    with pytest.raises(KeyError, match=r"signal of M must be one of S, got 'T'"):
         layout.field("T")
 
 

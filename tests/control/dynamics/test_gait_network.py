@@ -1,4 +1,4 @@
-"""The network: its shape, its range, its file, its speed of change; what it knows about gaits is `atalante gait check`."""
+"""Tests of the gait network: shape, range, file, continuity. `atalante gait check` measures its accuracy."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SHIPPED = load_network()
 
 
 def drawn(seed: int) -> GaitNetwork:
-    """A network nobody trained, with a last layer in the space of periodic gaits."""
+    """Return an untrained network whose last layer gives periodic gaits."""
     rng = np.random.default_rng(seed)
     _, _, right = np.linalg.svd(periodicity())
     basis = right[len(periodicity()) :]
@@ -57,25 +57,25 @@ def subject(inputs: np.ndarray) -> Subject:
 
 
 @pytest.mark.parametrize("network", [SHIPPED, drawn(1)], ids=["shipped", "untrained"])
-def test_the_angles_of_every_gait_go_on_in_its_mirror_image(network: GaitNetwork) -> None:
+def test_angles_of_every_gait_continue_in_the_mirrored_step(network: GaitNetwork) -> None:
     for inputs in random_inputs(network, 50):
         points = network.coefficients(inputs)
         np.testing.assert_allclose(points[:, -1], SIGN * points[SWAP, 0], atol=1e-12)
 
 
-def test_speeds_go_on_but_for_what_an_impact_leaves() -> None:
+def test_velocities_continue_in_the_mirrored_step_within_tolerance() -> None:
     for inputs in random_inputs(SHIPPED, 200):
         _, qd, _ = motion(SHIPPED.coefficients(inputs), inputs[3], np.array([0.0, 1.0]))
         assert np.abs(qd[1] - SIGN * qd[0][SWAP]).max() < 0.02
 
 
-def test_gaits_of_the_shipped_network_keep_the_robot_s_limits() -> None:
+def test_gaits_of_the_shipped_network_are_within_robot_limits() -> None:
     ends = np.array(np.meshgrid(*zip(SHIPPED.low, SHIPPED.high, strict=True))).reshape(len(INPUTS), -1).T
     for inputs in [*random_inputs(SHIPPED, 10), *ends]:
         check_gait(SHIPPED.gait(subject(inputs), ROBOT), ROBOT)
 
 
-def test_the_shipped_network_covers_the_subjects_of_the_paper() -> None:
+def test_shipped_network_covers_the_subjects_of_the_paper() -> None:
     assert dict(zip(INPUTS, SHIPPED.low, strict=True))["mass"] <= 58.0
     assert dict(zip(INPUTS, SHIPPED.high, strict=True))["mass"] >= 91.0
     assert SHIPPED.low[1] <= 1.62
@@ -84,7 +84,7 @@ def test_the_shipped_network_covers_the_subjects_of_the_paper() -> None:
 
 
 def test_output_is_continuous() -> None:
-    """A millionth of the range changes no angle by more than a ten-thousandth of a degree."""
+    """An input step of 1e-6 of its range changes every angle by less than 1e-4 degrees."""
     for inputs in random_inputs(SHIPPED, 100):
         for axis, step in enumerate(1e-6 * (SHIPPED.high - SHIPPED.low)):
             nudged = inputs + step * (np.arange(len(INPUTS)) == axis)
@@ -92,14 +92,14 @@ def test_output_is_continuous() -> None:
             assert np.degrees(np.abs(change).max()) < 1e-4
 
 
-def test_feedforward_is_the_inverse_dynamics_of_its_own_trajectory() -> None:
-    who = subject(random_inputs(SHIPPED, 1)[0])
-    gait = SHIPPED.gait(who, ROBOT)
-    expected = stance_dynamics(ROBOT, who.patient).feedforward(gait.coefficients, gait.duration)
+def test_feedforward_is_the_inverse_dynamics_of_the_trajectory() -> None:
+    person = subject(random_inputs(SHIPPED, 1)[0])
+    gait = SHIPPED.gait(person, ROBOT)
+    expected = stance_dynamics(ROBOT, person.patient).feedforward(gait.coefficients, gait.duration)
     assert gait.feedforward is not None
     np.testing.assert_array_equal(gait.feedforward, expected)
-    assert gait.parameters == who.parameters()
-    assert gait.duration == who.step_duration
+    assert gait.parameters == person.parameters()
+    assert gait.duration == person.step_duration
 
 
 @pytest.mark.parametrize(
@@ -115,19 +115,19 @@ def test_feedforward_is_the_inverse_dynamics_of_its_own_trajectory() -> None:
         (lambda low, high: Subject(Patient(75.0, 1.75, 0.47), 0.15, 0.9), "knows legs of Winter's proportions"),
     ],
 )
-def test_a_subject_it_was_not_fitted_for_is_refused_with_the_range(
+def test_subject_out_of_range_is_rejected_with_the_range(
     change: Callable[[np.ndarray, np.ndarray], Subject], sentence: str
 ) -> None:
     with pytest.raises(NetworkError, match=sentence):
         SHIPPED.gait(change(SHIPPED.low, SHIPPED.high), ROBOT)
 
 
-def test_the_ends_of_the_range_belong_to_it() -> None:
+def test_ends_of_the_range_are_accepted() -> None:
     for inputs in (SHIPPED.low, SHIPPED.high):
         SHIPPED.check(subject(inputs))
 
 
-def test_a_saved_network_is_read_back_to_the_bit(tmp_path: Path) -> None:
+def test_saved_network_is_loaded_bit_for_bit(tmp_path: Path) -> None:
     network = drawn(2)
     save_network(network, tmp_path / "network.npz")
     back = load_network(tmp_path / "network.npz")
@@ -156,9 +156,7 @@ def test_a_saved_network_is_read_back_to_the_bit(tmp_path: Path) -> None:
         ({"bias_1": np.arange(96.0)}, "the angles of a gait must continue in the next step"),
     ],
 )
-def test_a_file_that_is_no_network_is_refused(
-    tmp_path: Path, change: dict[str, np.ndarray | None], sentence: str
-) -> None:
+def test_invalid_network_file_is_rejected(tmp_path: Path, change: dict[str, np.ndarray | None], sentence: str) -> None:
     path = tmp_path / "network.npz"
     save_network(drawn(3), path)
     with np.load(path) as file:
@@ -171,7 +169,7 @@ def test_a_file_that_is_no_network_is_refused(
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 nothing", b"not a network", b"(1700000000.0) can0 123#00"])
-def test_a_broken_file_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_damaged_network_file_is_rejected(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "network.npz"
     path.write_bytes(content)
     with pytest.raises(NetworkError, match=re.escape(f"{path} is no gait network: ") + ".*`atalante gait fit`$"):
@@ -180,7 +178,7 @@ def test_a_broken_file_is_refused(tmp_path: Path, content: bytes) -> None:
         load_network(tmp_path / "nowhere.npz")
 
 
-def test_a_network_that_could_not_be_read_is_not_written(tmp_path: Path) -> None:
+def test_invalid_network_is_not_saved(tmp_path: Path) -> None:
     network = drawn(4)
     endless = replace(
         network, layers=(*network.layers[:-1], Layer(network.layers[-1].weights, np.full(OUTPUTS, np.inf)))
@@ -190,7 +188,7 @@ def test_a_network_that_could_not_be_read_is_not_written(tmp_path: Path) -> None
     assert not list(tmp_path.iterdir())
 
 
-def test_a_damaged_network_of_the_package_asks_for_its_installation(
+def test_damaged_network_of_the_package_asks_for_reinstallation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "network.npz"
@@ -202,7 +200,7 @@ def test_a_damaged_network_of_the_package_asks_for_its_installation(
         load_network()
 
 
-def test_walking_needs_none_of_the_training_stack() -> None:
+def test_network_loads_without_the_training_dependencies() -> None:
     program = (
         "import sys; from atalante_control.dynamics.gait_network import load_network; load_network(); "
         "print([m for m in ('casadi', 'joblib', 'sklearn', 'scipy') if m in sys.modules])"
@@ -211,7 +209,7 @@ def test_walking_needs_none_of_the_training_stack() -> None:
     assert ast.literal_eval(done.stdout) == []
 
 
-def test_the_other_leg_s_step_is_the_mirror_image() -> None:
+def test_gait_mirrored_twice_is_unchanged() -> None:
     gait = SHIPPED.gait(subject(random_inputs(SHIPPED, 1)[0]), ROBOT)
     twice: Gait = gait.mirrored().mirrored()
     np.testing.assert_array_equal(twice.coefficients, gait.coefficients)

@@ -1,4 +1,4 @@
-"""The fit and the report on it, with a family of gaits drawn by arithmetic: smooth, periodic, and known everywhere."""
+"""Tests of the fit of the gait network and its check, on synthetic gaits that are known for every subject."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ AIRWALK = load_gait(AIRWALK_GAIT, ROBOT)
 GRID = Grid((58.0, 75.0, 91.0), (1.62, 1.78, 1.93), (0.1, 0.15, 0.2), (0.8, 0.95, 1.1))
 LOW, HIGH = (np.array([axis[end] for axis in GRID.axes()]) for end in (0, -1))
 _, _, _RIGHT = np.linalg.svd(periodicity())
-#: Directions in which the drawn gaits differ, periodic ones.
-WAYS = np.random.default_rng(8).normal(size=(5, 72)) @ _RIGHT[24:] * 0.004
+#: Periodic directions in which the synthetic gaits differ.
+DIRECTIONS = np.random.default_rng(8).normal(size=(5, 72)) @ _RIGHT[24:] * 0.004
 
 
-def drawn(subject: Subject) -> SolvedGait:
+def synthetic(subject: Subject) -> SolvedGait:
     mass, height, length, duration = (2.0 * (inputs_of(subject) - LOW) / (HIGH - LOW) - 1.0).tolist()
     share = np.array([mass, height + 0.3 * height * length, length, duration + 0.2 * mass**2, math.sin(duration)])
-    coefficients = AIRWALK.coefficients + (share @ WAYS).reshape(12, 8)
+    coefficients = AIRWALK.coefficients + (share @ DIRECTIONS).reshape(12, 8)
     feedforward = stance_dynamics(ROBOT, subject.patient).feedforward(coefficients, subject.step_duration)
     gait = Gait(
         str(subject), subject.step_duration, coefficients, feedforward * 0.1, subject.parameters(), {"status": SOLVED}
@@ -53,20 +53,20 @@ def inputs_of(subject: Subject) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def gaits() -> list[Gait]:
-    return [drawn(GRID.subject(index)).gait for index in GRID.points()]
+    return [synthetic(GRID.subject(index)).gait for index in GRID.points()]
 
 
-def test_the_fit_knows_gaits_it_never_saw(gaits: list[Gait]) -> None:
+def test_fit_generalizes_to_subjects_off_the_grid(gaits: list[Gait]) -> None:
     fitted = fit(gaits, GRID, hidden=(16,), iterations=1500)
-    assert fitted.directions <= len(WAYS) + 1
+    assert fitted.directions <= len(DIRECTIONS) + 1
     assert np.degrees(fitted.rms) < 0.01
     assert fitted.worst >= fitted.rms
     for subject in random_subjects(LOW, HIGH, 30, seed=1):
-        error = fitted.network.coefficients(inputs_of(subject)) - drawn(subject).gait.coefficients
+        error = fitted.network.coefficients(inputs_of(subject)) - synthetic(subject).gait.coefficients
         assert np.degrees(np.abs(error).max()) < 0.2
 
 
-def test_the_same_library_gives_the_same_network_whatever_its_order(gaits: list[Gait]) -> None:
+def test_same_library_gives_the_same_network(gaits: list[Gait]) -> None:
     first = fit(gaits, GRID, hidden=(6,), iterations=40).network
     again = fit(gaits, GRID, hidden=(6,), iterations=40).network
     for one, other in zip(first.layers, again.layers, strict=True):
@@ -76,14 +76,14 @@ def test_the_same_library_gives_the_same_network_whatever_its_order(gaits: list[
     np.testing.assert_array_equal(first.high, HIGH)
 
 
-def test_what_a_gait_tells_of_its_subject() -> None:
-    gait = drawn(Subject(Patient(70.0, 1.7), 0.12, 0.9)).gait
+def test_inputs_are_the_parameters_of_the_subject() -> None:
+    gait = synthetic(Subject(Patient(70.0, 1.7), 0.12, 0.9)).gait
     np.testing.assert_array_equal(inputs(gait), [70.0, 1.7, 0.12, 0.9])
 
 
-def test_a_gait_does_not_deviate_from_itself() -> None:
+def test_deviation_of_a_gait_from_itself_is_zero() -> None:
     subject = Subject(Patient(70.0, 1.7), 0.12, 0.9)
-    gait = drawn(subject).gait
+    gait = synthetic(subject).gait
     found = deviation(subject, gait, gait, ROBOT)
     assert found.angles.shape == (901, 12)
     assert not found.angles.any()
@@ -93,22 +93,22 @@ def test_a_gait_does_not_deviate_from_itself() -> None:
     assert found.within_limits
 
 
-def test_a_deviation_is_what_was_put_in() -> None:
-    """A bent swing ankle lands turned by as much; a bent knee lands elsewhere."""
+def test_deviation_equals_the_applied_change() -> None:
+    """A change of the swing ankle turns the landing foot; a change of the knee also moves it."""
     subject = Subject(Patient(70.0, 1.7), 0.12, 0.9)
-    gait = drawn(subject).gait
-    for joint, turned, moved in ((4, 0.01, 0.0), (3, 0.01, 0.01 * subject.patient.length("shank"))):
+    gait = synthetic(subject).gait
+    for joint, attitude, position in ((4, 0.01, 0.0), (3, 0.01, 0.01 * subject.patient.length("shank"))):
         bent = gait.coefficients.copy()
         bent[joint] += 0.01
         found = deviation(subject, replace(gait, coefficients=bent), gait, ROBOT)
         assert found.angles.max() == pytest.approx(0.01)
-        assert found.landing_attitude == pytest.approx(turned, rel=1e-6)
-        assert found.landing_position == pytest.approx(moved, rel=0.1, abs=1e-12)
+        assert found.landing_attitude == pytest.approx(attitude, rel=1e-6)
+        assert found.landing_position == pytest.approx(position, rel=0.1, abs=1e-12)
         assert found.position_defect == pytest.approx(0.01, rel=1e-6)
     assert not deviation(subject, replace(gait, coefficients=gait.coefficients + 0.5), gait, ROBOT).within_limits
 
 
-def test_findings_are_the_worst_of_all_in_degrees_and_millimetres() -> None:
+def test_findings_are_the_largest_deviations_in_degrees_and_millimetres() -> None:
     good = Deviation(np.zeros((100, 12)), 0.0, 0.0, 0.0, 0.0, 0.0, True)
     bad = Deviation(
         np.full((100, 12), math.radians(2.0)), 0.004, math.radians(0.4), math.radians(0.2), 0.03, 0.06, False
@@ -119,7 +119,7 @@ def test_findings_are_the_worst_of_all_in_degrees_and_millimetres() -> None:
     assert [finding.value for finding in found] == pytest.approx([2.0, 2.0, 4.0, 0.4, 0.2, 0.03, 6.0, 1.0])
 
 
-def test_subjects_are_off_the_grid_and_the_same_for_a_seed() -> None:
+def test_random_subjects_are_off_the_grid_and_repeatable() -> None:
     subjects = list(random_subjects(LOW, HIGH, 20, seed=3))
     assert subjects == list(random_subjects(LOW, HIGH, 20, seed=3))
     assert all(subject.patient.mass not in GRID.mass for subject in subjects)
@@ -139,14 +139,14 @@ SMALL = (
 
 
 class TestCommand:
-    """`atalante gait library`, `fit` and `check`, one after the other."""
+    """Tests of `atalante gait library`, `fit` and `check`."""
 
     @staticmethod
     def run(*arguments: str) -> Any:
         return CliRunner().invoke(cli, ["gait", *arguments])
 
     def test_from_library_to_report(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
-        monkeypatch.setattr(library_module, "solve_subject", drawn)
+        monkeypatch.setattr(library_module, "solve_subject", synthetic)
         monkeypatch.setattr(fit_module, "fit", partial(fit, hidden=(8,), iterations=800))
         folder, file = tmp_path / "library", tmp_path / "network.npz"
         levels = [
@@ -158,18 +158,18 @@ class TestCommand:
         assert len(made.stdout.splitlines()) == 81
         assert "81 of 81 gaits solved" in made.stderr
         again = self.run("library", "--out", str(folder), *levels)
-        assert "81 of them solved before" in again.stderr
+        assert "81 of them already solved" in again.stderr
         fitted = self.run("fit", "--library", str(folder), "--out", str(file), "--json")
         assert fitted.exit_code == 0, fitted.output
         assert load_network(file).low.tolist() == LOW.tolist()
         checked = self.run("check", "--network", str(file), "--count", "5")
-        # The drawn gaits are of the air: their feedforward is scaled, and what the ground asks for is beyond the drives.
+        # The synthetic gaits ignore the ground: their feedforward is scaled, and the true one exceeds the torque limits.
         assert checked.exit_code == 1
         assert [line.split()[-1] for line in checked.stdout.splitlines()[1:]] == ["ok"] * 6 + ["FAIL"] * 2
 
-    def test_failures_are_listed_and_end_in_1(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    def test_failures_are_listed_and_exit_with_1(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
         def fails(subject: Subject) -> SolvedGait:
-            done = drawn(subject)
+            done = synthetic(subject)
             return replace(done, status="the swing clearance cannot hold") if subject.step_length == 0.2 else done
 
         monkeypatch.setattr(library_module, "solve_subject", fails)
@@ -180,24 +180,24 @@ class TestCommand:
         assert len(Library(tmp_path).failures()) == 27
 
     @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-    def test_an_interrupted_library_says_how_far_it_is_and_goes_on(
+    def test_interrupted_library_reports_its_progress_and_resumes(
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: Any, number: int, code: int
     ) -> None:
         def signalled(subject: Subject) -> SolvedGait:
-            """As CasADi: what is raised meanwhile is a gait that failed."""
+            """Turn an exception into a failed gait, as CasADi does."""
             try:
                 os.kill(os.getpid(), number)
             except (KeyboardInterrupt, SystemExit):
-                return replace(drawn(subject), status="the impact map cannot hold")
-            return drawn(subject)
+                return replace(synthetic(subject), status="the impact map cannot hold")
+            return synthetic(subject)
 
         monkeypatch.setattr(library_module, "solve_subject", signalled)
         small = ("library", "--out", str(tmp_path), *SMALL)
         result = self.run(*small)
         assert result.exit_code == code
-        assert result.stderr.splitlines()[-1] == "interrupted, 1 of 81 gaits solved; the same command goes on"
+        assert result.stderr.splitlines()[-1] == "interrupted, 1 of 81 gaits solved; repeat the command to resume"
         assert Library(tmp_path).failures() == {}
-        monkeypatch.setattr(library_module, "solve_subject", drawn)
+        monkeypatch.setattr(library_module, "solve_subject", synthetic)
         assert self.run(*small).exit_code == 0
         assert len(list(tmp_path.glob("gaits/*.json"))) == 81
 
@@ -205,12 +205,15 @@ class TestCommand:
         ("arguments", "sentence"),
         [
             (["library", "--out", "x", "--mass", "60,70"], "mass has at least 3 levels that rise"),
-            (["library", "--out", "x", "--mass", "60,a"], "'60,a' is no list of levels"),
+            (
+                ["library", "--out", "x", "--mass", "60,a"],
+                "levels must be numbers separated by commas (58,75,91), got '60,a'",
+            ),
             (["fit", "--library", "nowhere", "--out", "x.npz"], "nowhere holds no library"),
             (["check", "--network", "nowhere.npz"], "nowhere.npz"),
         ],
     )
-    def test_bad_input_is_one_sentence(
+    def test_invalid_input_gives_one_sentence(
         self, arguments: list[str], sentence: str, tmp_path: Any, monkeypatch: Any
     ) -> None:
         monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""The library: resuming, failures, processes; gaits drawn by arithmetic instead of an optimiser."""
+"""Tests of the gait library: resuming, failures, processes. Synthetic gaits replace the optimiser."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ POINTS = math.prod(GRID.shape)
 WHY = "no such gait: the speed of the swing knee cannot hold"
 
 
-def drawn(subject: Subject) -> SolvedGait:
-    """A gait that depends on its subject."""
+def synthetic(subject: Subject) -> SolvedGait:
+    """Return a synthetic gait that depends on its subject."""
     share = 1.0 + 0.01 * (subject.step_length - 0.15)
     made = {"status": SOLVED}
     gait = Gait(str(subject), subject.step_duration, AIRWALK.coefficients * share, None, subject.parameters(), made)
     return SolvedGait(gait, SOLVED, 1e-9, 0.01, 10)
 
 
-def stubborn(subject: Subject) -> SolvedGait:
-    """Tall people in a hurry cannot do it."""
-    done = drawn(subject)
+def failing(subject: Subject) -> SolvedGait:
+    """Return a failure for tall patients with a short step duration."""
+    done = synthetic(subject)
     if subject.patient.height > 1.75 and subject.step_duration < 0.75:
         return replace(done, status=WHY)
     return done
@@ -44,9 +44,9 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*.json")}
 
 
-def test_every_gait_is_on_the_disk_with_its_parameters_and_record(tmp_path: Path) -> None:
+def test_every_gait_file_has_parameters_and_solver_record(tmp_path: Path) -> None:
     library = Library(tmp_path, GRID)
-    outcomes = list(library.generate(drawn))
+    outcomes = list(library.generate(synthetic))
     assert len(outcomes) == POINTS
     assert all(solved.gait.parameters == subject.parameters() for subject, solved in outcomes)
     assert not library.missing()
@@ -57,41 +57,41 @@ def test_every_gait_is_on_the_disk_with_its_parameters_and_record(tmp_path: Path
         assert gait.solver == {"status": SOLVED}
 
 
-def test_interrupted_and_resumed_gives_the_same_files(tmp_path: Path) -> None:
+def test_interrupted_and_resumed_run_gives_the_same_files(tmp_path: Path) -> None:
     once, twice = tmp_path / "once", tmp_path / "twice"
-    for _ in Library(once, GRID).generate(drawn):
+    for _ in Library(once, GRID).generate(synthetic):
         pass
-    interrupted = Library(twice, GRID).generate(drawn)
+    interrupted = Library(twice, GRID).generate(synthetic)
     for _ in range(POINTS // 3):
         next(interrupted)
     interrupted.close()
     assert len(Library(twice).missing()) == POINTS - POINTS // 3
-    assert len(list(Library(twice, GRID).generate(drawn))) == POINTS - POINTS // 3
+    assert len(list(Library(twice, GRID).generate(synthetic))) == POINTS - POINTS // 3
     assert files(once) == files(twice)
 
 
-def test_processes_give_the_same_files(tmp_path: Path) -> None:
-    for _ in Library(tmp_path / "one", GRID).generate(drawn):
+def test_two_processes_give_the_same_files(tmp_path: Path) -> None:
+    for _ in Library(tmp_path / "one", GRID).generate(synthetic):
         pass
-    for _ in Library(tmp_path / "two", GRID).generate(drawn, jobs=2):
+    for _ in Library(tmp_path / "two", GRID).generate(synthetic, jobs=2):
         pass
     assert files(tmp_path / "one") == files(tmp_path / "two")
 
 
-def test_failures_are_told_listed_and_tried_again(tmp_path: Path) -> None:
+def test_failures_are_listed_and_retried(tmp_path: Path) -> None:
     library = Library(tmp_path, GRID)
-    failed = {str(subject) for subject, solved in library.generate(stubborn) if not solved.solved}
+    failed = {str(subject) for subject, solved in library.generate(failing) if not solved.solved}
     assert len(failed) == 3 * 2 * 3
     failures = Library(tmp_path).failures()
     assert set(failures.values()) == {WHY}
     assert {str(GRID.subject(index)) for index in failures} == failed
     assert set(library.missing()) == set(failures)
-    assert len(list(library.generate(drawn))) == len(failures)
+    assert len(list(library.generate(synthetic))) == len(failures)
     assert not library.failures()
     assert not library.missing()
 
 
-def test_a_defect_of_the_solver_is_no_failure_of_a_gait(tmp_path: Path) -> None:
+def test_exception_in_the_solver_is_raised(tmp_path: Path) -> None:
     def broken(subject: Subject) -> SolvedGait:
         raise ZeroDivisionError(str(subject))
 
@@ -100,7 +100,7 @@ def test_a_defect_of_the_solver_is_no_failure_of_a_gait(tmp_path: Path) -> None:
     assert not Library(tmp_path).failures()
 
 
-def test_a_folder_keeps_its_grid(tmp_path: Path) -> None:
+def test_folder_keeps_its_grid(tmp_path: Path) -> None:
     Library(tmp_path, GRID)
     assert Library(tmp_path).grid == GRID
     with pytest.raises(LibraryError, match="holds a library over another grid"):
@@ -119,7 +119,7 @@ def test_a_folder_keeps_its_grid(tmp_path: Path) -> None:
         json.dumps({"format": "atalante-library/1", "weight": [50, 60, 70]}),
     ],
 )
-def test_a_grid_file_that_is_none_is_refused(tmp_path: Path, content: str) -> None:
+def test_invalid_grid_file_is_rejected(tmp_path: Path, content: str) -> None:
     (tmp_path / "grid.json").write_text(content)
     with pytest.raises(LibraryError, match=r"grid\.json"):
         Library(tmp_path)
@@ -134,12 +134,12 @@ def test_a_grid_file_that_is_none_is_refused(tmp_path: Path, content: str) -> No
         ({"step_length": (0.1, 0.2, 0.5)}, "a step length is from 0.05 to 0.4 m, not 0.5 m"),
     ],
 )
-def test_a_grid_that_makes_no_sense_is_refused(levels: dict[str, tuple[float, ...]], sentence: str) -> None:
+def test_invalid_grid_is_rejected(levels: dict[str, tuple[float, ...]], sentence: str) -> None:
     with pytest.raises(ValueError, match=f"^{sentence}"):
         Grid(**levels)
 
 
-def test_the_default_grid_encloses_the_paper_s_subjects() -> None:
+def test_default_grid_covers_the_subjects_of_the_paper() -> None:
     grid = Grid()
     assert min(grid.shape) >= 3
     assert (grid.mass[0], grid.mass[-1]) == (58.0, 91.0)
@@ -147,18 +147,18 @@ def test_the_default_grid_encloses_the_paper_s_subjects() -> None:
     np.testing.assert_allclose(grid.subject((0, 0, 0, 0)).patient.length("thigh"), 0.245 * 1.62)
 
 
-def test_what_pinocchio_does_not_agree_with_is_no_gait(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A gait drawn for the air asks the ground for what it cannot give."""
-    monkeypatch.setattr(library_module, "solve", lambda subject, machine_code=False: drawn(subject))
+def test_gait_that_fails_verification_is_not_solved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The synthetic gait ignores the ground, so Pinocchio rejects it."""
+    monkeypatch.setattr(library_module, "solve", lambda subject, machine_code=False: synthetic(subject))
     subject = GRID.subject((1, 1, 1, 1))
     for solve in (library_module.solve_subject, library_module.solve_compiled):
-        judged = solve(subject)
-        assert not judged.solved
-        assert judged.status.startswith(f"{subject}: ")
-        assert " when verified, over " in judged.status
+        outcome = solve(subject)
+        assert not outcome.solved
+        assert outcome.status.startswith(f"{subject}: ")
+        assert " when verified, over " in outcome.status
 
 
-def test_what_failed_is_not_verified() -> None:
+def test_failed_gait_is_not_verified() -> None:
     subject = GRID.subject((0, 3, 0, 0))
-    failed = stubborn(subject)
+    failed = failing(subject)
     assert library_module.verified(subject, failed) is failed

@@ -1,4 +1,4 @@
-"""`atalante bench`: the shape of what it says, and that a benchmark without work is an error. No figure is judged here."""
+"""Tests of `atalante bench`: output format, and the error for a benchmark without work. No time is asserted."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from atalante_tools.bench.measure import Effort, Measurement, WorkError, require
 from atalante_tools.cli import cli
 
 KEYS = ["name", "value", "unit", "baseline", "baseline_value", "ratio"]
-#: What is asked for, by name.
+#: Target ratio of each benchmark.
 TARGETS = {
     "hal_cycle": 1 / 7,
     "decode_cycle": 8.0,
@@ -42,14 +42,14 @@ def lines() -> dict[str, dict[str, Any]]:
     return {line["name"]: line for line in map(json.loads, result.stdout.splitlines())}
 
 
-def test_one_line_each_in_order(lines: dict[str, dict[str, Any]]) -> None:
+def test_json_has_one_line_per_benchmark_in_order(lines: dict[str, dict[str, Any]]) -> None:
     names = [benchmark.name for benchmark in BENCHMARKS]
     assert list(lines) == names
     assert len(set(names)) == len(names)
 
 
 @pytest.mark.parametrize("benchmark", BENCHMARKS, ids=lambda b: b.name)
-def test_a_line_has_the_keys_scripts_rely_on(benchmark: Benchmark, lines: dict[str, dict[str, Any]]) -> None:
+def test_json_line_has_the_documented_keys(benchmark: Benchmark, lines: dict[str, dict[str, Any]]) -> None:
     line = lines[benchmark.name]
     assert list(line) == KEYS
     assert (line["unit"], line["baseline"]) == (benchmark.unit, benchmark.baseline)
@@ -59,11 +59,11 @@ def test_a_line_has_the_keys_scripts_rely_on(benchmark: Benchmark, lines: dict[s
     assert line["ratio"] == pytest.approx(line["value"] / line["baseline_value"], rel=1e-12)
 
 
-def test_targets_are_those_of_the_issue() -> None:
+def test_targets_have_the_specified_values() -> None:
     assert {b.name: b.target for b in BENCHMARKS if b.target is not None} == TARGETS
 
 
-def test_chosen_benchmarks_as_a_table() -> None:
+def test_selected_benchmarks_are_printed_as_a_table() -> None:
     result = CliRunner().invoke(cli, ["bench", "--quick", "ring_write", "E2E_CHECK"])
     assert result.exit_code == 0
     head, *rows = result.stdout.splitlines()
@@ -73,20 +73,20 @@ def test_chosen_benchmarks_as_a_table() -> None:
     assert "ring_write (1 of 2)" in result.stderr
 
 
-def test_an_unknown_name_is_a_usage_error_that_lists_the_names() -> None:
+def test_unknown_name_is_a_usage_error_that_lists_the_names() -> None:
     result = CliRunner().invoke(cli, ["bench", "hal_cykle"])
     assert result.exit_code == 2
     assert "hal_cycle" in result.stderr
     assert "start_up" in result.stderr
 
 
-def test_a_missed_target_is_shown_and_is_no_failure() -> None:
+def test_missed_target_is_shown_in_the_table() -> None:
     benchmark = replace(BENCHMARKS[0], target=0.5)
     assert "MISSED" in bench.row(benchmark, Measurement(0.6, 1.0))
     assert "met" in bench.row(benchmark, Measurement(0.5, 1.0))
 
 
-def test_without_a_compiler_nothing_looks_like_a_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_compiler_the_values_are_null(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(wire, "available", lambda: False)
     result = CliRunner().invoke(cli, ["bench", "--quick", "--json", "decode_cycle"])
     assert result.exit_code == 0
@@ -106,14 +106,14 @@ def idle(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("idle")
-def test_a_benchmark_that_did_no_work_fails() -> None:
+def test_benchmark_without_work_exits_with_1() -> None:
     result = CliRunner().invoke(cli, ["bench", "hal_cycle"])
     assert result.exit_code == 1
     assert "hal_cycle did not do its work: nothing was done" in result.stderr
     assert result.stdout == ""
 
 
-def test_blocks_alternate_and_medians_are_taken() -> None:
+def test_blocks_alternate_and_the_medians_are_returned() -> None:
     order: list[str] = []
     figures = {"a": iter([9.0, 1.0, 2.0, 50.0, 3.0, 4.0]), "b": iter([9.0, 10.0, 10.0, 10.0, 99.0, 10.0])}
 
@@ -126,13 +126,13 @@ def test_blocks_alternate_and_medians_are_taken() -> None:
     assert (measured.value, measured.baseline, measured.ratio) == (3.0, 10.0, 0.3)
 
 
-def test_a_timed_block_runs_as_often_as_it_says() -> None:
+def test_timed_block_runs_the_given_number_of_times() -> None:
     ran: list[int] = []
     assert timed(lambda: ran.append(1), 7)() >= 0.0
     assert len(ran) == 7
 
 
-def test_require_names_what_did_not_hold() -> None:
+def test_require_raises_its_message() -> None:
     require(True, "fine")
     with pytest.raises(WorkError, match="the robot fell"):
         require(False, "the robot fell")

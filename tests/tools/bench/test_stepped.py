@@ -1,4 +1,4 @@
-"""Step-by-step rollouts: the guide's rollouts, marched."""
+"""Tests of the step-by-step rollouts against the exact flow of the guide filter."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ STEPPED = SteppedRollouts(GUIDE)
 
 @given(st.integers(0, 800), *[st.floats(-0.1, 0.1), st.floats(-3.0, 3.0)] * 2)
 @settings(max_examples=40)
-def test_marching_and_the_exact_flow_agree(cycle: int, e1: float, ed1: float, e2: float, ed2: float):
-    marched = STEPPED.rollouts(cycle, e1, ed1, e2, ed2)
-    np.testing.assert_allclose(marched, GUIDE.rollouts(cycle, e1, ed1, e2, ed2), atol=1e-12)
+def test_integration_agrees_with_the_exact_flow(cycle: int, e1: float, ed1: float, e2: float, ed2: float):
+    integrated = STEPPED.rollouts(cycle, e1, ed1, e2, ed2)
+    np.testing.assert_allclose(integrated, GUIDE.rollouts(cycle, e1, ed1, e2, ed2), atol=1e-12)
 
 
-def test_follows_the_guide_into_a_new_step():
+def test_rollouts_agree_after_a_new_step():
     GUIDE.start_step(0.5, (0.05, -0.02), (0.3, 0.9))
     STEPPED.start_step()
     np.testing.assert_allclose(
@@ -41,7 +41,7 @@ def test_follows_the_guide_into_a_new_step():
 
 
 @pytest.mark.parametrize("points", [13, 50, 160, 800])
-def test_agree_on_any_grid(points: int):
+def test_rollouts_agree_on_any_grid(points: int):
     config = GuideConfig(CONFIG.policies, CONFIG.disturbance, points=points)
     guide = GuideFilter(config, CONSTANT, GUIDE.deadbeat, GAIT.coefficients[2:4], GAIT.mirrored().coefficients[2:4])
     for cycle in (0, 7, 400):

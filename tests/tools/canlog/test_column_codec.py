@@ -215,7 +215,7 @@ def test_unsupported_message_does_not_affect_the_others(tmp_path: Path) -> None:
     found = catalogue(path)
     assert [layout.name for layout in found.layouts] == ["Good"]
     assert [refused.name for refused in found.refused] == ["Bad"]
-    with pytest.raises(KeyError, match="there are Good"):
+    with pytest.raises(KeyError, match="message must be one of Good"):
         found.layout("Ugly")
 
 

@@ -1,4 +1,4 @@
-"""A desk with one emulated node on it, whose frames and insides a test can spoil."""
+"""Node tester with one emulated node; tests can change the frames and the internals of the node."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from atalante_emulator.pendant import Operator
 from atalante_hal.bus.pair import PairBus, lockstep_pair
 from atalante_hal.robot import Robot
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, Frames, joined, new_frames
-from atalante_tools.conform.bench import Bench, Limits, LockStep
+from atalante_tools.conform.bench import Limits, LockStep, NodeTester
 from atalante_tools.conform.examination import requirements_of
 from atalante_tools.conform.requirement import Result, Verdict, examine
 from atalante_tools.conform.technician import EmulatorTechnician
@@ -26,14 +26,14 @@ NO_FRAME = new_frames(0)
 
 
 class Wire:
-    """The bench's end of the pair; `to_node` and `from_node` take a frame and return the frames that arrive."""
+    """Bus of the node tester. `to_node` and `from_node` replace each frame on its way by zero or more frames."""
 
     def __init__(self, bus: PairBus) -> None:
         self._bus = bus
         self.to_node: Callable[[Frames], Frames] | None = None
         self.from_node: Callable[[Frames], Frames] | None = None
-        #: Frames the node says besides, asked at every receive.
-        self.out_of_the_blue: Callable[[], Frames] = lambda: NO_FRAME
+        #: Function that returns additional frames of the node; called at every receive.
+        self.unsolicited: Callable[[], Frames] = lambda: NO_FRAME
         self.sync_sent = False  # since the last receive
         self._syncs = range(0x10, 0x14)
 
@@ -45,16 +45,16 @@ class Wire:
         if self.to_node is None:
             self._bus.send(frames)
             return
-        for place in range(len(frames)):
-            kept = self.to_node(frames[place : place + 1].copy())
+        for row in range(len(frames)):
+            kept = self.to_node(frames[row : row + 1].copy())
             if len(kept):
                 self._bus.send(kept)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
         count = self._bus.receive(frames, timeout)
         if self.from_node is not None:
-            kept = [self.from_node(frames[place : place + 1].copy()) for place in range(count)]
-            together = joined([*kept, self.out_of_the_blue()])
+            kept = [self.from_node(frames[row : row + 1].copy()) for row in range(count)]
+            together = joined([*kept, self.unsolicited()])
             count = len(together)
             frames[:count] = together
         self.sync_sent = False
@@ -62,38 +62,38 @@ class Wire:
 
 
 def protect(frame: Frames, message: Message, *, counter: int | None = None, data_id: int | None = None) -> Frames:
-    """Make length, format, counter and CRC of a frame right again. Independent of the code under test."""
+    """Write valid length, format, counter and CRC into a frame. Independent of the code under test."""
     frame["len"], frame["flags"] = message.length, FLAG_FDF | FLAG_BRS
     data = frame["data"][0]
     data[message.length :] = 0
     if counter is not None:
         data[2] = counter & 0xFF
-    secret = message.data_id if data_id is None else data_id
-    code = crc_hqx(secret.to_bytes(2, "little"), crc_hqx(data[2 : message.length].tobytes(), 0xFFFF))
+    protected_id = message.data_id if data_id is None else data_id
+    code = crc_hqx(protected_id.to_bytes(2, "little"), crc_hqx(data[2 : message.length].tobytes(), 0xFFFF))
     data[:2] = code & 0xFF, code >> 8
     return frame
 
 
 def crc_holds(frame: Frames, data_id: int) -> bool:
-    """Whether a frame is intact, at the length it has."""
+    """Return whether the CRC of a frame is valid for its own length."""
     data = frame["data"][0][: frame["len"][0]].tobytes()
     return crc_hqx(data_id.to_bytes(2, "little"), crc_hqx(data[2:], 0xFFFF)) == int.from_bytes(data[:2], "little")
 
 
 def is_good(frame: Frames, message: Message) -> bool:
-    """Whether length, format and CRC are right."""
+    """Return whether length, format and CRC of a frame are valid."""
     shape = int(frame["len"][0]), int(frame["flags"][0]) & FLAG_FDF
     return shape == (message.length, FLAG_FDF) and crc_holds(frame, message.data_id)
 
 
 def raw(frame: Frames, message: Message, signal: str) -> int:
-    """Code of a signal in a frame."""
+    """Return the raw code of a signal in a frame."""
     s = message.signal(signal)
     return int.from_bytes(frame["data"][0].tobytes(), "little") >> s.start & (1 << s.length) - 1
 
 
 def put(frame: Frames, message: Message, signal: str, code: int) -> None:
-    """Write the code of a signal into a frame."""
+    """Write the raw code of a signal into a frame."""
     s = message.signal(signal)
     payload = int.from_bytes(frame["data"][0].tobytes(), "little")
     payload = payload & ~((1 << s.length) - 1 << s.start) | code << s.start
@@ -101,26 +101,26 @@ def put(frame: Frames, message: Message, signal: str, code: int) -> None:
 
 
 @dataclass
-class Desk:
-    """One node, and the bench it is examined on."""
+class NodeSetup:
+    """One emulated node with its tester and bus."""
 
-    bench: Bench
+    tester: NodeTester
     wire: Wire
     emulator: Emulator
 
     def message(self, kind: str) -> Message:
-        return self.bench.network.message(f"{self.bench.node.name}_{kind}")
+        return self.tester.network.message(f"{self.tester.node.name}_{kind}")
 
     def examine(self, without: Sequence[str] = ()) -> list[Result]:
-        return list(examine(self.bench, [r for r in requirements_of(self.bench) if r.id not in without]))
+        return list(examine(self.tester, [r for r in requirements_of(self.tester) if r.id not in without]))
 
 
-#: Takes a frame of the HAL for another: `(frame, message, memory)`; None: as it is. `memory["other"]` is another Data ID.
+#: Function `(frame, message, memory)` that replaces a frame of the HAL; None: unchanged. `memory["other"]`: another Data ID.
 Reading = Callable[[Frames, Message, dict], Frames | None]
 
 
-def hear_as(desk: Desk, message: Message, other_data_id: int, change: Reading) -> Desk:
-    """Let the node on the desk read one message of the HAL as another."""
+def receive_as(setup: NodeSetup, message: Message, other_data_id: int, change: Reading) -> NodeSetup:
+    """Replace every frame of one message on its way to the node by the result of `change`."""
     memory: dict = {"other": other_data_id}
 
     def to_node(frame: Frames) -> Frames:
@@ -129,24 +129,24 @@ def hear_as(desk: Desk, message: Message, other_data_id: int, change: Reading) -
         changed = change(frame.copy(), message, memory)
         return frame if changed is None else changed
 
-    desk.wire.to_node = to_node
-    return desk
+    setup.wire.to_node = to_node
+    return setup
 
 
 def no_crc(frame: Frames, message: Message, memory: dict) -> Frames | None:
-    """Take damaged frames for good ones."""
+    """Accept frames with a wrong CRC."""
     if crc_holds(frame, message.data_id) or crc_holds(frame, memory["other"]):
         return None
     return protect(frame, message)
 
 
 def no_data_id(frame: Frames, message: Message, memory: dict) -> Frames | None:
-    """Take another message's frames for its own."""
+    """Accept frames with the Data ID of another message."""
     return protect(frame, message) if crc_holds(frame, memory["other"]) else None
 
 
 def no_repetition(frame: Frames, message: Message, memory: dict) -> Frames | None:
-    """Take a repeated frame for a new one."""
+    """Accept frames with a repeated counter."""
     if not is_good(frame, message):
         return None
     counter = int(frame["data"][0][2])
@@ -156,21 +156,21 @@ def no_repetition(frame: Frames, message: Message, memory: dict) -> Frames | Non
 
 
 def no_length(frame: Frames, message: Message, _: dict) -> Frames | None:
-    """Take a frame of another length or format for one of its own."""
+    """Accept frames of another length or format."""
     shape = int(frame["len"][0]), int(frame["flags"][0]) & FLAG_FDF
     return None if shape == (message.length, FLAG_FDF) else protect(frame, message)
 
 
 def not_passed(results: list[Result]) -> dict[str, Verdict]:
-    """Id -> verdict of what did not pass."""
+    """Return the verdict of each requirement that did not pass, by id."""
     return {r.requirement.id: r.verdict for r in results if r.verdict is not Verdict.PASSED}
 
 
-MakeDesk = Callable[..., Desk]
+MakeSetup = Callable[..., NodeSetup]
 
 
 @pytest.fixture
-def make_desk(network: Network, robot: Robot, urdf_text: str) -> Iterator[MakeDesk]:
+def make_setup(network: Network, robot: Robot, urdf_text: str) -> Iterator[MakeSetup]:
     bodies: list[PyBulletBody] = []
 
     def make(
@@ -181,7 +181,7 @@ def make_desk(network: Network, robot: Robot, urdf_text: str) -> Iterator[MakeDe
         operator: Operator | None = None,
         limits: Limits | None = None,
         **options: Any,
-    ) -> Desk:
+    ) -> NodeSetup:
         ours, theirs = lockstep_pair()
         body = PyBulletBody(urdf_text)
         bodies.append(body)
@@ -190,8 +190,8 @@ def make_desk(network: Network, robot: Robot, urdf_text: str) -> Iterator[MakeDe
         ours.step = emulator.poll
         wire = Wire(ours)
         technician = EmulatorTechnician(emulator, operator)
-        bench = Bench(network, robot, network.node(node), wire, LockStep(emulator), technician, limits)
-        return Desk(bench, wire, emulator)
+        tester = NodeTester(network, robot, network.node(node), wire, LockStep(emulator), technician, limits)
+        return NodeSetup(tester, wire, emulator)
 
     yield make
     for body in bodies:

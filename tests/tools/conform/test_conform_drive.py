@@ -1,4 +1,4 @@
-"""A drive passes the examination, and each way of being broken is named by its own requirement and no other."""
+"""Tests of the drive requirements: an emulated drive passes, and each defect fails exactly its own requirement."""
 
 from __future__ import annotations
 
@@ -20,10 +20,9 @@ from atalante_tools.conform.requirement import Verdict
 
 from .conftest import (
     NO_FRAME,
-    Desk,
-    MakeDesk,
+    MakeSetup,
+    NodeSetup,
     Reading,
-    hear_as,
     is_good,
     no_crc,
     no_data_id,
@@ -33,31 +32,32 @@ from .conftest import (
     protect,
     put,
     raw,
+    receive_as,
 )
 
 S, C = DriveState, Controlword
 Patch = pytest.MonkeyPatch
 
 NODE = "LEFT_SK"
-SK = 3  # its joint
+SK = 3  # index of its joint
 
 
 @pytest.mark.parametrize("node", ["LEFT_FH", NODE, "RIGHT_HA"])
-def test_an_emulated_drive_passes(node: str, make_desk: MakeDesk):
-    results = make_desk(node).examine()
+def test_emulated_drive_passes_every_requirement(node: str, make_setup: MakeSetup):
+    results = make_setup(node).examine()
     assert not_passed(results) == {}
     assert len(results) == 38
 
 
-def test_the_expected_transitions_cover_every_state_and_command_once():
+def test_expected_transitions_cover_the_standard():
     assert {number for number, _ in LEGAL.values()} == {2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 16}
     assert {goal for _, goal in LEGAL.values()} == set(ROUTES)
 
 
-# -- what the firmware does with CiA 402 -------------------------------------------------------------------------------
+# -- defects of the CiA 402 state machine -----------------------------------------------------------------------------
 
 
-def starts_ready(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+def starts_ready(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
     class Eager(Drives):
         def _states_changed(self) -> None:
             if not hasattr(self, "_begun"):
@@ -66,15 +66,15 @@ def starts_ready(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
             super()._states_changed()
 
     monkeypatch.setattr("atalante_emulator.emulator.Drives", Eager)
-    return make_desk(NODE)
+    return make_setup(NODE)
 
 
-def _with_rule(rule: Callable[[DriveState, int, bool], DriveState]) -> Callable[[MakeDesk, Patch], Desk]:
-    """A drive with another state machine."""
+def _with_rule(rule: Callable[[DriveState, int, bool], DriveState]) -> Callable[[MakeSetup, Patch], NodeSetup]:
+    """Return a drive with another state machine."""
 
-    def broken(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+    def broken(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
         monkeypatch.setattr(emulated, "next_state", lambda state, word, *, latched: rule(state, word, latched))
-        return make_desk(NODE)
+        return make_setup(NODE)
 
     return broken
 
@@ -85,7 +85,7 @@ def _misses_transition_8(state: DriveState, word: int, latched: bool) -> DriveSt
     return next_state(state, word, latched=latched)
 
 
-def _switches_on_at_once(state: DriveState, word: int, latched: bool) -> DriveState:
+def _skips_ready_to_switch_on(state: DriveState, word: int, latched: bool) -> DriveState:
     if (state, word) == (S.SWITCH_ON_DISABLED, C.SWITCH_ON):
         return S.SWITCHED_ON
     return next_state(state, word, latched=latched)
@@ -101,7 +101,7 @@ def _switches_a_fault_off(state: DriveState, word: int, latched: bool) -> DriveS
     return next_state(state, word, latched=latched)
 
 
-def stops_late(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+def stops_late(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
     waited = 0
 
     def rule(state: DriveState, word: int, latched: bool) -> DriveState:
@@ -112,46 +112,46 @@ def stops_late(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
                 return state
         return next_state(state, word, latched=latched)
 
-    return _with_rule(rule)(make_desk, monkeypatch)
+    return _with_rule(rule)(make_setup, monkeypatch)
 
 
 # -- torque ------------------------------------------------------------------------------------------------------------
 
 
-def holds_with_the_wrong_sign(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+def holds_with_the_wrong_sign(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
     del monkeypatch
-    robot = make_desk(NODE).bench.robot
-    return make_desk("RIGHT_HA", their_robot=_replace(robot, hold_kp=-1.5 * robot.hold_kp))
+    robot = make_setup(NODE).tester.robot
+    return make_setup("RIGHT_HA", their_robot=_replace(robot, hold_kp=-1.5 * robot.hold_kp))
 
 
-def makes_torque_when_switched_on(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+def makes_torque_when_switched_on(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
     class Live(Drives):
         def _states_changed(self) -> None:
             super()._states_changed()
             self._is_enabled = self._is_enabled | (self.signals.state == S.SWITCHED_ON)
 
     monkeypatch.setattr("atalante_emulator.emulator.Drives", Live)
-    return make_desk(NODE)
+    return make_setup(NODE)
 
 
 def _replace(robot: Robot, **arrays: np.ndarray) -> Robot:
     return dataclasses.replace(robot, **arrays)
 
 
-def _on_command(change: Reading) -> Callable[[MakeDesk, Patch], Desk]:
-    """A drive that reads its command as if it were another."""
+def _on_command(change: Reading) -> Callable[[MakeSetup, Patch], NodeSetup]:
+    """Return a drive that receives its command changed by `change`."""
 
-    def broken(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+    def broken(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
         del monkeypatch
-        desk = make_desk(NODE)
-        other = desk.bench.network.message("COMMAND_RIGHT_LEG").data_id
-        return hear_as(desk, desk.bench.command.message, other, change)
+        setup = make_setup(NODE)
+        other = setup.tester.network.message("COMMAND_RIGHT_LEG").data_id
+        return receive_as(setup, setup.tester.command.message, other, change)
 
     return broken
 
 
 def _reads(signal: str, read: Callable[[int], int]) -> Reading:
-    """Take another code of a signal of the knee."""
+    """Return a change of the raw code of a knee signal."""
 
     def change(frame: Frames, message: Message, _: dict) -> Frames | None:
         if not is_good(frame, message):
@@ -174,30 +174,30 @@ def _no_sequence(frame: Frames, message: Message, memory: dict) -> Frames | None
     if not is_good(frame, message):
         return None
     counter = int(frame["data"][0][2])
-    said = counter + memory.get("shift", 0) & 0xFF
-    if (said - memory.get("said", said - 1)) & 0xFF > 5:
-        memory["shift"] = (memory["said"] + 1 - counter) & 0xFF
-        said = memory["said"] + 1 & 0xFF
-    memory["said"] = said
-    return protect(frame, message, counter=said)
+    reported = counter + memory.get("shift", 0) & 0xFF
+    if (reported - memory.get("reported", reported - 1)) & 0xFF > 5:
+        memory["shift"] = (memory["reported"] + 1 - counter) & 0xFF
+        reported = memory["reported"] + 1 & 0xFF
+    memory["reported"] = reported
+    return protect(frame, message, counter=reported)
 
 
 # -- watchdogs and emergencies -----------------------------------------------------------------------------------------
 
 
-def _with_watchdog(cycles: int) -> Callable[[MakeDesk, Patch], Desk]:
-    def broken(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+def _with_watchdog(cycles: int) -> Callable[[MakeSetup, Patch], NodeSetup]:
+    def broken(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
         monkeypatch.setattr(emulated, "WATCHDOG", cycles)
-        return make_desk(NODE)
+        return make_setup(NODE)
 
     return broken
 
 
-def _without_emergency(code: int) -> Callable[[MakeDesk, Patch], Desk]:
-    def broken(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+def _without_emergency(code: int) -> Callable[[MakeSetup, Patch], NodeSetup]:
+    def broken(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
         del monkeypatch
-        desk = make_desk(NODE)
-        message, kept_back = desk.message("EMCY"), 0
+        setup = make_setup(NODE)
+        message, kept_back = setup.message("EMCY"), 0
 
         def from_node(frame: Frames) -> Frames:
             nonlocal kept_back
@@ -208,38 +208,38 @@ def _without_emergency(code: int) -> Callable[[MakeDesk, Patch], Desk]:
                 return NO_FRAME
             return protect(frame, message, counter=int(frame["data"][0][2]) - kept_back)
 
-        desk.wire.from_node = from_node
-        return desk
+        setup.wire.from_node = from_node
+        return setup
 
     return broken
 
 
-def ignores_the_loss_of_sync(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
-    desk = make_desk(NODE)
-    monkeypatch.setattr(desk.emulator, "idle", lambda: None)
-    return desk
+def ignores_the_loss_of_sync(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
+    setup = make_setup(NODE)
+    monkeypatch.setattr(setup.emulator, "idle", lambda: None)
+    return setup
 
 
-def never_trips(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+def never_trips(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
     del monkeypatch
-    return make_desk(NODE, parameters=EmulatorParameters(drive=DriveParameters(trip_temperature=1000.0)))
+    return make_setup(NODE, parameters=EmulatorParameters(drive=DriveParameters(trip_temperature=1000.0)))
 
 
 F, N = Verdict.FAILED, Verdict.NOT_TESTED
 
-BROKEN: dict[str, tuple[Callable[[MakeDesk, Patch], Desk], dict[str, Verdict]]] = {
+BROKEN: dict[str, tuple[Callable[[MakeSetup, Patch], NodeSetup], dict[str, Verdict]]] = {
     "starts READY TO SWITCH ON": (starts_ready, {"DRIVE-01": F}),
     "misses transition 8": (_with_rule(_misses_transition_8), {"DRIVE-02": F}),
-    "switches on from SWITCH ON DISABLED": (_with_rule(_switches_on_at_once), {"DRIVE-03": F}),
+    "switches on from SWITCH ON DISABLED": (_with_rule(_skips_ready_to_switch_on), {"DRIVE-03": F}),
     "needs 20 cycles to stop": (stops_late, {"DRIVE-04": F}),
     "holds with the wrong sign": (holds_with_the_wrong_sign, {"DRIVE-05": F}),
     "makes torque when SWITCHED ON": (makes_torque_when_switched_on, {"DRIVE-06": F}),
     "makes torque with the wrong sign": (_on_command(_reads("TargetTorque", _negated)), {"DRIVE-07": F}),
-    "takes MaxTorque for twice as much": (
+    "doubles MaxTorque": (
         _on_command(_reads("MaxTorque", lambda code: code if code == 0xFFFF else min(2 * code, 0xFFFE))),
         {"DRIVE-08": F},
     ),
-    "takes MaxTorque for a signed number": (
+    "reads MaxTorque as signed": (
         _on_command(_reads("MaxTorque", lambda code: 0 if 0x7FFF < code < 0xFFFF else code)),
         {"DRIVE-09": F},
     ),
@@ -247,38 +247,39 @@ BROKEN: dict[str, tuple[Callable[[MakeDesk, Patch], Desk], dict[str, Verdict]]] 
         _on_command(_reads("Controlword", lambda code: code & 0x7F if 0x80 < code < 0xFF else code)),
         {"DRIVE-10": F},
     ),
-    "takes the invalid torque for a number": (
+    "accepts the invalid torque": (
         _on_command(_reads("TargetTorque", lambda code: 0x8001 if code == 0x8000 else code)),
         {"DRIVE-11": F},
     ),
-    "gives up after 4 commands": (_with_watchdog(4), {"DRIVE-12": F}),
-    "waits for 6 commands": (_with_watchdog(6), {"DRIVE-13": F}),
+    "latches after 4 lost commands": (_with_watchdog(4), {"DRIVE-12": F}),
+    "latches after 6 lost commands": (_with_watchdog(6), {"DRIVE-13": F}),
     "enables a latched hold": (_with_rule(_enables_a_latched_hold), {"DRIVE-14": F}),
-    "does not tell the latch": (_without_emergency(0x8250), {"DRIVE-15": F}),
+    "does not report the latch": (_without_emergency(0x8250), {"DRIVE-15": F}),
     "ignores the loss of SYNC": (ignores_the_loss_of_sync, {"DRIVE-16": F}),
     "checks no CRC": (_on_command(no_crc), {"DRIVE-17": F}),
     "checks no Data ID": (_on_command(no_data_id), {"DRIVE-18": F}),
-    "takes repeated commands": (_on_command(no_repetition), {"DRIVE-19": F}),
-    "takes commands out of sequence": (_on_command(_no_sequence), {"DRIVE-20": F}),
-    "takes any length": (_on_command(no_length), {"DRIVE-21": F}),
-    "does not tell the trip": (_without_emergency(0x4310), {"DRIVE-22": F}),
+    "accepts repeated commands": (_on_command(no_repetition), {"DRIVE-19": F}),
+    "accepts commands out of sequence": (_on_command(_no_sequence), {"DRIVE-20": F}),
+    "accepts any length": (_on_command(no_length), {"DRIVE-21": F}),
+    "does not report the trip": (_without_emergency(0x4310), {"DRIVE-22": F}),
     "never trips": (never_trips, {"DRIVE-22": F, "DRIVE-23": N}),
     "switches a fault off without reset": (_with_rule(_switches_a_fault_off), {"DRIVE-23": F}),
 }
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_broken_drive_fails_for_its_own_reason(name: str, make_desk: MakeDesk, monkeypatch: Patch):
+def test_defective_drive_fails_only_its_requirement(name: str, make_setup: MakeSetup, monkeypatch: Patch):
     broken, expected = BROKEN[name]
-    # What a node owes at rest takes long and has tests of its own.
-    desk = broken(make_desk, monkeypatch)
+    # The requirements at rest take long and have their own tests.
+    setup = broken(make_setup, monkeypatch)
     assert (
-        not_passed(desk.examine(without=("NODE-03", "NODE-04", "NODE-07", "NODE-08", "NODE-09", "NODE-10"))) == expected
+        not_passed(setup.examine(without=("NODE-03", "NODE-04", "NODE-07", "NODE-08", "NODE-09", "NODE-10")))
+        == expected
     )
 
 
-def test_every_requirement_of_a_drive_has_a_drive_that_breaks_it(make_desk: MakeDesk):
+def test_every_drive_requirement_has_a_defective_drive(make_setup: MakeSetup):
     from atalante_tools.conform.examination import requirements_of
 
-    ids = {r.id for r in requirements_of(make_desk(NODE).bench) if r.id.startswith("DRIVE-")}
+    ids = {r.id for r in requirements_of(make_setup(NODE).tester) if r.id.startswith("DRIVE-")}
     assert {id for _, expected in BROKEN.values() for id, verdict in expected.items() if verdict is F} == ids

@@ -1,4 +1,4 @@
-"""Every other kind of node passes, and each way of being broken is named by its own requirement and no other."""
+"""Tests of the requirements for the other nodes: each emulated node passes, each defect fails exactly its own requirement."""
 
 from __future__ import annotations
 
@@ -18,10 +18,9 @@ from atalante_tools.conform.requirement import Verdict
 
 from .conftest import (
     NO_FRAME,
-    Desk,
-    MakeDesk,
+    MakeSetup,
+    NodeSetup,
     Reading,
-    hear_as,
     is_good,
     no_crc,
     no_data_id,
@@ -31,32 +30,33 @@ from .conftest import (
     protect,
     put,
     raw,
+    receive_as,
 )
 
 Patch = pytest.MonkeyPatch
-Break = Callable[[MakeDesk, Patch], Desk]
+Break = Callable[[MakeSetup, Patch], NodeSetup]
 
 IMU = "IMU_TORSO"
 KINDS = {IMU: 21, "IMU_LEFT_TIBIA": 21, "FOOT_LEFT": 18, "FOOT_RIGHT": 18, "HAPTICS": 22, "PENDANT": 21}
 
 
 @pytest.mark.parametrize("node", KINDS)
-def test_an_emulated_node_passes(node: str, make_desk: MakeDesk):
-    results = make_desk(node).examine()
+def test_emulated_node_passes_every_requirement(node: str, make_setup: MakeSetup):
+    results = make_setup(node).examine()
     assert not_passed(results) == {}
     assert len(results) == KINDS[node]
 
 
-# -- what it says ------------------------------------------------------------------------------------------------------
+# -- frames sent -------------------------------------------------------------------------------------------------------
 
 
-def _says(kind: str, change: Callable[[Frames, Message, int], Frames | None], node: str = IMU) -> Break:
-    """Change the frames of a kind the node sends: `change(frame, message, number)`; None: unchanged."""
+def _sends(kind: str, change: Callable[[Frames, Message, int], Frames | None], node: str = IMU) -> Break:
+    """Return a node whose frames of one kind are replaced by `change(frame, message, number)`; None: unchanged."""
 
-    def broken(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+    def broken(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
         del monkeypatch
-        desk = make_desk(node)
-        message, number = desk.message(kind), -1
+        setup = make_setup(node)
+        message, number = setup.message(kind), -1
 
         def from_node(frame: Frames) -> Frames:
             nonlocal number
@@ -66,8 +66,8 @@ def _says(kind: str, change: Callable[[Frames, Message, int], Frames | None], no
             changed = change(frame.copy(), message, number)
             return frame if changed is None else changed
 
-        desk.wire.from_node = from_node
-        return desk
+        setup.wire.from_node = from_node
+        return setup
 
     return broken
 
@@ -83,8 +83,8 @@ def _every_other(frame: Frames, message: Message, number: int) -> Frames:
     return protect(frame, message, counter=number if number < 2 else number // 2 + 1)
 
 
-def _one_late_in_life(frame: Frames, _message: Message, number: int) -> Frames:
-    """A pause of one answer, 0.7 s after the start."""
+def _one_missing(frame: Frames, _message: Message, number: int) -> Frames:
+    """Drop one answer, 0.7 s after the start."""
     return NO_FRAME if number == 700 else frame
 
 
@@ -106,16 +106,16 @@ def _reserved_bits(frame: Frames, message: Message, _: int) -> Frames:
     return protect(frame, message)
 
 
-def other_network(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+def other_network(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
     del monkeypatch
-    network = make_desk(IMU).bench.network
-    return make_desk(IMU, their_network=dataclasses.replace(network, hash32=network.hash32 ^ 1))
+    network = make_setup(IMU).tester.network
+    return make_setup(IMU, their_network=dataclasses.replace(network, hash32=network.hash32 ^ 1))
 
 
-def raises_an_emergency(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+def raises_an_emergency(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
     del monkeypatch
-    desk = make_desk(IMU)
-    message, asked = desk.message("EMCY"), 0
+    setup = make_setup(IMU)
+    message, asked = setup.message("EMCY"), 0
 
     def once() -> Frames:
         nonlocal asked
@@ -127,78 +127,78 @@ def raises_an_emergency(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
         put(frame, message, "ErrorCode", 0x5000)
         return protect(frame, message)
 
-    desk.wire.from_node = lambda frame: frame
-    desk.wire.out_of_the_blue = once
-    return desk
+    setup.wire.from_node = lambda frame: frame
+    setup.wire.unsolicited = once
+    return setup
 
 
-def talks_without_sync(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+def sends_without_sync(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
     last = np.zeros(1, NO_FRAME.dtype)
 
     def answer(frame: Frames, _message: Message, _number: int) -> None:
         last[:] = frame
 
-    desk = _says("STATE", answer)(make_desk, monkeypatch)
-    message = desk.message("STATE")
+    setup = _sends("STATE", answer)(make_setup, monkeypatch)
+    message = setup.message("STATE")
 
-    def unasked() -> Frames:
-        if desk.wire.sync_sent:
+    def without_sync() -> Frames:
+        if setup.wire.sync_sent:
             return NO_FRAME
         last[:] = protect(last, message, counter=int(last["data"][0, COUNTER_BYTE]) + 1 & 0xFF)
         return last.copy()
 
-    desk.wire.out_of_the_blue = unasked
-    return desk
+    setup.wire.unsolicited = without_sync
+    return setup
 
 
-# -- what it hears -----------------------------------------------------------------------------------------------------
+# -- frames received ---------------------------------------------------------------------------------------------------
 
 
-def _hears(kind: str, change: Reading, node: str = IMU) -> Break:
-    """A node that takes a message of the HAL for another."""
+def _receives(kind: str, change: Reading, node: str = IMU) -> Break:
+    """Return a node that receives a message of the HAL changed by `change`."""
 
-    def broken(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+    def broken(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
         del monkeypatch
-        desk = make_desk(node)
-        sync = desk.bench.sync.message
-        return hear_as(desk, sync if kind == "SYNC" else desk.bench.command.message, sync.data_id, change)
+        setup = make_setup(node)
+        sync = setup.tester.sync.message
+        return receive_as(setup, sync if kind == "SYNC" else setup.tester.command.message, sync.data_id, change)
 
     return broken
 
 
-def drowns_in_a_flood(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
-    """Its receive queue holds four frames."""
+def overflows_its_queue(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
+    """Return a node whose receive queue holds four frames."""
     del monkeypatch
-    desk = make_desk(IMU)
-    known = {m.frame_id for m in desk.bench.network.messages}
-    strangers = 0
+    setup = make_setup(IMU)
+    known = {m.frame_id for m in setup.tester.network.messages}
+    foreign = 0
 
     def to_node(frame: Frames) -> Frames:
-        nonlocal strangers
+        nonlocal foreign
         if int(frame["can_id"][0]) not in known:
-            strangers += 1
+            foreign += 1
             return frame
-        drowned, strangers = strangers > 4, 0
-        return NO_FRAME if drowned else frame
+        overflow, foreign = foreign > 4, 0
+        return NO_FRAME if overflow else frame
 
-    desk.wire.to_node = to_node
-    return desk
+    setup.wire.to_node = to_node
+    return setup
 
 
-# -- what it measures --------------------------------------------------------------------------------------------------
+# -- measured values ---------------------------------------------------------------------------------------------------
 
 
 def _measures(change: Callable[[Callable[[str], int], int, np.ndarray], None], node: str = IMU) -> Break:
-    """Other values before they are encoded: `change(place of a signal, cycle, values)`."""
+    """Return a node whose values are changed before encoding: `change(index of a signal, cycle, values)`."""
 
-    def broken(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+    def broken(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
         del monkeypatch
-        desk = make_desk(node)
-        codec, message = desk.emulator.signals, desk.message("STATE").name
-        desk.emulator.before_send.append(
+        setup = make_setup(node)
+        codec, message = setup.emulator.signals, setup.message("STATE").name
+        setup.emulator.before_send.append(
             lambda cycle, values: change(lambda signal: codec.index(message, signal), cycle, values)
         )
-        return desk
+        return setup
 
     return broken
 
@@ -242,13 +242,13 @@ def _no_temperature_once(at: Callable[[str], int], cycle: int, values: np.ndarra
 
 
 def _with_motors(advance: Callable[[Haptics, np.ndarray, int, int], None]) -> Break:
-    def broken(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+    def broken(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
         class Broken(Haptics):
             def advance(self, level: np.ndarray, silence: int, cycles: int) -> None:
                 advance(self, level, silence, cycles)
 
         monkeypatch.setattr("atalante_emulator.emulator.Haptics", Broken)
-        return make_desk("HAPTICS")
+        return make_setup("HAPTICS")
 
     return broken
 
@@ -263,7 +263,7 @@ def _never_stop(motors: Haptics, level: np.ndarray, _silence: int, cycles: int) 
 
 
 def _hum(motors: Haptics, level: np.ndarray, silence: int, cycles: int) -> None:
-    """Turn a little until the first command."""
+    """Vibrate slightly until the first command."""
     if not hasattr(motors, "commanded"):
         motors.commanded = False
     motors.commanded |= level.any()
@@ -271,7 +271,7 @@ def _hum(motors: Haptics, level: np.ndarray, silence: int, cycles: int) -> None:
 
 
 def _weak(motors: Haptics, level: np.ndarray, silence: int, cycles: int) -> None:
-    """Nine tenths of full level are all there is; half a level is half a level."""
+    """Limit the level to 0.96."""
     Haptics.advance(motors, np.minimum(level, 0.96), silence, cycles)
 
 
@@ -289,15 +289,15 @@ def _levels(read: Callable[[list[int]], list[int]]) -> Reading:
 
 
 def _pendant(operator: Callable[[], Operator]) -> Break:
-    def broken(make_desk: MakeDesk, monkeypatch: Patch) -> Desk:
+    def broken(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
         del monkeypatch
-        return make_desk("PENDANT", operator=operator())
+        return make_setup("PENDANT", operator=operator())
 
     return broken
 
 
 class Bouncing(Operator):
-    """A START button that bounces."""
+    """Operator with a START button that bounces."""
 
     def start(self) -> None:
         super().start()
@@ -305,21 +305,21 @@ class Bouncing(Operator):
 
 
 class Swapped(Operator):
-    """HOLD wired to STOP."""
+    """Operator with the HOLD button wired to STOP."""
 
     def hold(self) -> None:
         self.stop()
 
 
 class Unplugged(Operator):
-    """No STOP button."""
+    """Operator with a disconnected STOP button."""
 
     def stop(self) -> None:
         pass
 
 
 class Ghost(Operator):
-    """Presses by itself, now and then, when nobody touches anything for long."""
+    """Operator with a START button that triggers once without a press."""
 
     def __init__(self) -> None:
         super().__init__(starts=False)
@@ -330,56 +330,56 @@ class Ghost(Operator):
         if self._heard == self.at:
             self.start()
 
-    #: In the 200 ms after its start-up.
+    #: Cycle of the press, during the test of PENDANT-01.
     at = 300
 
 
 BROKEN: dict[str, tuple[Break, str]] = {
-    "no boot-up": (_says("STATUS", _never_booting), "NODE-01"),
+    "no boot-up": (_sends("STATUS", _never_booting), "NODE-01"),
     "other network": (other_network, "NODE-02"),
-    "half the heartbeat": (_says("STATUS", _every_other), "NODE-03"),
-    "misses a SYNC": (_says("STATE", _one_late_in_life), "NODE-04"),
+    "half the heartbeat": (_sends("STATUS", _every_other), "NODE-03"),
+    "misses a SYNC": (_sends("STATE", _one_missing), "NODE-04"),
     "emergency at rest": (raises_an_emergency, "NODE-05"),
-    "talks without SYNC": (talks_without_sync, "NODE-06"),
-    "no CRC of SYNC": (_hears("SYNC", no_crc), "NODE-07"),
-    "answers a repeated SYNC": (_hears("SYNC", no_repetition), "NODE-08"),
-    "answers any length of SYNC": (_hears("SYNC", no_length), "NODE-09"),
-    "drowns in a flood": (drowns_in_a_flood, "NODE-10"),
-    "counter slips": (_says("STATE", _counter_slips), "NODE-11"),
-    "wrong Data ID now and then": (_says("STATE", _other_data_id), "NODE-12"),
-    "no bit rate switch": (_says("STATUS", _no_bit_rate_switch), "NODE-13"),
+    "sends without SYNC": (sends_without_sync, "NODE-06"),
+    "no CRC of SYNC": (_receives("SYNC", no_crc), "NODE-07"),
+    "answers a repeated SYNC": (_receives("SYNC", no_repetition), "NODE-08"),
+    "answers any length of SYNC": (_receives("SYNC", no_length), "NODE-09"),
+    "receive queue overflows": (overflows_its_queue, "NODE-10"),
+    "counter slips": (_sends("STATE", _counter_slips), "NODE-11"),
+    "wrong Data ID sometimes": (_sends("STATE", _other_data_id), "NODE-12"),
+    "no bit rate switch": (_sends("STATUS", _no_bit_rate_switch), "NODE-13"),
     "an invalid code": (_measures(_no_temperature_once), "NODE-14"),
-    "reserved bits": (_says("STATE", _reserved_bits), "NODE-15"),
+    "reserved bits": (_sends("STATE", _reserved_bits), "NODE-15"),
     "quaternion not of unit length": (_measures(_shrunk_quaternion), "IMU-01"),
     "accelerometer scale": (_measures(_scaled_accel), "IMU-02"),
     "axes swapped": (_measures(_swapped_accel), "IMU-03"),
     "gyro bias": (_measures(_biased_gyro), "IMU-04"),
     "gyro axis stuck": (_set("GyroX", 0.01), "IMU-05"),
-    "IMU not well": (_set("ImuState", 1.0), "IMU-06"),
+    "IMU error": (_set("ImuState", 1.0), "IMU-06"),
     "tare lost": (_measures(_tare_lost, "FOOT_LEFT"), "FOOT-01"),
     "cell stuck": (_set("FR_ForceX", 0.0, "FOOT_RIGHT"), "FOOT-02"),
-    "foot not well": (_set("FootState", 1.0, "FOOT_LEFT"), "FOOT-03"),
+    "foot error": (_set("FootState", 1.0, "FOOT_LEFT"), "FOOT-03"),
     "hums": (_with_motors(_hum), "HAPTICS-01"),
     "ramps": (_with_motors(_ramp), "HAPTICS-02"),
-    "never full": (_with_motors(_weak), "HAPTICS-03"),
+    "never full amplitude": (_with_motors(_weak), "HAPTICS-03"),
     "two motors swapped": (
-        _hears("COMMAND", _levels(lambda codes: [codes[1], codes[0], *codes[2:]]), "HAPTICS"),
+        _receives("COMMAND", _levels(lambda codes: [codes[1], codes[0], *codes[2:]]), "HAPTICS"),
         "HAPTICS-04",
     ),
     "wraps around": (
-        _hears("COMMAND", _levels(lambda codes: [c - 201 if 200 < c < 255 else c for c in codes]), "HAPTICS"),
+        _receives("COMMAND", _levels(lambda codes: [c - 201 if 200 < c < 255 else c for c in codes]), "HAPTICS"),
         "HAPTICS-05",
     ),
-    "takes the invalid level for full": (
-        _hears("COMMAND", _levels(lambda codes: [200 if c == 255 else c for c in codes]), "HAPTICS"),
+    "accepts the invalid level": (
+        _receives("COMMAND", _levels(lambda codes: [200 if c == 255 else c for c in codes]), "HAPTICS"),
         "HAPTICS-06",
     ),
     "never stops": (_with_motors(_never_stop), "HAPTICS-07"),
-    "no CRC": (_hears("COMMAND", no_crc, "HAPTICS"), "HAPTICS-08"),
-    "no Data ID": (_hears("COMMAND", no_data_id, "HAPTICS"), "HAPTICS-09"),
-    "takes repeated levels": (_hears("COMMAND", no_repetition, "HAPTICS"), "HAPTICS-10"),
-    "takes any length": (_hears("COMMAND", no_length, "HAPTICS"), "HAPTICS-11"),
-    "presses by itself": (_pendant(Ghost), "PENDANT-01"),
+    "no CRC": (_receives("COMMAND", no_crc, "HAPTICS"), "HAPTICS-08"),
+    "no Data ID": (_receives("COMMAND", no_data_id, "HAPTICS"), "HAPTICS-09"),
+    "accepts repeated levels": (_receives("COMMAND", no_repetition, "HAPTICS"), "HAPTICS-10"),
+    "accepts any length": (_receives("COMMAND", no_length, "HAPTICS"), "HAPTICS-11"),
+    "request without a press": (_pendant(Ghost), "PENDANT-01"),
     "dead-man stuck": (_set("DeadMan", 1.0, "PENDANT"), "PENDANT-02"),
     "START bounces": (_pendant(lambda: Bouncing(starts=False)), "PENDANT-03"),
     "no STOP": (_pendant(lambda: Unplugged(starts=False)), "PENDANT-04"),
@@ -387,20 +387,20 @@ BROKEN: dict[str, tuple[Break, str]] = {
     "dial dead": (_set("AssistanceSet", 0.0, "PENDANT"), "PENDANT-06"),
 }
 
-#: What every node owes takes long; what breaks something else is examined without.
+#: Requirements at rest, which take long; skipped for nodes with another defect.
 _REST = ("NODE-03", "NODE-04", "NODE-07", "NODE-08", "NODE-09", "NODE-10")
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_broken_node_fails_for_its_own_reason(name: str, make_desk: MakeDesk, monkeypatch: Patch):
+def test_defective_node_fails_only_its_requirement(name: str, make_setup: MakeSetup, monkeypatch: Patch):
     broken, expected = BROKEN[name]
-    desk = broken(make_desk, monkeypatch)
+    setup = broken(make_setup, monkeypatch)
     without = () if expected.startswith("NODE") else _REST
-    assert not_passed(desk.examine(without)) == {expected: Verdict.FAILED}
+    assert not_passed(setup.examine(without)) == {expected: Verdict.FAILED}
 
 
-def test_every_requirement_has_a_node_that_breaks_it(make_desk: MakeDesk):
+def test_every_requirement_has_a_defective_node(make_setup: MakeSetup):
     from atalante_tools.conform.examination import requirements_of
 
-    ids = {r.id for node in KINDS for r in requirements_of(make_desk(node).bench)}
+    ids = {r.id for node in KINDS for r in requirements_of(make_setup(node).tester)}
     assert {expected for _, expected in BROKEN.values()} == ids

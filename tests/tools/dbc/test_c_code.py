@@ -1,4 +1,4 @@
-"""The generated C under the sanitizers against the Python codec, and that the comparison can fail."""
+"""Tests of the generated C code against the Python codec with sanitizers, and of the comparison itself."""
 
 from __future__ import annotations
 
@@ -33,29 +33,29 @@ def compiler() -> None:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Build, Path, Path]:
-    """The whole network, generated and compiled once: build, folder, program."""
+    """Generate and compile the whole network once; return build, folder and program."""
     folder = tmp_path_factory.mktemp("c")
     build = Build.of(DBC_FILE, None)
     write(build, folder, 0)
     return build, folder, compile_host_test(build, folder)
 
 
-def test_c_and_python_agree_on_ten_thousand_random_images_of_the_whole_network(whole):
+def test_c_and_python_agree_on_random_images_of_the_whole_network(whole):
     build, _, program = whole
     assert len(build.messages) == len(load().messages)
-    # Every message unpacked and packed.
+    # Every message is compared twice: unpacked and packed.
     assert run_host_test(build, program, IMAGES, seed=1) == 2 * IMAGES * len(build.messages)
 
 
-def test_the_vector_file_needs_no_python(whole):
+def test_host_test_runs_on_the_vector_file(whole):
     _, folder, program = whole
     done = subprocess.run([program, folder / "vectors.bin"], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, f"{2 * 100 * len(load().messages)} frames compared\n")
 
 
 @pytest.mark.parametrize("offset", [16 + 8, 16 + 8 + 1, -1], ids=["value range flag", "value", "payload"])
-def test_a_vector_that_is_wrong_by_one_bit_is_found(whole, offset: int, tmp_path: Path):
-    # The first frame is an 8-byte SYNC: payload, range flag, values; the last byte is the end of a payload to be made.
+def test_one_wrong_bit_in_the_vectors_fails_the_comparison(whole, offset: int, tmp_path: Path):
+    # The first frame is an 8-byte SYNC: payload, range flag, values. The last byte belongs to the payload of a sent frame.
     _, folder, program = whole
     content = bytearray((folder / "vectors.bin").read_bytes())
     content[offset] ^= 1
@@ -66,7 +66,7 @@ def test_a_vector_that_is_wrong_by_one_bit_is_found(whole, offset: int, tmp_path
     assert "not " in done.stdout
 
 
-def test_vectors_of_another_network_are_refused(whole, tmp_path: Path):
+def test_vectors_of_another_network_are_rejected(whole, tmp_path: Path):
     _, folder, program = whole
     content = bytearray((folder / "vectors.bin").read_bytes())
     content[8] ^= 1
@@ -75,7 +75,7 @@ def test_vectors_of_another_network_are_refused(whole, tmp_path: Path):
     assert (done.returncode, "another network" in done.stdout) == (2, True)
 
 
-def test_a_wrong_scaling_in_c_is_found(tmp_path: Path):
+def test_wrong_factor_in_c_fails_the_comparison(tmp_path: Path):
     """The smallest mistake an engineer could make by hand: one factor, in its ninth digit."""
     build = Build.of(DBC_FILE, "LEFT_SK")
     write(build, tmp_path, 0)
@@ -88,7 +88,7 @@ def test_a_wrong_scaling_in_c_is_found(tmp_path: Path):
         run_host_test(build, program, 100, seed=0)
 
 
-def test_a_warning_in_the_code_is_an_error(tmp_path: Path):
+def test_compiler_warning_is_an_error(tmp_path: Path):
     build = Build.of(DBC_FILE, "PENDANT")
     write(build, tmp_path, 0)
     with (tmp_path / "atalante_e2e.c").open("a") as file:
@@ -97,7 +97,7 @@ def test_a_warning_in_the_code_is_an_error(tmp_path: Path):
         compile_host_test(build, tmp_path)
 
 
-def test_the_command_writes_and_checks_one_nodes_share(tmp_path: Path):
+def test_command_writes_and_checks_the_messages_of_one_node(tmp_path: Path):
     arguments = ["dbc", "c-code", "-o", str(tmp_path), "--node", "left_sk", "--check", "--images", "500", "--json"]
     result = CliRunner().invoke(cli, arguments)
     assert result.exit_code == 0, result.output
@@ -111,32 +111,32 @@ def test_the_command_writes_and_checks_one_nodes_share(tmp_path: Path):
     assert "atalante_left_sk_state_check" not in header
     assert "ATALANTE_LEFT_SK_STATE_TORQUE_INVALID (-32768)" in header
     assert f"{load().hash32:#010x}" in header
-    # And without Python, from the folder alone.
+    # The Makefile needs no Python.
     (tmp_path / "host_test").unlink()
     made = subprocess.run(["make", "-s", "-C", tmp_path, "test"], capture_output=True, text=True, check=False)
     assert (made.returncode, made.stdout) == (0, "500 frames compared\n"), made.stderr
 
 
-def test_the_same_network_gives_the_same_bytes(tmp_path: Path):
+def test_same_network_gives_the_same_bytes(tmp_path: Path):
     build = Build.of(DBC_FILE, "HAPTICS")
     first, second = ([path.read_bytes() for path in write(build, tmp_path / name, 0)] for name in "ab")
     assert first == second
 
 
-def test_a_node_that_does_not_exist_is_answered_with_a_near_one():
+def test_unknown_node_is_rejected_with_a_similar_name():
     with pytest.raises(click.UsageError, match="LEFT_SK"):
         Build.of(DBC_FILE, "LEFT_KS")
 
 
-def test_a_missing_compiler_is_told_with_what_to_install(whole, monkeypatch: pytest.MonkeyPatch):
+def test_missing_compiler_gives_the_install_command(whole, monkeypatch: pytest.MonkeyPatch):
     build, folder, _ = whole
     monkeypatch.setenv("CC", "no-such-cc")
     with pytest.raises(Failed, match="apt-get install gcc"):
         compile_host_test(build, folder)
 
 
-def test_the_readable_vectors_are_what_cantools_decodes(whole):
-    """A second witness: the examples are not only our own codec's word."""
+def test_json_vectors_equal_the_values_of_cantools(whole):
+    """Cantools decodes the examples independently of the codec of this project."""
     _, folder, _ = whole
     oracle = cantools.database.load_file(str(DBC_FILE), strict=False)
     vectors = json.loads((folder / "vectors.json").read_text())
@@ -151,12 +151,12 @@ def test_the_readable_vectors_are_what_cantools_decodes(whole):
     assert False in {v["in_range"] for v in vectors if v["what"] == "invalid codes"}
 
 
-def test_the_crc_table_is_the_standard_librarys_polynomial():
+def test_crc_table_equals_binascii():
     assert crc_table() == [crc_hqx(bytes([byte]), 0) for byte in range(256)]
 
 
-def test_random_payloads_meet_codes_outside_their_range(whole):
-    """Otherwise the comparison of the range checks would prove little."""
+def test_random_payloads_have_codes_out_of_range(whole):
+    """The comparison of the range checks needs payloads of both kinds."""
     from atalante_tools.dbc.vectors import Vectors
 
     build, _, _ = whole

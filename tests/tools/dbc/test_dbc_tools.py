@@ -1,4 +1,4 @@
-"""`atalante dbc lint | table | busload | diff`: what people and programs read, and the exit codes."""
+"""Tests of `atalante dbc lint | table | busload | diff`: output and exit codes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def rows(result: Result) -> list[dict]:
 
 @pytest.fixture
 def mutated(tmp_path: Path):
-    """Write the network with a text of LEFT_FH_STATE or below replaced once."""
+    """Write the network with texts replaced once, from LEFT_FH_STATE on."""
 
     def write(*replacements: tuple[str, str]) -> Path:
         start = TEXT.index("BO_ 385 LEFT_FH_STATE")
@@ -49,13 +49,13 @@ def mutated(tmp_path: Path):
 # -- lint ----------------------------------------------------------------------------------------------------------------
 
 
-def test_the_robots_own_network_has_no_findings():
+def test_network_of_the_robot_has_no_findings():
     result = run("lint")
     assert result.exit_code == 0
     assert result.stdout == ""
 
 
-def test_each_finding_has_the_line_it_is_in(mutated):
+def test_each_finding_has_its_line(mutated):
     path = mutated((TORQUE, TORQUE.replace("0.0125", "0")), (TEMPERATURE, TEMPERATURE.replace("56|", "52|")))
     found = findings(path)
     lines = path.read_text().splitlines()
@@ -68,7 +68,7 @@ def test_each_finding_has_the_line_it_is_in(mutated):
     assert rows(run("lint", "--json", path)) == [{"file": str(path), "line": f.line, "text": f.text} for f in found]
 
 
-def test_a_file_that_does_not_parse_is_a_finding_too(tmp_path: Path):
+def test_parse_error_is_a_finding(tmp_path: Path):
     path = tmp_path / "no.dbc"
     path.write_text('VERSION "1"\nBO_ nonsense\n')
     (finding,) = findings(path)
@@ -78,7 +78,7 @@ def test_a_file_that_does_not_parse_is_a_finding_too(tmp_path: Path):
     assert "Traceback" not in result.output
 
 
-def test_a_missing_file_is_a_usage_error():
+def test_missing_file_is_a_usage_error():
     result = run("lint", "nowhere.dbc")
     assert result.exit_code == 2
     assert "nowhere.dbc" in result.output
@@ -98,7 +98,7 @@ def test_table_has_every_message_with_all_its_attributes():
     }  # fmt: skip
 
 
-def test_table_for_people_is_one_aligned_line_a_message():
+def test_text_table_has_one_aligned_line_per_message():
     lines = run("table").stdout.splitlines()
     assert len(lines) == 1 + len(NETWORK.messages)
     columns = [re.search(r"\bbus\b", lines[0]).start()] * len(lines)
@@ -118,7 +118,7 @@ def test_table_of_signals_has_unit_range_and_invalid_code():
 # -- busload -------------------------------------------------------------------------------------------------------------
 
 
-def test_busload_adds_up_to_the_networks_own_figure():
+def test_busload_of_messages_adds_up_to_the_bus_load():
     network = NETWORK
     result = run("busload", "--json")
     assert result.exit_code == 0
@@ -131,7 +131,7 @@ def test_busload_adds_up_to_the_networks_own_figure():
     assert command["percent"] == pytest.approx(100 * wire_time(48) / 1e-3)
 
 
-def test_busload_above_the_limit_names_the_bus_and_fails():
+def test_busload_above_the_limit_fails_and_names_the_bus():
     result = run("busload", "--limit", 58)
     assert result.exit_code == 1
     assert "left_leg" in result.stderr
@@ -141,13 +141,13 @@ def test_busload_above_the_limit_names_the_bus_and_fails():
 # -- diff ----------------------------------------------------------------------------------------------------------------
 
 
-def test_a_network_does_not_differ_from_itself():
+def test_diff_of_a_network_with_itself_is_empty():
     assert changes(NETWORK, load()) == []
     result = run("diff", DBC_FILE, DBC_FILE)
     assert (result.exit_code, result.stdout) == (0, "")
 
 
-#: What to replace from LEFT_FH_STATE on -> subject of the change, where, whether it breaks.
+#: Name -> replacements from LEFT_FH_STATE on, subject of the change, location, whether it is breaking.
 CHANGES = {
     "length": ([("LEFT_FH_STATE: 12", "LEFT_FH_STATE: 16")], "length", "LEFT_FH_STATE", True),
     "data id": ([('"E2EDataId" BO_ 385 41345', '"E2EDataId" BO_ 385 99')], "data id", "LEFT_FH_STATE", True),
@@ -181,16 +181,16 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_diff_names_what_changes_on_the_wire(name: str, mutated):
+def test_diff_reports_the_change_and_its_consequences(name: str, mutated):
     replacements, subject, where, breaking = CHANGES[name]
     found = [c for c in changes(NETWORK, load(mutated(*replacements))) if c.subject != "hash" or subject == "hash"]
     assert (subject, where, breaking) in {(c.subject, c.where, c.breaking) for c in found}
-    # And nothing besides what follows from it.
+    # No change besides the consequences of this one.
     follows = {"layout": {"range", "invalid code"}, "sign": {"range"}, "offset": {"range"}}.get(name, set())
     assert {c.subject for c in found} - {subject} <= follows
 
 
-def test_another_identifier_breaks(tmp_path: Path):
+def test_changed_identifier_is_breaking(tmp_path: Path):
     path = tmp_path / "new.dbc"
     path.write_text(re.sub(r"((?:BO_|SG_|VAL_) )385 ", r"\g<1>384 ", TEXT), "cp1252")
     found = [c for c in changes(NETWORK, load(path)) if c.subject != "hash"]
@@ -199,7 +199,7 @@ def test_another_identifier_breaks(tmp_path: Path):
 
 
 @pytest.mark.parametrize(("name", "code"), [("range", 1), ("timeout", 0)])
-def test_diff_fails_on_what_breaks_alone(name: str, code: int, mutated):
+def test_diff_fails_only_on_breaking_changes(name: str, code: int, mutated):
     replacements, _, where, _ = CHANGES[name]
     result = run("diff", DBC_FILE, mutated(*replacements))
     assert result.exit_code == code
@@ -207,7 +207,7 @@ def test_diff_fails_on_what_breaks_alone(name: str, code: int, mutated):
     assert kinds == ["breaking" if code else "compatible"]
 
 
-def test_a_timeout_no_longer_than_the_other_sides_cycle_breaks(mutated):
+def test_timeout_below_the_cycle_of_the_other_version_is_breaking(mutated):
     old = mutated(('"GenMsgCycleTime" BO_ 403 10', '"GenMsgCycleTime" BO_ 403 20'))
     before = load(old)
     new = mutated(('"TimeoutTime" BO_ 403 ', '"TimeoutTime" BO_ 403 1'))
@@ -218,8 +218,8 @@ def test_a_timeout_no_longer_than_the_other_sides_cycle_breaks(mutated):
     assert timeout.breaking
 
 
-def test_a_message_that_is_gone_breaks_and_a_new_one_does_not(tmp_path: Path):
-    # Without the last emergency: its block, and every line that mentions its identifier.
+def test_removed_message_is_breaking_and_new_message_is_not(tmp_path: Path):
+    # Remove the last emergency: its block, and every line with its identifier.
     lines = re.sub(r"BO_ 148 .*?\n\n", "", TEXT, flags=re.S).splitlines()
     path = tmp_path / "less.dbc"
     path.write_text("\n".join(line for line in lines if not re.search(r"(BO_|SG_|VAL_) 148 ", line)) + "\n")
@@ -229,25 +229,25 @@ def test_a_message_that_is_gone_breaks_and_a_new_one_does_not(tmp_path: Path):
     assert [(c.where, c.breaking) for c in new] == [("PENDANT_EMCY", False)]
 
 
-def test_a_message_renamed_is_the_same_to_the_wire(mutated):
+def test_renamed_message_is_compatible(mutated):
     path = mutated(("LEFT_FH_STATE", "LEFT_FH_DRIVE_STATE"))
     found = [c for c in changes(NETWORK, load(path)) if c.subject != "hash"]
     assert [(c.subject, c.where, c.breaking) for c in found] == [("name", "LEFT_FH_DRIVE_STATE", False)]
 
 
-def test_new_signal_is_compatible_in_reserved_bits_alone(mutated):
-    # The first message with reserved bits behind LEFT_FH_STATE is an IMU: bits 40 to 63.
+def test_new_signal_is_compatible_only_in_reserved_bits(mutated):
+    # The first message with reserved bits after LEFT_FH_STATE is an IMU: bits 40 to 63.
     accel = ' SG_ AccelX : 192|16@1- (0.005,0) [-163.835|163.835] "m/s2" HAL'
     for line, breaking in (
         (' SG_ Extra : 40|8@1+ (1,0) [0|254] "1" HAL', False),
-        (' SG_ Extra : 40|8@1+ (1,0) [1|254] "1" HAL', True),  # the 0 of an old sender is outside
+        (' SG_ Extra : 40|8@1+ (1,0) [1|254] "1" HAL', True),  # the 0 sent by an old node is out of range
     ):
         path = mutated((accel, f"{accel}\n{line}"))
         (found,) = [c for c in changes(NETWORK, load(path)) if c.subject == "signal"]
         assert (found.where, found.breaking) == ("IMU_TORSO_STATE.Extra", breaking)
 
 
-def test_diff_as_json_is_one_object_a_change(mutated):
+def test_diff_json_is_one_object_per_change(mutated):
     result = run("diff", "--json", DBC_FILE, mutated(("LEFT_FH_STATE: 12", "LEFT_FH_STATE: 16")))
     assert result.exit_code == 1
     kinds = [(row["kind"], row["subject"], row["where"]) for row in rows(result)]

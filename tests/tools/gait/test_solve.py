@@ -1,4 +1,4 @@
-"""`atalante gait solve`: what it prints, writes and refuses."""
+"""Tests of `atalante gait solve`: output, files and errors."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:
     return run(*PATIENT, "--step-length", "0.16", "--step-duration", "0.8", "--json", *files), folder
 
 
-def test_json_is_one_object_with_the_keys_scripts_rely_on(result: tuple[Result, Path]) -> None:
+def test_json_is_one_object_with_the_documented_keys(result: tuple[Result, Path]) -> None:
     outcome, _ = result
     assert outcome.exit_code == 0, outcome.output
     [line] = map(json.loads, outcome.stdout.splitlines())
@@ -48,14 +48,12 @@ def test_json_is_one_object_with_the_keys_scripts_rely_on(result: tuple[Result, 
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_in_the_midst_of_the_optimiser_is_no_verdict(
-    monkeypatch: pytest.MonkeyPatch, number: int, code: int
-) -> None:
+def test_signal_during_optimisation_gives_no_result(monkeypatch: pytest.MonkeyPatch, number: int, code: int) -> None:
     class GivenUp:
         solved, status = False, "no such gait: the impact map cannot hold"
 
     def optimise(*_: object, **__: object) -> GivenUp:
-        """As CasADi: what is raised meanwhile ends the search."""
+        """Swallow an exception and give up, as CasADi does."""
         with suppress(KeyboardInterrupt, SystemExit):
             os.kill(os.getpid(), number)
         return GivenUp()
@@ -66,14 +64,14 @@ def test_a_signal_in_the_midst_of_the_optimiser_is_no_verdict(
     assert "no such gait" not in outcome.stderr
 
 
-def test_the_gait_is_one_the_controller_reads(result: tuple[Result, Path]) -> None:
+def test_controller_loads_the_written_gait(result: tuple[Result, Path]) -> None:
     gait = load_gait(result[1] / "gait.json", load_robot())
     assert gait.duration == 0.8
     assert gait.parameters["patient_mass"] == 75.0
     assert gait.feedforward is not None
 
 
-def test_pictures(result: tuple[Result, Path], tmp_path: Path) -> None:
+def test_plot_and_animation_are_written(result: tuple[Result, Path], tmp_path: Path) -> None:
     from atalante_control.model import Patient
 
     with Image.open(result[1] / "gait.png") as picture:
@@ -84,7 +82,7 @@ def test_pictures(result: tuple[Result, Path], tmp_path: Path) -> None:
         assert animation.n_frames == 21  # 25 a second over 0.8 s, both ends included
 
 
-def test_people_get_torques_residuals_and_pinocchios_judgement() -> None:
+def test_text_output_has_torques_residuals_and_verification() -> None:
     outcome = run(*PATIENT, "--kind", "stop")
     assert outcome.exit_code == 0, outcome.output
     for text in ("stance Nm", "centre of pressure across the sole", "by Pinocchio", "speed at rest"):
@@ -92,8 +90,8 @@ def test_people_get_torques_residuals_and_pinocchios_judgement() -> None:
     assert "FAIL" not in outcome.stdout
 
 
-def test_what_cannot_be_walked_ends_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    # IPOPT gives up after 150 iterations, which is told in no other way.
+def test_infeasible_gait_gives_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Fewer iterations than the default of 150 end the infeasible problem sooner.
     monkeypatch.setitem(solve._OPTIONS, "ipopt.max_iter", 15)
     outcome = run(*PATIENT, "--step-length", "0.4", "--step-duration", "0.4", "--json")
     assert outcome.exit_code == 1
@@ -111,13 +109,13 @@ def test_what_cannot_be_walked_ends_in_one_sentence(monkeypatch: pytest.MonkeyPa
         ([*PATIENT, "--kind", "hop"], "periodic"),
     ],
 )
-def test_usage(arguments: list[str], sentence: str) -> None:
+def test_invalid_options_are_usage_errors(arguments: list[str], sentence: str) -> None:
     outcome = run(*arguments)
     assert outcome.exit_code == 2
     assert sentence in outcome.stderr
 
 
-def test_without_casadi_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_casadi_gives_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
     real = builtins.__import__
 
     def absent(name: str, *arguments: Any, **keywords: Any) -> Any:

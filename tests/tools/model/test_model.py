@@ -1,4 +1,4 @@
-"""`atalante model`: the table, the checks, the URDF and the picture, and what it refuses."""
+"""Tests of `atalante model`: table, checks, URDF, picture and errors."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ def objects(result: Result) -> list[dict[str, Any]]:
     return [json.loads(line) for line in result.stdout.splitlines()]
 
 
-def test_links_add_up_to_patient_and_exoskeleton_and_every_check_holds() -> None:
-    said = objects(model("--mass", "75", "--height", "175", "--json"))
-    bodies = [line for line in said if "link" in line]
+def test_link_masses_add_up_and_every_check_passes() -> None:
+    output = objects(model("--mass", "75", "--height", "175", "--json"))
+    bodies = [line for line in output if "link" in line]
     assert [body["link"] for body in bodies] == [link.name for link in links(ExoskeletonParameters())]
     assert sum(body["mass"] for body in bodies) == pytest.approx(82.5 + 75.0, abs=1e-12)
-    assert {line["check"]: line["ok"] for line in said if "check" in line} == {
+    assert {line["check"]: line["ok"] for line in output if "check" in line} == {
         "mass": True, "mirror": True, "inertias": True, "engines": True,
     }  # fmt: skip
 
 
-def test_metres_and_centimetres_are_the_same_patient() -> None:
+def test_lengths_in_metres_and_centimetres_are_equal() -> None:
     metres = model("--mass", "75", "--height", "1.75", "--thigh", "0.44", "--shank", "0.41")
     assert metres.exit_code == 0
     assert metres.stdout == model("--mass", "75", "--height", "175", "--thigh", "44", "--shank", "41").stdout
     assert "157.5 kg: exoskeleton 82.5, patient 75" in metres.stdout
 
 
-def test_without_a_patient_it_is_the_exoskeleton_alone() -> None:
+def test_model_without_patient_is_the_exoskeleton() -> None:
     assert "82.5 kg: exoskeleton 82.5, patient 0" in model().stdout
 
 
@@ -54,7 +54,7 @@ def test_urdf_and_picture_are_written(tmp_path: Path) -> None:
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_show_alone_names_the_picture_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_show_without_file_writes_model_png(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert "picture in model.png" in model("--show").stderr
     assert (tmp_path / "model.png").exists()
@@ -70,25 +70,25 @@ def test_show_alone_names_the_picture_itself(tmp_path: Path, monkeypatch: pytest
         (["--thigh", "40"], "a patient needs --mass and --height"),
     ],
 )
-def test_a_patient_out_of_range_is_refused_with_the_range(arguments: list[str], sentence: str) -> None:
+def test_patient_out_of_range_is_rejected_with_the_range(arguments: list[str], sentence: str) -> None:
     result = model(*arguments)
     assert result.exit_code == 2
     assert sentence in result.stderr
 
 
-def test_a_model_that_is_not_sound_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    def lopsided(parameters: ExoskeletonParameters, patient: Patient | None = None) -> tuple[Link, ...]:
+def test_asymmetric_model_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    def asymmetric(parameters: ExoskeletonParameters, patient: Patient | None = None) -> tuple[Link, ...]:
         bodies = exoskeleton.links(parameters, patient)
         heavier = replace(bodies[3].inertia, mass=bodies[3].inertia.mass + 1.0)
         return (*bodies[:3], replace(bodies[3], inertia=heavier), *bodies[4:])
 
-    monkeypatch.setattr(checks_module, "links", lopsided)
+    monkeypatch.setattr(checks_module, "links", asymmetric)
     result = model("--mass", "75", "--height", "175")
     assert result.exit_code == 1
-    assert "FAIL  mirror: left_frontal_hip and the right one differ" in result.stdout
-    assert "the model is not sound: mirror" in result.stderr
+    assert "FAIL  mirror: left_frontal_hip and its right counterpart differ" in result.stdout
+    assert "the model is inconsistent: mirror" in result.stderr
 
 
-def test_engines_that_disagree_fail(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_disagreement_of_the_engines_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checks_module, "AGREEMENT", 1e-20)
     assert "FAIL  engines" in model().stdout

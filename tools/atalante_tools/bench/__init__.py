@@ -1,6 +1,6 @@
-"""`atalante bench`: how fast the stack is, each figure beside its baseline, measured in the same run.
+"""Command `atalante bench`: run the benchmarks, each beside a baseline measured in the same run.
 
-nodes, generated_c, python_can_hal -> wire, motion, startup -> catalogue -> the table or the JSON lines
+nodes, generated_c, python_can_hal -> wire, motion, startup -> catalogue -> table or JSON lines
 """
 
 from __future__ import annotations
@@ -22,13 +22,14 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("names", metavar="[NAME]...", nargs=-1)
-@click.option("--quick", is_flag=True, help="A few rounds of each: whether everything works, not how fast it is.")
+@click.option("--quick", is_flag=True, help="Run only a few rounds per benchmark, to check that all of them work.")
 @json_option
 def command(names: tuple[str, ...], quick: bool, as_json: bool) -> None:
-    """Measure the stack: value and baseline side by side in short blocks, medians of each. The ratio is the result.
+    """Measure the speed of the stack against baselines and print the ratio of the medians.
 
-    Absolute figures depend on the machine and on what else runs on it. Every benchmark checks that it did real work; one
-    that did not ends the command with code 1. A missed target does not: it is shown.
+    Value and baseline are measured alternately in short blocks. Absolute times depend on the machine and its load, so
+    only the ratio is comparable. Every benchmark checks that it did its work; the exit code is 1 if one did not. A missed
+    target is shown and does not change the exit code.
 
     \b
     Example: atalante bench
@@ -41,15 +42,15 @@ def command(names: tuple[str, ...], quick: bool, as_json: bool) -> None:
     chosen = [BENCHMARKS[find(name, known, "benchmark")] for name in dict.fromkeys(names)] or list(BENCHMARKS)
     progress = Progress()
     rows: list[tuple[str, ...]] = [("benchmark", "value", "baseline", "unit", "ratio", "target", "", "baseline is")]
-    for place, benchmark in enumerate(chosen, start=1):
+    for number, benchmark in enumerate(chosen, start=1):
         check_stop()
-        where = f"{benchmark.name} ({place} of {len(chosen)})"
+        label = f"{benchmark.name} ({number} of {len(chosen)})"
 
-        def show(done: int, of: int, where: str = where) -> None:
+        def show(done: int, total: int, label: str = label) -> None:
             if progress.due():
-                progress.show(f"{where}: round {done} of {of}")
+                progress.show(f"{label}: round {done} of {total}")
 
-        progress.show(f"{where}: preparing")
+        progress.show(f"{label}: preparing")
         try:
             measured = benchmark.run(Effort(quick, show))
         except WorkError as error:
@@ -66,7 +67,7 @@ def command(names: tuple[str, ...], quick: bool, as_json: bool) -> None:
 
 
 def line(benchmark: Benchmark, measured: Measurement) -> dict[str, Any]:
-    """What scripts get; null where nothing was measured."""
+    """Return one benchmark as a JSON object; values that were not measured are null."""
     return {
         "name": benchmark.name,
         "value": _in_unit(benchmark, measured.value),
@@ -78,7 +79,7 @@ def line(benchmark: Benchmark, measured: Measurement) -> dict[str, Any]:
 
 
 def row(benchmark: Benchmark, measured: Measurement) -> tuple[str, ...]:
-    """What people get."""
+    """Return one benchmark as a row of the table."""
     ratio, target = measured.ratio, benchmark.target
     if ratio is None:
         verdict = "not measured"

@@ -1,4 +1,4 @@
-"""Benchmarks of the gait optimiser: one gait from scratch, and one from its neighbour, on one core."""
+"""Benchmarks of the gait optimiser on one core: a gait from the kinematic guess, and a gait from a neighbouring gait."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from atalante_control.gait.subject import Subject
 from atalante_control.model import Patient
 from atalante_tools.bench.measure import Effort, Measurement, require
 
-#: What a gait may take on a core, and what it should [s].
-_LIMIT: Final = 3.0
-_TARGET: Final = 1.0
+#: Time limit of a gait from the kinematic guess, and from a neighbouring gait, on one core [s].
+_COLD_LIMIT: Final = 3.0
+_WARM_LIMIT: Final = 1.0
 _ROUNDS: Final = 12
 _CENTRE: Final = Subject(Patient(75.0, 1.75), 0.15, 0.9)
 _SUBJECTS: Final = (
@@ -27,25 +27,25 @@ _SUBJECTS: Final = (
 
 
 def gait_solve_cold(effort: Effort) -> Measurement:
-    """A gait from the kinematic guess."""
-    return Measurement(_solved(effort, None), _LIMIT)
+    """Measure the solution of a gait from the kinematic guess."""
+    return Measurement(_solved(effort, None), _COLD_LIMIT)
 
 
 def gait_solve_warm(effort: Effort) -> Measurement:
-    """A gait from that of a neighbour."""
-    return Measurement(_solved(effort, _centre()), _TARGET)
+    """Measure the solution of a gait from a neighbouring gait."""
+    return Measurement(_solved(effort, _centre()), _WARM_LIMIT)
 
 
 @cache
 def _centre() -> Gait:
-    """The neighbour of all subjects; once it is solved, the program is built."""
+    """Return the gait from which the warm benchmark starts. The first call also builds the nonlinear program."""
     from atalante_control.gait_optimization.solve import solve
 
     return solve(_CENTRE).gait
 
 
 def _solved(effort: Effort, neighbour: Gait | None) -> float:
-    """Median processor time of a solve [s], the program being built; compiled, unless it has to be quick."""
+    """Return the median processor time of a solution [s], without the time to build and compile the nonlinear program."""
     from atalante_control.gait_optimization.solve import solve
 
     if effort.quick:

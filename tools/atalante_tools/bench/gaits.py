@@ -1,4 +1,4 @@
-"""Benchmarks of the model and its gaits: what a session waits for before it walks, and what a library costs."""
+"""Benchmarks of the model, the gait network and the gait library."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from atalante_hal.robot import load_robot
 from atalante_tools.bench.measure import Effort, Measurement, require, timed
 
 _PATIENT: Final = Patient(75.0, 1.75)
-#: What an evaluation of the network may take [s].
+#: Time limit of one evaluation of the gait network [s].
 _BUDGET: Final = 50e-6
-#: What a gait of a library may take on a core [s].
+#: Time limit of one gait of a library on one core [s].
 _GAIT: Final = 3.0
 _BUILDS: Final = 3
 _EVALUATIONS: Final = 100
@@ -26,7 +26,7 @@ _DYNAMICS: Final = 100
 
 
 def model_build(effort: Effort) -> Measurement:
-    """From a patient's mass and height to the Pinocchio model."""
+    """Measure the construction of the Pinocchio model from mass and height of a patient."""
     robot, parameters = load_robot(), ExoskeletonParameters()
     text = urdf(parameters, robot, _PATIENT)
     return effort.interleave(
@@ -37,7 +37,7 @@ def model_build(effort: Effort) -> Measurement:
 
 
 def inverse_dynamics(effort: Effort) -> Measurement:
-    """Joint torques and ground wrench of one state on the stance foot."""
+    """Measure the inverse dynamics of one state on the stance foot: joint torques and ground wrench."""
     robot = load_robot()
     dynamics = stance_dynamics(robot, _PATIENT)
     model = pinocchio_model(urdf(ExoskeletonParameters(), robot, _PATIENT), fixed_base=False).model
@@ -47,7 +47,9 @@ def inverse_dynamics(effort: Effort) -> Measurement:
     floating = [(np.r_[np.zeros(6), 1.0, q], np.r_[np.zeros(6), v], np.r_[np.zeros(6), a]) for q, v, a in states]
     weight = pinocchio.computeTotalMass(model) * 9.81
     force = dynamics.forces(states[0][0], np.zeros(12), np.zeros(12)).force
-    require(abs(force[2] - weight) < 1e-6, f"the ground carries {force[2]:.1f} N of a weight of {weight:.1f} N")
+    require(
+        abs(force[2] - weight) < 1e-6, f"ground force must equal the weight of {weight:.1f} N, got {force[2]:.1f} N"
+    )
     ours, theirs = cycle(states), cycle(floating)
     return effort.interleave(
         timed(lambda: dynamics.forces(*next(ours)), _DYNAMICS),
@@ -56,28 +58,28 @@ def inverse_dynamics(effort: Effort) -> Measurement:
 
 
 def network_evaluation(effort: Effort) -> Measurement:
-    """Parameters in, twelve trajectories out."""
+    """Measure one evaluation of the gait network: from subject parameters to twelve joint trajectories."""
     network = load_network()
     inputs = np.random.default_rng(0).uniform(network.low, network.high, (64, len(network.low)))
     spread = np.ptp([network.coefficients(row) for row in inputs], axis=0).max()
-    require(spread > 0.05, f"the gaits differ by {spread:.3f} rad only")
+    require(spread > 0.05, f"the gaits must differ by more than 0.05 rad, got {spread:.3f} rad")
     rows = cycle(inputs)
     measured = effort.interleave(timed(lambda: network.coefficients(next(rows)), _EVALUATIONS), lambda: _BUDGET)
     return Measurement(measured.value, _BUDGET)
 
 
 def library_one_process(effort: Effort) -> Measurement:
-    """Seconds a gait of a library, one process."""
+    """Measure the time per gait of a library in one process."""
     return _library(effort, 1)
 
 
 def library_two_processes(effort: Effort) -> Measurement:
-    """Seconds a gait of a library, two processes."""
+    """Measure the time per gait of a library in two processes."""
     return _library(effort, 2)
 
 
 def _library(effort: Effort, jobs: int) -> Measurement:
-    """The fan-out of a library, from when every process has built its program and made a gait, to the last gait."""
+    """Measure the time per gait of a library. The first gait of each process includes its set-up and is not counted."""
     from atalante_control.gait_optimization.library import solve_subject
     from atalante_control.gait_optimization.network_error import random_subjects
     from atalante_control.gait_optimization.parallel import fan_out
@@ -93,4 +95,4 @@ def _library(effort: Effort, jobs: int) -> Measurement:
         elif done > 0:
             effort.progress(done, count)
     seconds = time.perf_counter() - began
-    return Measurement(seconds / count, _GAIT / jobs, (f"{count / seconds * 60:.0f} gaits a minute",))
+    return Measurement(seconds / count, _GAIT / jobs, (f"{count / seconds * 60:.0f} gaits per minute",))

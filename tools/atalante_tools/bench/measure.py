@@ -1,6 +1,7 @@
-"""How a figure is taken: value and baseline side by side in the same run, in short blocks A B A B, medians of each.
+"""Measurement of one benchmark: value and baseline in alternating short blocks, and the median of each.
 
-Absolute figures depend on the machine and on what else it does; both sides meet the same machine, so the ratio travels.
+Absolute times depend on the machine and its load. Both sides run under the same conditions, so the ratio is comparable
+between machines.
 """
 
 from __future__ import annotations
@@ -12,21 +13,21 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-#: Blocks of each side: enough for a median that other processes do not move, or just enough to see that it works.
+#: Number of blocks of each side for a robust median, and for a quick functional check.
 ROUNDS: Final = 200
 QUICK_ROUNDS: Final = 5
 
-#: Runs one block and returns its seconds for one unit of work.
+#: Function that runs one block and returns the time per unit of work [s].
 Block = Callable[[], float]
 
 
 class WorkError(Exception):
-    """A benchmark did not do the work it is about; its figures would mean nothing."""
+    """Benchmark did not do its work, so its times are meaningless."""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """Medians in seconds; None: not measured, and `remarks` say why. `remarks` are sentences for the person who asked."""
+    """Median times of value and baseline [s]; None: not measured. `remarks` are sentences to log, such as the reason."""
 
     value: float | None
     baseline: float | None
@@ -34,23 +35,33 @@ class Measurement:
 
     @property
     def ratio(self) -> float | None:
-        """Value over baseline."""
+        """Return value divided by baseline; None if one of them was not measured."""
         return None if self.value is None or not self.baseline else self.value / self.baseline
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much to measure. `progress(done, of)` is called after each round."""
+    """Number of rounds to measure. `progress(done, total)` is called after each round."""
 
     quick: bool = False
-    progress: Callable[[int, int], None] = field(default=lambda _done, _of: None)
+    progress: Callable[[int, int], None] = field(default=lambda _done, _total: None)
 
     def rounds(self, share: float = 1.0) -> int:
-        """Rounds of a benchmark whose blocks are long: a share of the usual number, at least a few."""
+        """Return the number of rounds.
+
+        Args:
+            share: fraction of the usual number, for benchmarks with long blocks; the result is at least `QUICK_ROUNDS`.
+        """
         return QUICK_ROUNDS if self.quick else max(QUICK_ROUNDS, round(ROUNDS * share))
 
     def interleave(self, value: Block, baseline: Block, share: float = 1.0) -> Measurement:
-        """Medians of both over the rounds, after one block each to warm up; the garbage collector rests meanwhile."""
+        """Run both blocks alternately and return the medians. One warm-up block each comes first; garbage collection is off.
+
+        Args:
+            value: block of the benchmark.
+            baseline: block of the baseline.
+            share: fraction of the usual number of rounds.
+        """
         rounds = self.rounds(share)
         value(), baseline()
         ours, theirs = [], []
@@ -63,9 +74,9 @@ class Effort:
 
 
 def timed(work: Callable[[], object], repetitions: int) -> Block:
-    """A block that calls `work` a number of times."""
+    """Return a block that calls `work` `repetitions` times."""
     counter = range(repetitions)
-    # What other processes take meanwhile is not in it.
+    # Processor time of this thread excludes the time used by other processes.
     now = time.thread_time
 
     def block() -> float:
@@ -77,14 +88,18 @@ def timed(work: Callable[[], object], repetitions: int) -> Block:
     return block
 
 
-def require(held: object, what: str) -> None:
-    """Raise `WorkError` unless the check held."""
-    if not held:
-        raise WorkError(what)
+def require(condition: object, message: str) -> None:
+    """Raise an error with `message` if the condition is false.
+
+    Raises:
+        WorkError: If the condition is false.
+    """
+    if not condition:
+        raise WorkError(message)
 
 
 class _no_collection:  # noqa: N801 - used like a function
-    """Garbage collection off inside the block: its pauses are the loop's business to avoid, not part of a stage."""
+    """Context with garbage collection off, because its pauses belong to no benchmark."""
 
     def __enter__(self) -> None:
         gc.collect()

@@ -1,4 +1,4 @@
-"""Benchmarks of what moves: the guide filter, the emulator, and the whole stack in the air."""
+"""Benchmarks of the guide filter, the emulator, and the whole stack on the suspended robot."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from atalante_tools.console.options import EMBEDDED, Target
 from atalante_tools.session.embedded import EmbeddedRobot
 from atalante_tools.session.rig import Rig, open_hal
 
-#: Exact flow and step-by-step integration agree within this [rad].
+#: Largest difference of exact flow and step-by-step integration [rad].
 AGREEMENT: Final = 1e-6
-#: A robot that walks keeps the gait within this [rad]; one that fell, hangs limp or exploded does not.
+#: Largest deviation of a joint from the gait while the robot walks [rad].
 POSE: Final = 0.15
-#: Cycles from the start until the robot walks, and of one block.
+#: Number of cycles from the start until the robot walks, and of one block.
 _BEFORE_WALKING: Final = 3000
 _BLOCK: Final = 50
 _TICKS: Final = 40
@@ -36,7 +36,7 @@ _MARCHES: Final = 4
 
 
 def filter_tick(effort: Effort) -> Measurement:
-    """u_v of both joints against nothing but the march of the rollouts."""
+    """Measure the guide filter of both joints against the step-by-step integration of its rollouts."""
     guide = walk().guide
     guide.start_step(ASSISTANCE, (ERROR, -ERROR), (ERROR_RATE, ERROR_RATE))
     march = SteppedRollouts(guide)
@@ -47,20 +47,23 @@ def filter_tick(effort: Effort) -> Measurement:
     ]
     saturated = guide.stepped
     worst = max(float(np.abs(guide.rollouts(*moment) - march.rollouts(*moment)).max()) for moment in moments)
-    require(worst <= AGREEMENT, f"the exact flow is {worst:.1e} rad off the integration, more than {AGREEMENT:.0e}")
+    require(
+        worst <= AGREEMENT,
+        f"the exact flow must agree with the integration within {AGREEMENT:.0e} rad, got {worst:.1e}",
+    )
     ours, theirs = cycle(moments), cycle(moments)
     measured = effort.interleave(
         timed(lambda: guide.tick(*next(ours)), _TICKS), timed(lambda: march.rollouts(*next(theirs)), _MARCHES)
     )
-    require(guide.stepped == saturated, "the filter saturated, which is another benchmark")
+    require(guide.stepped == saturated, "the filter must not saturate during the benchmark")
     return Measurement(measured.value, measured.baseline, (f"agrees with the integration to {worst:.1e} rad",))
 
 
 def emulator_tick(effort: Effort) -> Measurement:
-    """What the emulator does with a cycle while the whole stack walks, beside the engine's share of the same ticks.
+    """Measure one tick of the emulator while the whole stack walks, against the share of the engine in the same ticks.
 
-    Both are taken inside the cycle: a bare step repeated alone has its caches to itself and is a third cheaper, which no
-    emulator in a loop will ever see.
+    Both are measured inside the running stack. An engine step repeated alone takes a third less, because nothing else
+    uses the caches.
     """
     now = time.perf_counter
     ours: list[float] = []
@@ -87,26 +90,29 @@ def emulator_tick(effort: Effort) -> Measurement:
         body.exchange = timed_exchange  # type: ignore[attr-defined]
         bus.step = tick  # type: ignore[attr-defined]
         cycles = stack.walk(effort)
-        # What came before was not walking, what came after was holding.
+        # The robot does not walk before this range, and holds after it.
         walked = slice(_BEFORE_WALKING, _BEFORE_WALKING + cycles)
-        require(len(ours[walked]) == len(theirs[walked]) == cycles, f"only {len(ours)} ticks ran")
+        require(
+            len(ours[walked]) == len(theirs[walked]) == cycles,
+            f"{_BEFORE_WALKING + cycles} ticks expected, got {len(ours)}",
+        )
     return Measurement(statistics.median(ours[walked]), statistics.median(theirs[walked]))
 
 
 def lockstep(effort: Effort) -> Measurement:
-    """Wall time of a simulated second: HAL, controller, emulator, and a record into the ring every cycle."""
+    """Measure the wall time of a simulated second: HAL, controller, emulator, and one record per cycle."""
     with _stack(EmbeddedRobot()) as stack:
         stack.walk(effort)
     ordered = [block / (_BLOCK * PERIOD) for block in sorted(stack.blocks)]
     seconds, undisturbed = statistics.median(ordered), ordered[len(ordered) // 10]
-    # Two processes need two whole cores: who shares a core's other half with them takes almost half of their speed, unseen.
-    told = f"{1.0 / seconds:.1f} times real time; {1.0 / undisturbed:.1f} in the tenth of its blocks least disturbed by others"
-    return Measurement(seconds, 1.0, (told,))
+    # A process on the sibling hyperthread of a core takes almost half of its speed and does not show up in the load.
+    remark = f"{1.0 / seconds:.1f} times real time; {1.0 / undisturbed:.1f} times in the fastest tenth of the blocks"
+    return Measurement(seconds, 1.0, (remark,))
 
 
 @dataclass
 class _Stack:
-    """Everything in the air, as `atalante demo` runs it."""
+    """HAL, controller and emulator of the suspended robot, as in `atalante demo`."""
 
     rig: Rig
     controller: AirwalkController
@@ -114,31 +120,34 @@ class _Stack:
     blocks: list[float] = field(default_factory=list)  # s, wall time of each block of walking
 
     def walk(self, effort: Effort) -> int:
-        """Start, walk, and stop after the effort's rounds of `_BLOCK` cycles; returns how many that were.
+        """Run until the robot has walked for all rounds of `_BLOCK` cycles; return the number of cycles walked.
+
+        Args:
+            effort: number of rounds, and progress display.
 
         Raises:
-            WorkError: the robot did not walk, or frames or records were lost.
+            WorkError: If the robot does not walk, or frames or records are lost.
         """
         rounds = effort.rounds()
         cycles = rounds * _BLOCK
         count = 0
-        begun = 0.0
+        start = 0.0
 
-        def over(state: State) -> bool:
-            nonlocal count, begun
+        def finished(state: State) -> bool:
+            nonlocal count, start
             count += 1
             walked = count - _BEFORE_WALKING
             if walked >= 0 and walked % _BLOCK == 0:
-                ended = time.perf_counter()
+                end = time.perf_counter()
                 if walked:
-                    self.blocks.append(ended - begun)
+                    self.blocks.append(end - start)
                     effort.progress(walked // _BLOCK, rounds)
                 self._require_walking(state)
-                begun = time.perf_counter()
+                start = time.perf_counter()
             return walked == cycles
 
         hal, ring = self.rig.hal, self.ring
-        self.rig.run(self.controller, until=over, record=lambda: ring.write(hal.record))
+        self.rig.run(self.controller, until=finished, record=lambda: ring.write(hal.record))
         require(
             ring.written == _BEFORE_WALKING + cycles, f"{ring.written} records in {_BEFORE_WALKING + cycles} cycles"
         )
@@ -147,16 +156,19 @@ class _Stack:
         return cycles
 
     def _require_walking(self, state: State) -> None:
-        """A robot that fell or hangs limp is cheaper to simulate."""
+        """Require a robot that walks, because a robot without motion is cheaper to simulate."""
         reason = self.rig.hal.reason
-        require(state.supervisor is SupervisorState.ACTIVE, f"the robot is in {state.supervisor.name}: {reason}")
+        require(
+            state.supervisor is SupervisorState.ACTIVE,
+            f"the robot must be in ACTIVE, got {state.supervisor.name}: {reason}",
+        )
         error = np.abs(state.position - self.controller.telemetry[: len(state.position)]).max()
-        require(error < POSE, f"a joint is {error:.2f} rad off the gait, more than {POSE}")
+        require(error < POSE, f"joint deviation from the gait must be below {POSE} rad, got {error:.2f} rad")
 
 
 @contextmanager
 def _stack(robot_process: EmbeddedRobot | None) -> Iterator[_Stack]:
-    """With the robot in a process of its own, or in this one."""
+    """Open the whole stack, with the emulated robot in a subprocess (`robot_process`) or in-process (None)."""
     walking = walk()
     controller = AirwalkController(walking.robot, walking.gait, CONSTANT)
     with (

@@ -1,8 +1,8 @@
-"""The nodes as a recording: frames sealed beforehand, with right counters and checksums, played to a HAL in lock-step.
+"""Recorded nodes: frames prepared in advance, with valid counters and CRCs, played to a HAL in lock-step.
 
-What the HAL costs is measured without an emulator: a cycle's answer is one copy of bytes. The recording trembles about the first
-pose of a swing, with a small tracking error: the guide filter has to do with the numbers of a walk, and no plausibility check
-finds anything.
+They replace the emulator in benchmarks of the HAL: the answer to a SYNC is a single copy of bytes. The recording
+oscillates about the first pose of a swing with a small tracking error, so the guide filter works on realistic values and
+no plausibility check fails.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from atalante_tools.bench.measure import require
 
 Vector = npt.NDArray[np.float64]
 
-#: Cycles of the recording: one turn of the alive counters, and how many poses it has: odd, so that whoever looks at every 16th
-#: cycle sees another one.
+#: Number of cycles of the recording: one turn of the alive counters.
 TURN = 256
+#: Number of poses of the recording. Odd, so that a check of every 16th cycle gets a different pose each time.
 POSES = 15
-#: Tracking error of the recorded walk [rad], and its speed [rad/s]: inside the guide, so that nothing saturates.
+#: Tracking error of the recorded walk [rad], and its rate [rad/s]; small enough that the guide filter does not saturate.
 ERROR = 0.01
 ERROR_RATE = 0.05
 PERIOD = 1e-3  # s
@@ -47,7 +47,7 @@ _E2E = Struct("<HB")
 
 @dataclass(frozen=True)
 class Walk:
-    """What is walked in the recording."""
+    """Network, robot, gait and guide filter of the recording."""
 
     network: Network
     robot: Robot
@@ -58,32 +58,34 @@ class Walk:
 
 @cache
 def walk() -> Walk:
-    """The gait of the demo and its guide filter."""
+    """Return the gait of the demo and its guide filter."""
     network, robot = atalante_dbc.load(), load_robot()
     gait = load_gait(AIRWALK_GAIT, robot)
     return Walk(network, robot, gait, gait.tables(), AirwalkController(robot, gait, CONSTANT).guide_at(ASSISTANCE))
 
 
 def cyclic_messages(network: Network) -> list[Message]:
-    """What the HAL receives in every cycle, in the order of the buses."""
+    """Return the messages the HAL receives in every cycle, in the order of the buses."""
     return [m for bus in network.buses for m in network.received_by("HAL") if m.bus == bus and m.cycle_ms == 1]
 
 
 def syncs(network: Network) -> list[Message]:
-    """The SYNC of each bus, in the order in which the HAL sends them."""
+    """Return the SYNC message of each bus, in the order in which the HAL sends them."""
     return [m for m in network.sent_by("HAL") if m.name.startswith("SYNC_")]
 
 
 class Recording:
-    """The nodes' answers, cycle by cycle: `play` puts one into memory.
+    """Answers of the nodes, cycle by cycle. `play` writes one cycle into `frames`.
 
-    It is small, so that playing it does not empty the caches: `POSES` payloads, and the checksum of each for each counter.
+    The recording is small to keep the caches warm: `POSES` payloads, and the CRC of each payload for each counter.
 
     Attributes:
-        cyclic: the messages of every cycle, in order.
-        slow: the slower ones, each with its period and phase [cycles].
-        frames: what `play` writes.
-        values: what the cyclic messages say, shape (POSES, signals), order of `Codec(cyclic).signals`.
+        cyclic: messages of every cycle, in order.
+        slow: messages with longer periods, each with its period and phase [cycles].
+        frames: frames of the current cycle, written by `play`.
+        values: physical values of the cyclic messages, shape (POSES, signals), in the order of `Codec(cyclic).signals`.
+        cycles: number of cycles played.
+        pose: index of the last pose played.
     """
 
     def __init__(self, walk: Walk) -> None:
@@ -98,17 +100,19 @@ class Recording:
         error = rng.uniform(-ERROR, ERROR, len(JOINTS))
         self.values[:, codec.slice("Position")] = (walk.tables.q[0] + error + swing) * motor
         self.values[:, codec.slice("Velocity")] = ERROR_RATE * np.cos(phase) * motor
-        turn = np.where(np.arange(POSES) % 2, 1.0, -1.0)[:, None]  # no two looks at a sensor are alike
+        turn = np.where(np.arange(POSES) % 2, 1.0, -1.0)[:, None]  # consecutive sensor values differ
         for name, noise in (("Torque", 0.05), ("Gyro", 0.01), ("Accel", 0.05), ("Force", 1.0)):
-            places = codec.slice(name)
-            self.values[:, places] += turn * rng.uniform(0.5 * noise, noise, (POSES, places.stop - places.start))
+            columns = codec.slice(name)
+            self.values[:, columns] += turn * rng.uniform(0.5 * noise, noise, (POSES, columns.stop - columns.start))
         for side, leg in (("LEFT", 0), ("RIGHT", len(JOINTS) // 2)):
-            pitch = 0.5 * (walk.tables.q[0] + error)[leg + 2 : leg + 4].sum()  # half of hip and knee
+            pitch = (
+                0.5 * (walk.tables.q[0] + error)[leg + 2 : leg + 4].sum()
+            )  # rad, half of the sum of hip and knee angle
             for axis, value in (("W", np.cos(pitch)), ("Y", np.sin(pitch))):
                 self.values[:, codec.index(f"IMU_{side}_TIBIA_STATE", f"Quaternion{axis}")] = value
-        press = [codec.index("PENDANT_STATE", name) for name in ("Request", "RequestCounter")]
+        request = [codec.index("PENDANT_STATE", name) for name in ("Request", "RequestCounter")]
         self._before = _seal(image, self.values)
-        self.values[:, press] = 1.0  # START, pressed once
+        self.values[:, request] = 1.0  # START pressed once
         self._steady = _seal(image, self.values)
 
         slow = [m for m in network.received_by("HAL") if m.cycle_ms > 1]
@@ -117,7 +121,7 @@ class Recording:
         image.values[image.codec.slice("NodeState")] = 5  # operational
         image.values[image.codec.slice("SupplyVoltage")] = 48.0
         gap = max(m.cycle_ms for m in slow) // len(slow)
-        #: Spread so that all blocks of ten cycles are alike.
+        #: Phases are spread evenly, so that every block of ten cycles has the same load.
         self.slow = tuple((m, m.cycle_ms, gap * row % m.cycle_ms) for row, m in enumerate(slow))
         self._slow = _seal(image, image.values[None, :])
         self._slow_turn = [0] * len(slow)
@@ -129,27 +133,27 @@ class Recording:
         self.frames = new_frames(rows + len(slow))
         self._cyclic_memory = self.frames[:rows].view(np.uint8).data
         self._cyclic_counters, self._cyclic_checksums = _e2e_fields(self.frames[:rows])
-        self._places = [self.frames[rows + i : rows + i + 1].view(np.uint8).data for i in range(len(slow))]
+        self._slow_memory = [self.frames[rows + i : rows + i + 1].view(np.uint8).data for i in range(len(slow))]
         self.cycles = 0
-        self.pose = 0  # played last
+        self.pose = 0
 
     def play(self) -> int:
-        """Write the next cycle into `frames`; returns how many there are."""
+        """Write the next cycle into `frames`; return the number of frames."""
         cycle = self.cycles
         self.cycles = cycle + 1
-        tag = self.cycles % TURN  # low byte of the SYNC's number: a HAL's first is 1
+        tag = self.cycles % TURN  # low byte of the SYNC cycle number, which starts at 1
         self.pose = tag % POSES
         sealed = self._before if cycle < TURN else self._steady
         self._cyclic_memory[:] = sealed.payloads[self.pose]
         self._cyclic_counters.fill(tag)
         self._cyclic_checksums[:] = sealed.checksums[tag]
         due = self._due[cycle % len(self._due)]
-        for place, row in zip(self._places, due, strict=False):
+        for memory, row in zip(self._slow_memory, due, strict=False):
             turn = self._slow_turn[row]
             self._slow_turn[row] = (turn + 1) % TURN
-            at = row * FRAME_BYTES
-            place[:] = self._slow.payloads[0][at : at + FRAME_BYTES]
-            _E2E.pack_into(place, HEADER_BYTES, self._slow.checksums[turn, row], turn)
+            start = row * FRAME_BYTES
+            memory[:] = self._slow.payloads[0][start : start + FRAME_BYTES]
+            _E2E.pack_into(memory, HEADER_BYTES, self._slow.checksums[turn, row], turn)
         return len(self.cyclic) + len(due)
 
 
@@ -170,7 +174,7 @@ def _seal(image: TransmitImage, values: Vector) -> _Sealed:
 
 
 def _e2e_fields(frames: Frames) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint16]]:
-    """Views of the counters and of the checksums of frames."""
+    """Return views of the counters and the CRCs of frames, shape (frames,) each."""
     octets, halves = (
         frames.view(np.uint8).reshape(-1, FRAME_BYTES),
         frames.view(np.uint16).reshape(-1, FRAME_BYTES // 2),
@@ -179,19 +183,19 @@ def _e2e_fields(frames: Frames) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.u
 
 
 def _walking(walk: Walk, image: TransmitImage) -> Vector:
-    """Values of the cyclic messages that do not change: everything measured is in its range, everything is well."""
+    """Return the constant part of the values: measurements within range and states without error. Shape (signals,)."""
     codec, rng = image.codec, np.random.default_rng(1)
     values = np.zeros(codec.size)
     for name, low, high in (
         ("Torque", -20.0, 20.0), ("Force", -5.0, 5.0), ("Gyro", -0.1, 0.1), ("Accel", -0.1, 0.1),
     ):  # fmt: skip
-        places = codec.slice(name)
-        values[places] = rng.uniform(low, high, places.stop - places.start)
-    for place, (_, signal) in enumerate(codec.signals):
+        columns = codec.slice(name)
+        values[columns] = rng.uniform(low, high, columns.stop - columns.start)
+    for column, (_, signal) in enumerate(codec.signals):
         if signal.name == "Temperature":
-            values[place] = 30.0
+            values[column] = 30.0
         elif signal.name == "DriveState":
-            values[place] = DriveState.OPERATION_ENABLED
+            values[column] = DriveState.OPERATION_ENABLED
     values[codec.slice("Accel")][2::3] += 9.81
     values[codec.slice("Quaternion")][::4] = 1.0
     for name, value in (("DeadMan", 1.0), ("AssistanceSet", 1.0), ("AssistanceFactor", ASSISTANCE)):
@@ -200,32 +204,32 @@ def _walking(walk: Walk, image: TransmitImage) -> Vector:
 
 
 class RecordedBus:
-    """The HAL's bus (see `atalante_hal.bus.Bus`) with nothing behind it but the recording: each SYNC plays the next cycle."""
+    """Bus (see `atalante_hal.bus.Bus`) whose nodes are the recording. Each SYNC plays the next cycle."""
 
     def __init__(self, recording: Recording) -> None:
         self.name, self.dropped = "recording", 0
         self.stamps: Stamps = np.zeros(len(recording.frames), np.int64)
-        self.heard = 0  # frames of the HAL
+        self.sent = 0  # frames sent by the HAL
         self._recording, self._memory = recording, recording.frames.view(np.uint8).data
         self._into, self._into_memory = recording.frames, self._memory
         self._syncs = len(syncs(walk().network))
         self._synced = False
-        self._prepared: list[bytes] = []  # of the next cycles, the last one first
+        self._prepared: list[bytes] = []  # frames of the next cycles, in reverse order
 
     def prepare(self, cycles: int) -> None:
-        """Play the next cycles beforehand: what the nodes spend is not the HAL's."""
+        """Play the next cycles in advance, so that the time of the nodes is not measured as time of the HAL."""
         memory = self._memory
         self._prepared = [memory[: self._recording.play() * FRAME_BYTES].tobytes() for _ in range(cycles)][::-1]
 
     def send(self, frames: Frames) -> None:
-        """Count; a batch as long as the SYNCs of a cycle is them."""
+        """Count the frames. A batch with as many frames as there are buses is the batch of SYNCs."""
         count = len(frames)
-        self.heard += count
+        self.sent += count
         if count == self._syncs:
             self._synced = True
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """The next cycle, if there was a SYNC since the last."""
+        """Return the frames of the next cycle, if a SYNC was sent since the last one."""
         if not self._synced:
             return 0
         self._synced = False
@@ -239,12 +243,12 @@ class RecordedBus:
         return size // FRAME_BYTES
 
     def close(self) -> None:
-        """Nothing to do."""
+        """Do nothing; there is no resource to release."""
 
 
 @dataclass
 class RecordedRig:
-    """A HAL in ACTIVE on recorded nodes."""
+    """HAL in ACTIVE on recorded nodes."""
 
     hal: Hal
     bus: RecordedBus
@@ -252,10 +256,10 @@ class RecordedRig:
 
 
 def active_rig() -> RecordedRig:
-    """Build it and bring it to ACTIVE.
+    """Build a HAL on recorded nodes and bring it to ACTIVE.
 
     Raises:
-        WorkError: it does not get there.
+        WorkError: If the HAL does not reach ACTIVE.
     """
     recording = Recording(walk())
     bus = RecordedBus(recording)
@@ -264,12 +268,14 @@ def active_rig() -> RecordedRig:
         hal.read()
         hal.hold()
     state = hal.state.supervisor
-    require(state is SupervisorState.ACTIVE, f"the HAL on recorded nodes is in {state.name}, not ACTIVE: {hal.reason}")
+    require(
+        state is SupervisorState.ACTIVE, f"the HAL on recorded nodes must be in ACTIVE, got {state.name}: {hal.reason}"
+    )
     return RecordedRig(hal, bus, recording)
 
 
 class FilterOnly:
-    """A controller that is the guide filter on two joints and nothing else."""
+    """Controller that consists only of the guide filter on two joints."""
 
     def __init__(self, walk: Walk) -> None:
         self._guide, self._cycle = walk.guide, 0
@@ -277,12 +283,20 @@ class FilterOnly:
         self._command = Command(np.zeros(len(JOINTS)), np.full(8, 0.25))
 
     def update(self, state: State) -> Command:
-        """One cycle."""
+        """Return the command of one cycle."""
         self.filter(self._command.torque, *state.position[2:4].tolist(), *state.velocity[2:4].tolist())
         return self._command
 
     def filter(self, torque: Vector, hip: float, knee: float, hip_rate: float, knee_rate: float) -> None:
-        """Write u_v of the left SH and SK into the torques."""
+        """Write the guide torques u_v of the left SH and SK into `torque`.
+
+        Args:
+            torque: joint torques [Nm], shape (12,); entries 2 and 3 are written.
+            hip: angle of the left SH [rad].
+            knee: angle of the left SK [rad].
+            hip_rate: velocity of the left SH [rad/s].
+            knee_rate: velocity of the left SK [rad/s].
+        """
         cycle = self._cycle % TURN
         if not cycle:
             self._guide.start_step(ASSISTANCE, (0.01, -0.01), (0.05, 0.05))

@@ -1,8 +1,8 @@
-"""The HAL cycle as one would write it with python-can and cantools: the baseline of `hal_cycle`.
+"""HAL cycle written with python-can and cantools: the baseline of `hal_cycle`.
 
-The same frames, the same check of CRC, counter and range, the same filter and limiter; message by message and signal by
-signal. What it leaves out (ages, supervisor, record, HOLD) is to its advantage. Its bus is python-can's own for one process,
-`virtual`; what the nodes spend on sending is not counted.
+It processes the same frames with the same checks of CRC, counter and range and the same filter and limiter, message by
+message and signal by signal. It omits ages, supervisor, record and HOLD, which makes it faster. The bus is the in-process
+`virtual` bus of python-can. The time of the nodes to send is not measured.
 """
 
 from __future__ import annotations
@@ -23,23 +23,22 @@ from atalante_tools.bench.nodes import FilterOnly, Recording, Walk, syncs
 
 
 class VirtualNodes:
-    """The recording at the other end of a python-can `virtual` bus."""
+    """Recorded nodes on a python-can `virtual` bus."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._bus = can.Bus(interface="virtual", channel="bench")
-        self.heard = 0
 
     def answer(self, cycles: int) -> list[int]:
-        """Put the next cycles' frames on the bus and take what was sent to the nodes; returns how many are in each cycle."""
+        """Discard the frames sent to the nodes, send the frames of the next cycles, and return the number of frames per cycle."""
         while self._bus.recv(0.0) is not None:
-            self.heard += 1
+            pass
         return [self._answer_one() for _ in range(cycles)]
 
     def _answer_one(self) -> int:
         count = self._recording.play()
-        for place in range(count):
-            frame = self._recording.frames[place]
+        for row in range(count):
+            frame = self._recording.frames[row]
             data = frame["data"][: frame["len"]].tobytes()
             self._bus.send(
                 can.Message(
@@ -53,12 +52,12 @@ class VirtualNodes:
         return count
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Close the bus."""
         self._bus.shutdown()
 
 
 class PythonCanHal:
-    """One cycle at a time; the state is in plain arrays."""
+    """HAL that runs one cycle per call and keeps its state in plain arrays."""
 
     def __init__(self, walk: Walk, recording: Recording, controller: FilterOnly) -> None:
         network, robot = walk.network, walk.robot
@@ -84,7 +83,7 @@ class PythonCanHal:
         self._last_counter: dict[int, int] = {}
         self._counter: dict[int, int] = {}
         self._cycle = 0
-        self.refused = 0
+        self.rejected = 0
         joints = np.zeros((5, len(JOINTS)))
         self._motion = joints[:2]
         self.position, self.velocity, self.torque, self.temperature, self.drive_state = joints
@@ -94,16 +93,16 @@ class PythonCanHal:
         self.pendant: dict[str, Any] = {}
 
     def cycle(self, count: int) -> None:
-        """SYNC, receive the `count` frames of the cycle, filter, limit, command."""
+        """Run one cycle: send SYNC, receive the `count` frames of the answer, filter, limit, send commands."""
         self._cycle += 1
         for frame_id in self._syncs:
             self._send(frame_id, {"HalState": 2, "Cycle": self._cycle})
         missing = set(self._cyclic)
         for _ in range(count):
             message = self.bus.recv(0.0)
-            if message is not None and self._take(message):
+            if message is not None and self._receive(message):
                 missing.discard(message.arbitration_id)
-        self.refused += len(missing)
+        self.rejected += len(missing)
         self._controller.filter(self._torque, *self.position[2:4].tolist(), *self.velocity[2:4].tolist())
         self._limiter.apply(self._torque, self._motion)
         torque = self._limiter.last.tolist()
@@ -126,26 +125,26 @@ class PythonCanHal:
             can.Message(arbitration_id=frame_id, data=data, is_extended_id=False, is_fd=True, bitrate_switch=True)
         )
 
-    def _take(self, message: can.Message) -> bool:
+    def _receive(self, message: can.Message) -> bool:
         frame_id, data = message.arbitration_id, message.data
         if crc_hqx(self._data_id[frame_id], crc_hqx(data[2:], CRC_START)) != data[0] | data[1] << 8:
-            self.refused += 1
+            self.rejected += 1
             return False
         counter = data[2]
         last = self._last_counter.get(frame_id)
         self._last_counter[frame_id] = counter
         if last is not None and not 1 <= (counter - last) & 0xFF <= 5:
-            self.refused += 1
+            self.rejected += 1
             return False
         values: Any = self._database.decode_message(frame_id, bytes(data), decode_choices=False)
         for signal in self._signals[frame_id]:
             if not signal.minimum <= values[signal.name] <= signal.maximum:
-                self.refused += 1
+                self.rejected += 1
                 return False
-        self._keep(frame_id, values)
+        self._store(frame_id, values)
         return True
 
-    def _keep(self, frame_id: int, values: dict[str, Any]) -> None:
+    def _store(self, frame_id: int, values: dict[str, Any]) -> None:
         if (joint := self._joint.get(frame_id)) is not None:
             self.position[joint] = values["Position"] * self._per_turn[joint]
             self.velocity[joint] = values["Velocity"] * self._per_turn[joint]

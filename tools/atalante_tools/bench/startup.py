@@ -1,4 +1,4 @@
-"""Benchmark of a whole process: how long a newcomer waits for the first cycle."""
+"""Benchmark of a whole process, from its start to the first cycle."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _IMPORT_ALONE: Final = "import pybullet; print(1)"
 
 
 def start_up(effort: Effort) -> Measurement:
-    """From the shell to the first cycle of HAL and emulator in one process, and out again."""
+    """Measure a process that starts HAL and emulator, runs one cycle and exits."""
     ours: list[float] = []
     theirs: list[float] = []
     rounds = 1 if effort.quick else 5

@@ -1,8 +1,8 @@
-"""The virtual guide's rollouts integrated step by step: the witness and the baseline of the exact flow.
+"""Rollouts of the virtual guide by step-by-step integration: reference and baseline of the exact flow.
 
-Not in the control loop. It does what the guide filter does without its idea: for each cycle it marches all four
-rollouts (two joints, two extreme disturbances) over the same horizon grid, with as few numpy operations a step as such
-a march can have: each interval exactly discretised beforehand, the rollouts of all joints side by side.
+This module is not part of the control loop. In each cycle it integrates all four rollouts (two joints, two extreme
+disturbances) over the horizon grid of the guide filter. The exact discretisation of each interval is computed in advance
+and all rollouts advance together, so that the number of numpy operations per step is minimal.
 """
 
 from __future__ import annotations
@@ -17,16 +17,20 @@ Vector = npt.NDArray[np.float64]
 
 
 class SteppedRollouts:
-    """Marches the rollouts of a guide filter; monotone, unsaturated backup policies."""
+    """Step-by-step integration of the rollouts of a guide filter with monotone, unsaturated backup policies."""
 
     def __init__(self, guide: GuideFilter) -> None:
-        """Take over the guide's grid, gains and disturbance bounds."""
+        """Copy grid, gains and disturbance bounds of the guide filter.
+
+        Args:
+            guide: guide filter whose rollouts are integrated.
+        """
         self._guide = guide
         config = guide.config
         lengths = np.arange(guide.stride + 1, dtype=np.float64) * PERIOD
         joints = [0, 0, 1, 1]
         self._phi = np.stack([config.policies[j].transition(lengths) for j in joints], axis=3)
-        # The march is in e for every rollout; the lower extreme pushes down.
+        # Every rollout is integrated in the tracking error e. Columns of a joint: upper, then lower disturbance extreme.
         extremes = [config.disturbance[j][side] for j, side in zip(joints, (1, 0, 1, 0), strict=True)]
         self._push = np.stack(
             [config.policies[j].step_response(lengths) * u for j, u in zip(joints, extremes, strict=True)], axis=2
@@ -35,7 +39,7 @@ class SteppedRollouts:
         self.start_step()
 
     def start_step(self) -> None:
-        """Take over P after the guide's own `start_step`: what the forcing adds over each interval."""
+        """Update the particular solution P and its increment per grid interval. Call it after `GuideFilter.start_step`."""
         guide = self._guide
         self._p = guide.solution()[:, [[0, 0, 2, 2], [1, 1, 3, 3]]]
         interval = self._p[guide.grid]
@@ -43,7 +47,18 @@ class SteppedRollouts:
         self._added = interval[1:] - carried + self._push[guide.stride]
 
     def rollouts(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Vector:
-        """As `GuideFilter.rollouts`. Shape (4, n) [rad]."""
+        """Return the rollouts of both joints, as `GuideFilter.rollouts` does.
+
+        Args:
+            cycle: cycle of the step.
+            e_hip: tracking error of the hip [rad].
+            ed_hip: rate of the tracking error of the hip [rad/s].
+            e_knee: tracking error of the knee [rad].
+            ed_knee: rate of the tracking error of the knee [rad/s].
+
+        Returns:
+            Rollouts of hip and knee for both disturbance extremes, shape (4, n) [rad].
+        """
         guide = self._guide
         first = int(np.searchsorted(guide.grid, cycle))
         lag = int(guide.grid[first]) - cycle

@@ -1,4 +1,4 @@
-"""Benchmarks of what happens to frames: the HAL's cycle and its stages."""
+"""Benchmarks of the HAL cycle and its stages: decode, encode, E2E check, record."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from atalante_tools.bench.generated_c import COMPILER, GeneratedC, available
 from atalante_tools.bench.measure import Effort, Measurement, require, timed
 from atalante_tools.bench.nodes import FilterOnly, RecordedRig, Recording, active_rig, walk
 
-#: Cycles of a block: the mix of slow messages repeats after ten.
+#: Number of cycles of a block; the pattern of slow messages repeats after ten cycles.
 _BLOCK: Final = 10
-#: Repetitions inside a block where a single one is short.
+#: Number of repetitions inside a block for short functions, in Python and in C.
 _MANY: Final = 100
 _MANY_IN_C: Final = 1000
-#: What both sides read of the robot.
+#: Robot state that is compared between both HALs.
 _COMPARED: Final = (
     "position", "velocity", "torque", "temperature", "drive_state", "imu_quaternion", "imu_gyro", "imu_accel", "foot_force",
 )  # fmt: skip
 
 
 def hal_cycle(effort: Effort) -> Measurement:
-    """Receive, E2E, decode, filter on two joints, limiter, encode, send."""
+    """Measure the whole cycle: receive, E2E check, decode, filter on two joints, limiter, encode, send."""
     from atalante_tools.bench.python_can_hal import PythonCanHal, VirtualNodes
 
     rig, ours = _hal()
@@ -38,28 +38,28 @@ def hal_cycle(effort: Effort) -> Measurement:
 
     def our_block() -> float:
         rig.bus.prepare(_BLOCK)
-        begun = time.perf_counter()
+        start = time.perf_counter()
         for _ in range(_BLOCK):
             ours()
-        return (time.perf_counter() - begun) / _BLOCK
+        return (time.perf_counter() - start) / _BLOCK
 
     def their_block() -> float:
         frames = nodes.answer(_BLOCK)
-        begun = time.perf_counter()
+        start = time.perf_counter()
         for count in frames:
             theirs.cycle(count)
-        return (time.perf_counter() - begun) / _BLOCK
+        return (time.perf_counter() - start) / _BLOCK
 
     their_block(), their_block()
-    heard, played, cycles = rig.bus.heard, rig.recording.cycles, rig.hal.state.cycle
+    sent_before, played, cycles = rig.bus.sent, rig.recording.cycles, rig.hal.state.cycle
     measured = effort.interleave(our_block, their_block)
     _check_hal(rig)
-    sent, answered = rig.bus.heard - heard, rig.recording.cycles - played
+    sent, answered = rig.bus.sent - sent_before, rig.recording.cycles - played
     elapsed = rig.hal.state.cycle - cycles
     require(
         answered == elapsed and sent >= 7 * elapsed, f"{sent} frames sent and {answered} answers in {elapsed} cycles"
     )
-    require(theirs.refused == 0, f"the baseline refused {theirs.refused} frames")
+    require(theirs.rejected == 0, f"the baseline rejected {theirs.rejected} frames")
     while rig.recording.pose != recording.pose:
         theirs.cycle(*nodes.answer(1))
     _check_same_state(rig, theirs)
@@ -69,7 +69,7 @@ def hal_cycle(effort: Effort) -> Measurement:
 
 
 def decode_cycle(effort: Effort) -> Measurement:
-    """Everything the HAL receives in a cycle, to physical values, with the range of each signal looked at."""
+    """Measure the decoding of all messages received in a cycle, with the range check of every signal."""
     if (missing := _no_compiler()) is not None:
         return missing
     recording = Recording(walk())
@@ -80,15 +80,15 @@ def decode_cycle(effort: Effort) -> Measurement:
     ours, theirs = np.empty(codec.size), np.empty(codec.size)
     require(codec.decode(frames, ours), "the recording has signals outside their range")
     generated.decode(frames, theirs, 1)
-    require(generated.inside, "the generated C finds signals outside their range")
-    require(np.allclose(ours, theirs, rtol=1e-12, atol=0.0), "the generated C decodes other values")
+    require(generated.inside, "the generated C code reports signals outside their range")
+    require(np.allclose(ours, theirs, rtol=1e-12, atol=0.0), "the generated C code decodes different values")
     return effort.interleave(
         timed(lambda: codec.decode(frames, ours), _MANY), lambda: generated.decode(frames, theirs, _MANY_IN_C)
     )
 
 
 def encode_cycle(effort: Effort) -> Measurement:
-    """Everything the HAL sends in a cycle, from physical values, with the range of each signal looked at."""
+    """Measure the encoding of all messages sent in a cycle, with the range check of every signal."""
     if (missing := _no_compiler()) is not None:
         return missing
     codec = Codec([m for m in walk().network.sent_by("HAL") if m.cycle_ms == 1])
@@ -99,20 +99,22 @@ def encode_cycle(effort: Effort) -> Measurement:
     generated = GeneratedC(codec)
     codec.encode(values, ours)
     generated.encode(values, theirs, 1)
-    require(generated.inside, "the generated C finds values outside their range")
+    require(generated.inside, "the generated C code reports values outside their range")
     decoded = np.empty((2, codec.size))
     for frames, out in zip((ours, theirs), decoded, strict=True):
         codec.decode(frames, out)
-    # The generated C truncates where we round.
+    # The generated C code truncates, while the codec rounds.
     resolution = np.array([s.factor for _, s in codec.signals])
-    require((np.abs(decoded[0] - decoded[1]) <= 1.001 * resolution).all(), "the generated C encodes other values")
+    require(
+        (np.abs(decoded[0] - decoded[1]) <= 1.001 * resolution).all(), "the generated C code encodes different values"
+    )
     return effort.interleave(
         timed(lambda: codec.encode(values, ours), _MANY), lambda: generated.encode(values, theirs, _MANY_IN_C)
     )
 
 
 def e2e_check(effort: Effort) -> Measurement:
-    """CRC and counter of everything the HAL receives in a cycle."""
+    """Measure the check of CRC and counter of all messages received in a cycle."""
     recording = Recording(walk())
     recording.play()
     count = len(recording.cyclic)
@@ -127,30 +129,33 @@ def e2e_check(effort: Effort) -> Measurement:
     payloads = [(f["data"][: m.length], m.data_id) for f, m in zip(recording.frames, recording.cyclic, strict=False)]
 
     def theirs() -> bool:
-        good = True
+        valid = True
         for (data, data_id), counter in zip(payloads, expected, strict=True):
             payload = data.tobytes()
-            good &= check(payload, data_id) and payload[COUNTER_BYTE] == counter
-        return good
+            valid &= check(payload, data_id) and payload[COUNTER_BYTE] == counter
+        return valid
 
-    require(ours() and theirs(), "a good cycle is refused")
+    require(ours() and theirs(), "a valid cycle was rejected")
     recording.frames[count // 2]["data"][5] ^= 1
-    require(not ours() and not theirs(), "a damaged frame passes")
+    require(not ours() and not theirs(), "a damaged frame was accepted")
     recording.frames[count // 2]["data"][5] ^= 1
     measured = effort.interleave(timed(ours, _MANY), timed(theirs, _BLOCK))
-    require(ours() and theirs(), "a good cycle is refused after the benchmark")
+    require(ours() and theirs(), "a valid cycle was rejected after the benchmark")
     return Measurement(measured.value, measured.baseline, remark)
 
 
 def ring_write(effort: Effort) -> Measurement:
-    """One record into the shared-memory ring."""
+    """Measure the write of one record into the shared-memory ring."""
     rig, cycle = _hal()
     record = rig.hal.record
     with RingWriter(record.nbytes) as ring:
         measured = effort.interleave(timed(lambda: ring.write(record), _MANY), timed(cycle, _BLOCK))
         ring.write(record)
-        require(ring.last() == record.tobytes(), "the ring does not hold what was written")
-        require(ring.written >= effort.rounds() * _MANY, f"the ring counts {ring.written} records only")
+        require(ring.last() == record.tobytes(), "the last record of the ring must equal the record written")
+        require(
+            ring.written >= effort.rounds() * _MANY,
+            f"the ring must hold at least {effort.rounds() * _MANY} records, got {ring.written}",
+        )
     _check_hal(rig)
     return measured
 
@@ -170,13 +175,20 @@ def _hal() -> tuple[RecordedRig, Callable[[], object]]:
 def _check_hal(rig: RecordedRig) -> None:
     hal = rig.hal
     state = hal.state
-    require(state.supervisor is SupervisorState.ACTIVE, f"the HAL ended in {state.supervisor.name}: {hal.reason}")
-    require(hal.crc_errors == 0 and state.valid.all(), "the HAL refused frames of the recording")
-    require(walk().guide.stepped == 0, "the filter saturated, which is another benchmark")
+    require(
+        state.supervisor is SupervisorState.ACTIVE,
+        f"the HAL must end in ACTIVE, got {state.supervisor.name}: {hal.reason}",
+    )
+    require(hal.crc_errors == 0 and state.valid.all(), "the HAL rejected frames of the recording")
+    require(walk().guide.stepped == 0, "the filter must not saturate during the benchmark")
 
 
 def _check_same_state(rig: RecordedRig, theirs: object) -> None:
-    """Both sides in the same pose of the recording must hold the same numbers."""
+    """Require equal state of both HALs at the same pose of the recording.
+
+    Raises:
+        WorkError: If a value differs.
+    """
     from atalante_tools.bench.python_can_hal import PythonCanHal
 
     assert isinstance(theirs, PythonCanHal)
@@ -184,7 +196,7 @@ def _check_same_state(rig: RecordedRig, theirs: object) -> None:
     for name in _COMPARED:
         require(
             np.allclose(getattr(state, name), getattr(theirs, name), rtol=1e-9, atol=1e-12),
-            f"the baseline reads another {name}",
+            f"the baseline has a different {name}",
         )
 
 
@@ -195,13 +207,13 @@ def _no_compiler() -> Measurement | None:
 
 
 def _frame_checker() -> tuple[Callable[[bytes, int], bool], tuple[str, ...]]:
-    """Whether a frame's CRC is right, the way one checks it frame by frame."""
+    """Return a function that checks the CRC of one payload, and remarks about the baseline."""
     try:
         import e2e
     except ModuleNotFoundError:
-        return _check_alone, ("autosar-e2e is not installed; the baseline is crc_hqx frame by frame",)
+        return _check_crc, ("autosar-e2e is not installed; the baseline is binascii.crc_hqx, frame by frame",)
     return e2e.p05.e2e_p05_check, ()
 
 
-def _check_alone(payload: bytes, data_id: int) -> bool:
+def _check_crc(payload: bytes, data_id: int) -> bool:
     return crc(payload[CRC_BYTES:], data_id_bytes(data_id)) == int.from_bytes(payload[:CRC_BYTES], "little")

@@ -1,4 +1,4 @@
-"""`atalante conform`: one node, real or emulated, through an acceptance test in which this computer plays the HAL."""
+"""Command `atalante conform`: acceptance test of one node, real or emulated. This computer takes the role of the HAL."""
 
 from __future__ import annotations
 
@@ -14,22 +14,26 @@ from atalante_tools.console.stop_request import check_stop, ended_by
 from atalante_tools.console.terminal import say, show_json
 
 if TYPE_CHECKING:
-    from atalante_tools.conform.bench import Bench
+    from atalante_tools.conform.bench import NodeTester
     from atalante_tools.conform.requirement import Requirement
 
 
 @click.command()
 @click.argument("node")
 @target_options(embedded=True, clock=False)
-@click.option("--only", multiple=True, metavar="ID", help="Test this requirement alone; may be repeated.")
-@click.option("--without", multiple=True, metavar="ID", help="Leave this requirement out; may be repeated.")
+@click.option(
+    "--only", multiple=True, metavar="ID", help="Test only this requirement; repeat the option for more than one."
+)
+@click.option(
+    "--without", multiple=True, metavar="ID", help="Skip this requirement; repeat the option for more than one."
+)
 @click.option(
     "--torque",
     type=Between(0.5, 20.0),
     default=3.0,
     show_default=True,
     metavar="NM",
-    help="Largest torque a drive is let make.",
+    help="Largest torque commanded to a drive, in Nm.",
 )
 @click.option(
     "--patience",
@@ -37,7 +41,7 @@ if TYPE_CHECKING:
     default=30.0,
     show_default=True,
     metavar="S",
-    help="How long to wait for what a person has to do at the bench.",
+    help="How long to wait for each manual action, in seconds.",
 )
 @json_option
 def command(
@@ -49,10 +53,10 @@ def command(
     patience: float,
     as_json: bool,
 ) -> None:
-    """Play the HAL for one NODE (LEFT_SK, IMU_TORSO, FOOT_LEFT, HAPTICS, PENDANT, ...) and print an acceptance protocol.
+    """Test one NODE (LEFT_SK, IMU_TORSO, FOOT_LEFT, HAPTICS, PENDANT, ...) and print an acceptance protocol.
 
-    The joint of a drive must be free to move by hand's breadths and nobody in the exoskeleton. Exit code 1 if a requirement
-    failed or could not be tested.
+    The command sends SYNC and commands in place of the HAL. When a drive is tested, its joint must be free to move by about
+    10 cm, and the exoskeleton must be empty. The exit code is 1 if a requirement failed or could not be tested.
 
     \b
     Example: atalante conform LEFT_SK
@@ -64,25 +68,25 @@ def command(
     from atalante_tools.conform.report import as_object, conclusion, entry, heading
     from atalante_tools.conform.requirement import Verdict, examine
 
-    with _bench(node, target, torque, patience) as bench:
+    with _open_tester(node, target, torque, patience) as tester:
         check_stop()
-        wanted = _chosen(requirements_of(bench), only, without)
+        requirements = _chosen(requirements_of(tester), only, without)
         if not as_json:
-            click.echo(heading(bench, str(target), f"{datetime.now():%Y-%m-%d %H:%M}"))
+            click.echo(heading(tester, str(target), f"{datetime.now():%Y-%m-%d %H:%M}"))
         results = []
         try:
-            for result in examine(bench, wanted):
+            for result in examine(tester, requirements):
                 results.append(result)
                 if as_json:
-                    show_json(as_object(bench, result))
+                    show_json(as_object(tester, result))
                 else:
                     click.echo(entry(result))
         finally:
-            with ended_by(lambda: None):  # the node is made safe, whatever number of signals comes
-                make_safe(bench)
-    for left_out in without:
-        say(f"left out on request: {left_out.upper()}")
-    say(conclusion(bench, results))
+            with ended_by(lambda: None):  # further signals must not interrupt this
+                make_safe(tester)
+    for skipped in without:
+        say(f"skipped on request: {skipped.upper()}")
+    say(conclusion(tester, results))
     if any(result.verdict is not Verdict.PASSED for result in results):
         raise SystemExit(FAILED)
 
@@ -91,17 +95,17 @@ def _chosen(requirements: list[Requirement], only: tuple[str, ...], without: tup
     from atalante_tools.console.names import find
 
     ids = [requirement.id for requirement in requirements]
-    places = sorted({find(name, ids, "requirement") for name in only}) if only else range(len(ids))
-    left_out = {find(name, ids, "requirement") for name in without}
-    return [requirements[place] for place in places if place not in left_out]
+    selected = sorted({find(name, ids, "requirement") for name in only}) if only else range(len(ids))
+    skipped = {find(name, ids, "requirement") for name in without}
+    return [requirements[index] for index in selected if index not in skipped]
 
 
 @contextmanager
-def _bench(name: str, target: Target, torque: float, patience: float) -> Iterator[Bench]:
+def _open_tester(name: str, target: Target, torque: float, patience: float) -> Iterator[NodeTester]:
     import atalante_dbc
     from atalante_hal.robot import load_robot
-    from atalante_tools.conform.bench import Bench, Limits, LockStep, WallClock
-    from atalante_tools.conform.technician import EmulatorTechnician, Person
+    from atalante_tools.conform.bench import Limits, LockStep, NodeTester, WallClock
+    from atalante_tools.conform.technician import EmulatorTechnician, HumanTechnician
     from atalante_tools.console.names import find
 
     network, robot, limits = atalante_dbc.load(), load_robot(), Limits(torque)
@@ -119,23 +123,24 @@ def _bench(name: str, target: Target, torque: float, patience: float) -> Iterato
             operator = Operator(starts=False)
             emulator = Emulator(network, robot, body, theirs, operator=operator)
             ours.step = emulator.poll
-            yield Bench(network, robot, node, ours, LockStep(emulator), EmulatorTechnician(emulator, operator), limits)
+            yield NodeTester(
+                network, robot, node, ours, LockStep(emulator), EmulatorTechnician(emulator, operator), limits
+            )
         return
     from atalante_hal.bus import open_bus
     from atalante_hal.bus.channel_map import parse_channel_map
     from atalante_hal.loop import realtime
 
-    # The one bus the node is on.
     bus_name = network.message(f"{node.name}_STATE").bus
     channel = (
         target.channel if "=" not in target.channel else parse_channel_map(target.channel, network.buses)[bus_name]
     )
     bus = open_bus(target.interface, channel)
     try:
-        bench = Bench(network, robot, node, bus, WallClock(), Person(patience), limits)
-        bench.make_sure_to_be_alone()
-        for refused in realtime():
-            say(refused)
-        yield bench
+        tester = NodeTester(network, robot, node, bus, WallClock(), HumanTechnician(patience), limits)
+        tester.require_no_other_master()
+        for problem in realtime():
+            say(problem)
+        yield tester
     finally:
         bus.close()

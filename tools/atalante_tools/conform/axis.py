@@ -1,6 +1,6 @@
-"""The joint of a drive under test, and the state machine it owes: written down here from IEC 61800-7-201.
+"""Joint of the drive under test, and the CiA 402 state machine required of it, transcribed from IEC 61800-7-201.
 
-Not taken from `atalante_hal.wire.cia402`, which the emulated drive uses too.
+The table of transitions is independent of `atalante_hal.wire.cia402`, because the emulated drive uses that module.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ from typing import Final
 from atalante_hal.robot import JOINTS
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.frame import Frames
-from atalante_tools.conform.bench import Bench, NotTested
-from atalante_tools.conform.frames import Heard
+from atalante_tools.conform.bench import NodeTester, NotTested
+from atalante_tools.conform.frames import ReceivedFrame
 
 _S, _C = DriveState, Controlword
 
-#: (state, command) -> next state, with the number of the standard's transition; no other command moves.
+#: (state, command) -> (transition number of the standard, next state). Every other command must leave the state unchanged.
 LEGAL: Final[dict[tuple[DriveState, Controlword], tuple[int, DriveState]]] = {
     (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN): (2, _S.READY_TO_SWITCH_ON),
     (_S.READY_TO_SWITCH_ON, _C.SWITCH_ON): (3, _S.SWITCHED_ON),
     (_S.SWITCHED_ON, _C.ENABLE_OPERATION): (4, _S.OPERATION_ENABLED),
-    (_S.OPERATION_ENABLED, _C.SWITCH_ON): (5, _S.SWITCHED_ON),  # the command is DISABLE OPERATION here
+    (_S.OPERATION_ENABLED, _C.SWITCH_ON): (5, _S.SWITCHED_ON),  # SWITCH ON acts as DISABLE OPERATION in this state
     (_S.SWITCHED_ON, _C.SHUTDOWN): (6, _S.READY_TO_SWITCH_ON),
     (_S.READY_TO_SWITCH_ON, _C.DISABLE_VOLTAGE): (7, _S.SWITCH_ON_DISABLED),
     (_S.READY_TO_SWITCH_ON, _C.QUICK_STOP): (7, _S.SWITCH_ON_DISABLED),
@@ -33,7 +33,7 @@ LEGAL: Final[dict[tuple[DriveState, Controlword], tuple[int, DriveState]]] = {
     (_S.QUICK_STOP_ACTIVE, _C.DISABLE_VOLTAGE): (12, _S.SWITCH_ON_DISABLED),
     (_S.QUICK_STOP_ACTIVE, _C.ENABLE_OPERATION): (16, _S.OPERATION_ENABLED),
 }
-#: States a command can bring about, each with the way there from SWITCH ON DISABLED.
+#: States that can be reached by commands, each with the commands that lead to it from SWITCH ON DISABLED.
 ROUTES: Final[dict[DriveState, tuple[Controlword, ...]]] = {
     _S.SWITCH_ON_DISABLED: (),
     _S.READY_TO_SWITCH_ON: (_C.SHUTDOWN,),
@@ -42,33 +42,33 @@ ROUTES: Final[dict[DriveState, tuple[Controlword, ...]]] = {
     _S.QUICK_STOP_ACTIVE: (_C.SHUTDOWN, _C.SWITCH_ON, _C.ENABLE_OPERATION, _C.QUICK_STOP),
 }
 
-#: Cycles a drive may take for a transition.
+#: Largest number of cycles for a transition.
 FOLLOW: Final = 50
-#: Cycles for which a command that must not move is repeated.
+#: Number of cycles for which a command without transition is repeated.
 STAY: Final = 8
-#: Cycles from a command to the state frame that shows it, at the most, when nothing has to switch.
+#: Largest number of cycles from a command to the state frame that shows its effect, without a transition.
 SHOWN: Final = 3
-#: Difference of measured and wanted torque that is noise [Nm].
+#: Largest difference of measured and commanded torque that counts as noise [Nm].
 NOISE: Final = 0.3
 
 
 class Axis:
-    """The joint of a drive under test: commands to it, the other five of its leg switched off."""
+    """Joint of the drive under test. Commands go to this joint; the other five joints of the leg stay switched off."""
 
-    def __init__(self, bench: Bench) -> None:
-        self.bench = bench
-        self.joint = [joint.upper() for joint in JOINTS].index(bench.node.name)
-        self._prefix = bench.node.name.rsplit("_", 1)[1]
-        self._own = bench.network.message(bench.command.message.name)
+    def __init__(self, tester: NodeTester) -> None:
+        self.tester = tester
+        self.joint = [joint.upper() for joint in JOINTS].index(tester.node.name)
+        self._prefix = tester.node.name.rsplit("_", 1)[1]
+        self._own = tester.network.message(tester.command.message.name)
         self.other_data_id = next(
-            m.data_id for m in bench.network.sent_by("HAL") if m.length == self._own.length and m is not self._own
+            m.data_id for m in tester.network.sent_by("HAL") if m.length == self._own.length and m is not self._own
         )
 
     def signal(self, name: str) -> str:
-        """A signal of the command, this joint's."""
+        """Return the full name of this joint's signal `name` in the command message."""
         return f"{self._prefix}_{name}"
 
-    def word(
+    def command(
         self,
         controlword: Controlword,
         torque: float = 0.0,
@@ -80,16 +80,27 @@ class Axis:
         length: int | None = None,
         flip: int | None = None,
     ) -> Frames:
-        """A command. `raw` names this joint's quantities; see `Outgoing.frame` for the defects."""
+        """Return a command frame for this joint. Shape (1,).
+
+        Args:
+            controlword: CiA 402 command.
+            torque: target torque [Nm].
+            limit: largest torque [Nm]; None: the limit of the examination.
+            raw: raw code for each named quantity of this joint, in place of its value.
+            counter: alive counter in place of the next one.
+            data_id: E2E Data ID in place of that of the message.
+            length: payload length [byte] in place of that of the message.
+            flip: payload bit that is inverted after the CRC is written.
+        """
         values = {
             self.signal("Controlword"): float(controlword),
             self.signal("TargetTorque"): torque,
-            self.signal("MaxTorque"): self.bench.limits.torque if limit is None else limit,
+            self.signal("MaxTorque"): self.tester.limits.torque if limit is None else limit,
         }
         codes = {self.signal(name): code for name, code in (raw or {}).items()}
-        return self.bench.command.frame(values, raw=codes, counter=counter, data_id=data_id, length=length, flip=flip)
+        return self.tester.command.frame(values, raw=codes, counter=counter, data_id=data_id, length=length, flip=flip)
 
-    def push(
+    def bad_command(
         self,
         *,
         counter: int | None = None,
@@ -97,32 +108,39 @@ class Axis:
         length: int | None = None,
         flip: int | None = None,
     ) -> Frames:
-        """A defective command that would make all the torque there may be."""
-        push = self.bench.limits.torque
-        return self.word(_C.ENABLE_OPERATION, push, counter=counter, data_id=data_id, length=length, flip=flip)
+        """Return a defective command frame that asks for the largest torque of the examination. Shape (1,).
+
+        Args:
+            counter: alive counter in place of the next one.
+            data_id: E2E Data ID in place of that of the message.
+            length: payload length [byte] in place of that of the message.
+            flip: payload bit that is inverted after the CRC is written.
+        """
+        torque = self.tester.limits.torque
+        return self.command(_C.ENABLE_OPERATION, torque, counter=counter, data_id=data_id, length=length, flip=flip)
 
     def run(
         self, cycles: int, controlword: Controlword, torque: float = 0.0, limit: float | None = None
-    ) -> list[Heard]:
-        """The same command for some cycles; the states heard."""
-        return [h for _ in range(cycles) for h in self.send(self.word(controlword, torque, limit))]
+    ) -> list[ReceivedFrame]:
+        """Send the same command for a number of cycles and return the state frames received."""
+        return [frame for _ in range(cycles) for frame in self.send(self.command(controlword, torque, limit))]
 
-    def send(self, command: Frames) -> list[Heard]:
-        """One cycle with a command; the states heard."""
-        return self.bench.states(self.bench.cycle(command))
+    def send(self, command: Frames) -> list[ReceivedFrame]:
+        """Run one cycle with a command and return the state frames received."""
+        return self.tester.states(self.tester.cycle(command))
 
     def follow(self, controlword: Controlword, goal: DriveState, cycles: int = FOLLOW) -> int | None:
-        """Repeat a command until the drive is in `goal`; cycles it took, None if it never was."""
+        """Repeat a command until the drive is in `goal`; return the number of cycles, or None after `cycles` cycles."""
         for number in range(1, cycles + 1):
-            if any(state_of(h) == goal for h in self.send(self.word(controlword))):
+            if any(state_of(frame) == goal for frame in self.send(self.command(controlword))):
                 return number
         return None
 
     def go(self, goal: DriveState) -> None:
-        """Bring the drive to a state, by the way of the standard.
+        """Bring the drive to the state `goal` through the transitions of the standard.
 
         Raises:
-            NotTested: it does not follow.
+            NotTested: If the drive does not follow.
         """
         if self.follow(_C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED) is None:
             self.follow(_C.FAULT_RESET, _S.SWITCH_ON_DISABLED)
@@ -133,53 +151,57 @@ class Axis:
                 raise NotTested(f"the drive cannot be brought to {state.name}")
 
     def enable(self) -> None:
-        """OPERATION ENABLED with no torque. Raises `NotTested`."""
+        """Bring the drive to OPERATION ENABLED with a torque command of 0.
+
+        Raises:
+            NotTested: If the drive does not follow.
+        """
         self.go(_S.OPERATION_ENABLED)
         self.run(4, _C.ENABLE_OPERATION)
 
 
-def state_of(heard: Heard) -> int:
-    """DriveState of a state frame."""
-    return int(heard.values["DriveState"])
+def state_of(received: ReceivedFrame) -> int:
+    """Return the raw `DriveState` of a state frame."""
+    return int(received.values["DriveState"])
 
 
 def name_of(state: int) -> str:
-    """As the standard calls it."""
+    """Return the name of a drive state in the standard."""
     try:
         return DriveState(state).name
     except ValueError:
-        return f"{state:#04x}, which is no state"
+        return f"{state:#04x} (undefined state)"
 
 
-def torque_of(heard: list[Heard]) -> float:
-    """Largest measured torque [Nm], with its sign; 0 without frames."""
-    return max((h.values["Torque"] for h in heard), key=abs, default=0.0)
+def torque_of(received: list[ReceivedFrame]) -> float:
+    """Return the measured torque [Nm] with the largest magnitude; 0 without frames."""
+    return max((frame.values["Torque"] for frame in received), key=abs, default=0.0)
 
 
-def mean_torque(heard: list[Heard]) -> float:
-    """Mean of the measured torque [Nm]; NaN without frames."""
-    return sum(h.values["Torque"] for h in heard) / len(heard) if heard else math.nan
+def mean_torque(received: list[ReceivedFrame]) -> float:
+    """Return the mean of the measured torque [Nm]; NaN without frames."""
+    return sum(frame.values["Torque"] for frame in received) / len(received) if received else math.nan
 
 
-def names_of(heard: list[Heard]) -> str:
-    """The states of some frames, each once, in order."""
-    return " -> ".join(dict.fromkeys(name_of(state_of(h)) for h in heard)) or "no state frame"
+def names_of(received: list[ReceivedFrame]) -> str:
+    """Return the names of the drive states in the frames, each once, in order of first appearance."""
+    return " -> ".join(dict.fromkeys(name_of(state_of(frame)) for frame in received)) or "no state frame"
 
 
-def always(heard: list[Heard], state: DriveState) -> bool:
-    """Every frame says that state, and there is one."""
-    return bool(heard) and all(state_of(h) == state for h in heard)
+def all_in(received: list[ReceivedFrame], state: DriveState) -> bool:
+    """Return whether there is at least one frame and every frame reports `state`."""
+    return bool(received) and all(state_of(frame) == state for frame in received)
 
 
-def emergencies_of(bench: Bench, first: int) -> list[int]:
-    """Error codes of the emergencies of the node since the frame of that number."""
+def emergencies_of(tester: NodeTester, first: int) -> list[int]:
+    """Return the error codes of the emergencies in `tester.received` from index `first`."""
     return [
-        int(h.values["ErrorCode"])
-        for h in bench.heard[first:]
-        if h.message is bench.emergency_message and h.values and h.values["ErrorCode"]
+        int(frame.values["ErrorCode"])
+        for frame in tester.received[first:]
+        if frame.message is tester.emergency_message and frame.values and frame.values["ErrorCode"]
     ]
 
 
 def codes_of(codes: list[int]) -> str:
-    """Error codes as CiA 301 writes them."""
+    """Return error codes as text in hexadecimal, as in CiA 301."""
     return ", ".join(f"{code:#06x}" for code in codes) or "none"

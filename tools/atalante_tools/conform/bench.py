@@ -1,6 +1,7 @@
-"""The HAL's part played for one node, a cycle at a time: `SYNC -> the node's answer -> command`, with every frame recorded.
+"""Node tester: takes the role of the HAL for one node, cycle by cycle: `SYNC -> answer of the node -> command`.
 
-The same examination runs on a wire, on the wall clock, and against the emulator in this process, in lock-step.
+Every frame of the node is recorded. The same examination runs on a real bus in real time, and on the emulator in this
+process in lock-step.
 """
 
 from __future__ import annotations
@@ -15,93 +16,105 @@ from atalante_hal.bus import Bus, BusFull
 from atalante_hal.hal import PERIOD
 from atalante_hal.robot import Robot
 from atalante_hal.wire.frame import Frames, as_words, new_frames
-from atalante_tools.conform.frames import Heard, Incoming, Outgoing
+from atalante_tools.conform.frames import MessageReceiver, MessageSender, ReceivedFrame
 from atalante_tools.conform.technician import Action, Technician
 from atalante_tools.console.outcome import Failed
 
 if TYPE_CHECKING:
     from atalante_emulator.emulator import Emulator
 
-#: Frames one `receive` can take.
+#: Largest number of frames of one `receive`.
 _RECEIVE_BUDGET: Final = 128
-#: How long a node may take to answer before the command goes out [s].
+#: Longest wait for the answer of the node before the command is sent [s].
 _PATIENCE: Final = 0.6e-3
-#: Silence before anything is sent, to hear whether somebody else plays the HAL [s].
+#: Time to listen for another HAL before the first frame is sent [s].
 _LISTEN: Final = 0.2
 
 
 class NotTested(Exception):  # noqa: N818
-    """A requirement could not be tested; the message says why."""
+    """Requirement could not be tested; the message gives the reason."""
 
 
 class Clock(Protocol):
-    """When the next cycle begins."""
+    """Clock that starts the cycles."""
 
-    late: float  # s, longest delay of a cycle since it was last set to 0: this computer's fault, not the node's
+    delay: float  # s, longest delay of a cycle since the last reset to 0, caused by this computer
 
     def next_cycle(self, *, sync: bool, listen: Callable[[float], None]) -> None:
-        """Return when it is time; `listen(s)` receives meanwhile. `sync`: the cycle will begin with one."""
+        """Wait for the start of the next cycle.
+
+        Args:
+            sync: True if the cycle starts with SYNC.
+            listen: function that receives frames for a given time [s]; called during the wait.
+        """
 
     def time_of(self, stamp_ns: int, cycle: int) -> float:
-        """Time [s] of a frame."""
+        """Return the time of a frame [s].
+
+        Args:
+            stamp_ns: time stamp of the bus [ns].
+            cycle: number of the cycle in which the frame was received.
+        """
 
 
 class LockStep:
-    """The emulated node answers at once. Milliseconds without SYNC pass for it as they do in `Emulator.run`."""
+    """Lock-step clock: the emulated node answers without delay. Cycles without SYNC advance it as in `Emulator.run`."""
 
     def __init__(self, emulator: Emulator) -> None:
         from atalante_emulator.drive import WATCHDOG
 
-        self.late = 0.0
+        self.delay = 0.0
         self._emulator = emulator
         self._watchdog = WATCHDOG
         self._silent = 0
 
     def next_cycle(self, *, sync: bool, listen: Callable[[float], None]) -> None:
-        """At once."""
+        """Advance the emulated node if SYNC is missing; do not wait."""
         self._silent = 0 if sync else self._silent + 1
         if self._silent >= self._watchdog:
             self._emulator.idle()
 
     def time_of(self, stamp_ns: int, cycle: int) -> float:
-        """The cycle's."""
+        """Return the start time of the cycle [s]."""
         return cycle * PERIOD
 
 
 class WallClock:
-    """1 kHz by absolute deadlines. A missed deadline is not caught up with: that would be a burst of SYNCs."""
+    """Real-time clock at 1 kHz with absolute deadlines. Missed cycles are skipped, because catching up would send SYNC bursts."""
 
     def __init__(self) -> None:
-        self.late = 0.0
+        self.delay = 0.0
         self._deadline = time.monotonic()
 
     def next_cycle(self, *, sync: bool, listen: Callable[[float], None]) -> None:
-        """Listen until the deadline."""
+        """Receive frames until the deadline."""
         self._deadline += PERIOD
         while (left := self._deadline - time.monotonic()) > 0.0:
             listen(left)
-        listen(0.0)  # after a late wake-up what came before this SYNC is no answer to it
-        behind = -left
-        self.late = max(self.late, behind)
-        if behind > PERIOD:
+        listen(0.0)  # after a late wake-up, frames received before this SYNC are not answers to it
+        delay = -left
+        self.delay = max(self.delay, delay)
+        if delay > PERIOD:
             self._deadline = time.monotonic()
 
     def time_of(self, stamp_ns: int, cycle: int) -> float:
-        """The stamp of the bus."""
+        """Return the time stamp of the bus in seconds."""
         return stamp_ns * 1e-9
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What the bench may do to the node."""
+    """Limits of the commands to the node."""
 
-    torque: float = 3.0  # Nm: the largest torque it lets a drive make
+    torque: float = 3.0  # Nm, largest torque commanded to a drive
 
 
-class Bench:
-    """One node under test and everything heard of it.
+class NodeTester:
+    """Tester of one node: sends SYNC and commands, and records every frame of the node.
 
-    `heard` are its frames since the examination began; `cycle_number` counts milliseconds, with SYNC or without.
+    Attributes:
+        received: frames of the node since the start of the examination.
+        cycle_number: number of cycles of 1 ms, with or without SYNC.
     """
 
     def __init__(
@@ -116,9 +129,9 @@ class Bench:
     ) -> None:
         self.network, self.robot, self.node, self.clock, self.technician = network, robot, node, clock, technician
         self.limits = limits or Limits()
-        self.heard: list[Heard] = []
+        self.received: list[ReceivedFrame] = []
         self.cycle_number = 0
-        self.sync = Outgoing(network.message(f"SYNC_{self._of_node('STATE').bus.upper()}"))
+        self.sync = MessageSender(network.message(f"SYNC_{self._of_node('STATE').bus.upper()}"))
         self.state_message = self._of_node("STATE")
         self.status_message = self._of_node("STATUS")
         self.emergency_message = self._of_node("EMCY")
@@ -126,28 +139,28 @@ class Bench:
             m for m in network.received_by(node.name) if m.sender == "HAL" and m.cycle_ms and m != self.sync.message
         ]
         commands = [m for m in commands if not m.name.endswith("_STATUS")]
-        self._command = Outgoing(commands[0]) if commands else None
+        self._command = MessageSender(commands[0]) if commands else None
         self._bus = bus
-        self._incoming = {m.frame_id: Incoming(m) for m in network.sent_by(node.name)}
+        self._receivers = {m.frame_id: MessageReceiver(m) for m in network.sent_by(node.name)}
         self._masters = {m.frame_id: m.name for m in network.sent_by("HAL")}
         self._scratch = new_frames(_RECEIVE_BUDGET)
         self._outboxes: dict[int, Frames] = {}
-        self._singles = [self._scratch[place : place + 1] for place in range(_RECEIVE_BUDGET)]
+        self._singles = [self._scratch[row : row + 1] for row in range(_RECEIVE_BUDGET)]
 
     @property
-    def command(self) -> Outgoing:
-        """The HAL's command to this node."""
-        assert self._command is not None, f"{self.node.name} takes no command"
+    def command(self) -> MessageSender:
+        """Return the sender of the HAL's command to this node."""
+        assert self._command is not None, f"{self.node.name} receives no command"
         return self._command
 
     def _of_node(self, kind: str) -> Message:
         return self.network.message(f"{self.node.name}_{kind}")
 
-    def make_sure_to_be_alone(self) -> None:
-        """Listen before the first frame.
+    def require_no_other_master(self) -> None:
+        """Listen on the bus and fail if another HAL is active.
 
         Raises:
-            Failed: another HAL is on the bus.
+            Failed: If a frame of another HAL is received.
         """
         deadline = time.monotonic() + _LISTEN
         while (left := deadline - time.monotonic()) > 0.0:
@@ -155,21 +168,21 @@ class Bench:
             for frame_id in self._scratch["can_id"][:count].tolist():
                 if frame_id in self._masters:
                     raise Failed(
-                        f"somebody else plays the HAL on {self._bus.name} ({self._masters[frame_id]} was heard): stop it first"
+                        f"another HAL is active on {self._bus.name} ({self._masters[frame_id]} was received); stop it first"
                     )
 
     # -- one cycle -----------------------------------------------------------------------------------------------------
 
-    def cycle(self, *commands: Frames, sync: Frames | None = None, before: Frames | None = None) -> list[Heard]:
-        """One millisecond that begins with SYNC: send it, listen, send the commands.
+    def cycle(self, *commands: Frames, sync: Frames | None = None, before: Frames | None = None) -> list[ReceivedFrame]:
+        """Run one cycle of 1 ms: send SYNC, receive the answers, send the commands.
 
         Args:
-            commands: frames to send after the answers, shape (n,) each.
-            sync: frames in the place of the next SYNC.
-            before: frames to send before SYNC.
+            *commands: frames to send after the answers, shape (n,) each.
+            sync: frames to send in place of the next SYNC, shape (n,).
+            before: frames to send before SYNC, shape (n,).
 
         Returns:
-            What the node said since the SYNC.
+            Frames of the node since the SYNC.
         """
         if sync is None:
             sync = self.sync_frame()
@@ -178,95 +191,118 @@ class Bench:
         if before is not None:
             self._send(before)
         self._send(sync)
-        first = len(self.heard)
+        first = len(self.received)
         self._listen_for_answer()
         for frames in commands:
             self._send(frames)
-        return self.heard[first:]
+        return self.received[first:]
 
-    def silent_cycle(self) -> list[Heard]:
-        """One millisecond in which nothing is sent; what the node said."""
-        first = len(self.heard)
+    def silent_cycle(self) -> list[ReceivedFrame]:
+        """Run one cycle of 1 ms without sending, and return the frames of the node."""
+        first = len(self.received)
         self.clock.next_cycle(sync=False, listen=self._listen)
         self.cycle_number += 1
         self._listen(0.0)
-        return self.heard[first:]
+        return self.received[first:]
 
     def sync_frame(
         self, *, counter: int | None = None, length: int | None = None, classic: bool = False, flip: int | None = None
     ) -> Frames:
-        """The next SYNC, with the defects of `Outgoing.frame`."""
+        """Return the next SYNC, optionally defective. Shape (1,).
+
+        Args:
+            counter: alive counter in place of the next one.
+            length: payload length [byte] in place of that of the message.
+            classic: True for a classic CAN frame.
+            flip: payload bit that is inverted after the CRC is written.
+        """
         cycle = {"Cycle": self.cycle_number + 1 & 0xFFFFFFFF}
         return self.sync.frame(cycle, counter=counter, length=length, classic=classic, flip=flip)
 
     def _send(self, frames: Frames) -> None:
-        outbox = self._outboxes.setdefault(len(frames), new_frames(len(frames)))  # a bus likes to see the same array
+        # The same array for every batch of this length, because a bus caches the memory address of each array.
+        outbox = self._outboxes.setdefault(len(frames), new_frames(len(frames)))
         as_words(outbox)[:] = as_words(frames)
         try:
             self._bus.send(outbox)
         except BusFull:
-            # Nobody acknowledges while the node is switched off.
+            # While the node is switched off, no frame is acknowledged and the transmit queue fills up.
             return
 
     def _listen(self, timeout: float) -> None:
-        self._take(self._bus.receive(self._scratch, timeout))
+        self._record(self._bus.receive(self._scratch, timeout))
 
     def _listen_for_answer(self) -> None:
-        first = len(self.heard)
+        first = len(self.received)
         deadline = time.monotonic() + _PATIENCE
         left = _PATIENCE
         while left > 0.0:
             count = self._bus.receive(self._scratch, left)
-            self._take(count)
-            if not count or any(h.message is self.state_message for h in self.heard[first:]):
+            self._record(count)
+            if not count or any(frame.message is self.state_message for frame in self.received[first:]):
                 return
             left = deadline - time.monotonic()
 
-    def _take(self, count: int) -> None:
+    def _record(self, count: int) -> None:
         if not count:
             return
         stamps = self._bus.stamps
-        for place, can_id in enumerate(self._scratch["can_id"][:count].tolist()):
-            incoming = self._incoming.get(can_id)
-            if incoming is not None:
-                stamp = self.clock.time_of(int(stamps[place]), self.cycle_number)
-                self.heard.append(incoming.hear(self._singles[place], self.cycle_number, stamp))
+        for row, can_id in enumerate(self._scratch["can_id"][:count].tolist()):
+            receiver = self._receivers.get(can_id)
+            if receiver is not None:
+                stamp = self.clock.time_of(int(stamps[row]), self.cycle_number)
+                self.received.append(receiver.decode(self._singles[row], self.cycle_number, stamp))
 
     # -- waiting -------------------------------------------------------------------------------------------------------
 
-    def idle(self, cycles: int) -> list[Heard]:
-        """SYNC alone for some cycles; what the node said."""
-        first = len(self.heard)
+    def idle(self, cycles: int) -> list[ReceivedFrame]:
+        """Send only SYNC for a number of cycles, and return the frames of the node."""
+        first = len(self.received)
         for _ in range(cycles):
             self.cycle()
-        return self.heard[first:]
+        return self.received[first:]
 
-    def states(self, heard: list[Heard]) -> list[Heard]:
-        """The readable state frames among what was heard."""
-        return [h for h in heard if h.message is self.state_message and h.values]
+    def states(self, received: list[ReceivedFrame]) -> list[ReceivedFrame]:
+        """Return the state frames with valid length among `received`."""
+        return [frame for frame in received if frame.message is self.state_message and frame.values]
 
-    def until(self, shows: Callable[[list[Heard]], bool], cycle: Callable[[], list[Heard]] | None = None) -> bool:
-        """Run cycles until `shows(heard)` holds, or the technician's patience ends."""
+    def run_until(
+        self, shows: Callable[[list[ReceivedFrame]], bool], cycle: Callable[[], list[ReceivedFrame]] | None = None
+    ) -> bool:
+        """Run cycles until a condition holds; return False if it does not hold within the patience of the technician.
+
+        Args:
+            shows: condition on the frames received in a cycle.
+            cycle: function that runs one cycle; None: `self.cycle`.
+        """
         cycle = cycle or self.cycle
         return any(shows(cycle()) for _ in range(round(self.technician.patience / PERIOD)))
 
-    def ask(
-        self, action: Action, shows: Callable[[list[Heard]], bool], cycle: Callable[[], list[Heard]] | None = None
+    def request(
+        self,
+        action: Action,
+        shows: Callable[[list[ReceivedFrame]], bool],
+        cycle: Callable[[], list[ReceivedFrame]] | None = None,
     ) -> bool:
-        """Have something done to the node, run cycles, and say whether it shows.
+        """Request a manual action, run cycles, and return whether its effect was measured.
+
+        Args:
+            action: manual action on the node.
+            shows: condition on the frames received in a cycle that shows the effect.
+            cycle: function that runs one cycle; None: `self.cycle`.
 
         Raises:
-            NotTested: it does not, and may not have been done.
+            NotTested: If there is no effect and the action may not have been carried out.
         """
         technician = self.technician
-        technician.please(action, self.node.name)
-        shown = self.until(shows, cycle)
+        technician.request(action, self.node.name)
+        shown = self.run_until(shows, cycle)
         if not shown and not technician.certain:
-            wanted = action.value.format(node=self.node.name)
-            raise NotTested(f"nothing was seen within {technician.patience:g} s of the request to {wanted}")
+            instruction = action.value.format(node=self.node.name)
+            raise NotTested(f"no effect within {technician.patience:g} s after the request: {instruction}")
         return shown
 
     @property
     def dropped(self) -> int:
-        """Frames this computer lost."""
+        """Return the number of frames lost by this computer."""
         return self._bus.dropped

@@ -1,4 +1,4 @@
-"""What a drive makes of commands that are damaged, somebody else's or none, and of silence: nothing, then the latched hold."""
+"""Tests of a drive against defective, foreign and lost commands and lost SYNC: no effect at first, then the latched hold."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from atalante_tools.conform.axis import (
     SHOWN,
     STAY,
     Axis,
-    always,
+    all_in,
     codes_of,
     emergencies_of,
     mean_torque,
@@ -22,151 +22,166 @@ from atalante_tools.conform.axis import (
     state_of,
     torque_of,
 )
-from atalante_tools.conform.bench import Bench, NotTested
+from atalante_tools.conform.bench import NodeTester, NotTested
 from atalante_tools.conform.requirement import Outcome
 
 _S, _C = DriveState, Controlword
 
-#: Controlwords outside the range: known ones with the highest bit set, as a sloppy mask would let through, and the last.
+#: Controlwords outside the DBC range: valid ones with the highest bit set, which a wrong mask would accept, and 0xFE.
 UNKNOWN: Final = (0x82, 0x86, 0x87, 0x8F, 0xFE)
-#: Commands a drive rides through without, and those after which it holds by itself.
+#: Number of lost commands without effect, and number of lost commands after which the drive latches the hold.
 RIDDEN, LATCHED = 4, 5
-#: CiA 301 emergency code of a lost HAL: its command came no more (RPDO timeout).
+#: CiA 301 emergency code for loss of the HAL command (RPDO timeout).
 COMMAND_TIMEOUT: Final = 0x8250
 
 
-def ignores_unknown_controlwords(bench: Bench) -> Outcome:
-    """DRIVE-10."""
-    axis, wrong = Axis(bench), []
+def ignores_unknown_controlwords(tester: NodeTester) -> Outcome:
+    """Test DRIVE-10: a controlword outside the DBC range has no effect."""
+    axis, wrong = Axis(tester), []
     for state, stay in ((_S.OPERATION_ENABLED, _C.ENABLE_OPERATION), (_S.SWITCH_ON_DISABLED, _C.DISABLE_VOLTAGE)):
         axis.go(state)
         for code in UNKNOWN:
-            heard = [*axis.send(axis.word(stay, raw={"Controlword": code})), *axis.run(2 * SHOWN, stay)]
-            if not always(heard, state):
-                wrong.append(f"{code} in {state.name}: {names_of(heard)}")
-    return Outcome(not wrong, f"acted on {'; '.join(wrong)}" if wrong else "all refused")
+            received = [*axis.send(axis.command(stay, raw={"Controlword": code})), *axis.run(2 * SHOWN, stay)]
+            if not all_in(received, state):
+                wrong.append(f"{code} in {state.name}: {names_of(received)}")
+    return Outcome(not wrong, f"acted on {'; '.join(wrong)}" if wrong else "all ignored")
 
 
-def ignores_invalid_codes(bench: Bench) -> Outcome:
-    """DRIVE-11."""
-    axis, found, passed = Axis(bench), [], True
-    message = bench.command.message
+def ignores_invalid_codes(tester: NodeTester) -> Outcome:
+    """Test DRIVE-11: a command with an invalid code has no effect."""
+    axis, found, passed = Axis(tester), [], True
+    message = tester.command.message
     axis.enable()
     for quantity in ("Controlword", "TargetTorque", "MaxTorque"):
         code = message.signal(axis.signal(quantity)).invalid_raw
         assert code is not None
-        # A target above the limit: whoever took the invalid MaxTorque for a limit would make it.
-        limit, wanted = bench.limits.torque / 3.0, bench.limits.torque
-        heard = axis.run(6, _C.ENABLE_OPERATION, 0.0, limit)[2 * SHOWN :]
+        # The target is above the limit, so a drive that accepts the invalid MaxTorque as a limit makes more torque.
+        limit, target = tester.limits.torque / 3.0, tester.limits.torque
+        received = axis.run(6, _C.ENABLE_OPERATION, 0.0, limit)[2 * SHOWN :]
         for _ in range(2):
-            heard += axis.send(axis.word(_C.ENABLE_OPERATION, wanted, limit, raw={quantity: code}))
-        heard += axis.run(2 * SHOWN, _C.ENABLE_OPERATION, 0.0, limit)
-        most = torque_of(heard)
-        passed &= abs(most) <= NOISE and always(heard, _S.OPERATION_ENABLED)
-        found.append(f"{quantity}: {most:+.2f} Nm, {names_of(heard)}")
+            received += axis.send(axis.command(_C.ENABLE_OPERATION, target, limit, raw={quantity: code}))
+        received += axis.run(2 * SHOWN, _C.ENABLE_OPERATION, 0.0, limit)
+        most = torque_of(received)
+        passed &= abs(most) <= NOISE and all_in(received, _S.OPERATION_ENABLED)
+        found.append(f"{quantity}: {most:+.2f} Nm, {names_of(received)}")
     return Outcome(passed, "; ".join(found))
 
 
-def ignores(bad: Callable[[Axis, int], Frames], *, or_holds: bool = False) -> Callable[[Bench], Outcome]:
-    """Two bad commands change nothing; ten of them, and nothing else, latch the hold. `or_holds`: so may the first."""
+def ignores(bad: Callable[[Axis, int], Frames], *, or_holds: bool = False) -> Callable[[NodeTester], Outcome]:
+    """Return a test that two defective commands have no effect, and that ten of them in a row latch the hold.
 
-    def test(bench: Bench) -> Outcome:
-        axis = Axis(bench)
+    Args:
+        bad: function that returns the defective command number `n` for an axis.
+        or_holds: True if the first two may also latch the hold.
+    """
+
+    def test(tester: NodeTester) -> Outcome:
+        axis = Axis(tester)
         axis.enable()
-        heard = [h for number in range(2) for h in axis.send(bad(axis, number))]
-        heard += axis.run(2 * SHOWN, _C.ENABLE_OPERATION)
-        holds = [h for h in heard if or_holds and state_of(h) == _S.QUICK_STOP_ACTIVE]
-        obeys = [h for h in heard if h not in holds]
-        most = torque_of(obeys)
-        if abs(most) > NOISE or any(state_of(h) != _S.OPERATION_ENABLED for h in obeys) or not heard:
-            return Outcome(False, f"acted on: {most:+.2f} Nm, {names_of(heard)}")
+        received = [frame for number in range(2) for frame in axis.send(bad(axis, number))]
+        received += axis.run(2 * SHOWN, _C.ENABLE_OPERATION)
+        holds = [frame for frame in received if or_holds and state_of(frame) == _S.QUICK_STOP_ACTIVE]
+        others = [frame for frame in received if frame not in holds]
+        most = torque_of(others)
+        if abs(most) > NOISE or any(state_of(frame) != _S.OPERATION_ENABLED for frame in others) or not received:
+            return Outcome(False, f"acted on: {most:+.2f} Nm, {names_of(received)}")
         if holds:
-            return Outcome(True, f"{most:+.2f} Nm, {names_of(heard)}")
+            return Outcome(True, f"{most:+.2f} Nm, {names_of(received)}")
         axis.run(4, _C.ENABLE_OPERATION)
-        heard = [h for number in range(2 * LATCHED) for h in axis.send(bad(axis, number))]
-        fed = always(heard, _S.OPERATION_ENABLED)
-        return Outcome(not fed, f"{most:+.2f} Nm; {'fed the watchdog' if fed else 'latched without a good one'}")
+        received = [frame for number in range(2 * LATCHED) for frame in axis.send(bad(axis, number))]
+        fed = all_in(received, _S.OPERATION_ENABLED)
+        return Outcome(not fed, f"{most:+.2f} Nm; {'reset the watchdog' if fed else 'latched without a valid command'}")
 
     return test
 
 
-def ignores_a_jump(bench: Bench) -> Outcome:
-    """DRIVE-20."""
-    axis = Axis(bench)
+def ignores_a_jump(tester: NodeTester) -> Outcome:
+    """Test DRIVE-20: a jump of the alive counter has no effect."""
+    axis = Axis(tester)
     axis.enable()
-    heard = axis.send(axis.push(counter=(bench.command.counter + 100) & 0xFF))
-    heard += axis.run(2 * SHOWN, _C.ENABLE_OPERATION)
-    most = torque_of(heard)
-    return Outcome(abs(most) <= NOISE and always(heard, _S.OPERATION_ENABLED), f"{most:+.2f} Nm, {names_of(heard)}")
+    received = axis.send(axis.bad_command(counter=(tester.command.counter + 100) & 0xFF))
+    received += axis.run(2 * SHOWN, _C.ENABLE_OPERATION)
+    most = torque_of(received)
+    return Outcome(
+        abs(most) <= NOISE and all_in(received, _S.OPERATION_ENABLED), f"{most:+.2f} Nm, {names_of(received)}"
+    )
 
 
-# -- when the HAL is not heard -------------------------------------------------------------------------------------------
+# -- loss of commands and SYNC ---------------------------------------------------------------------------------------------
 
 
-def rides_through(bench: Bench) -> Outcome:
-    """DRIVE-12."""
-    axis, wanted = Axis(bench), bench.limits.torque
+def rides_through(tester: NodeTester) -> Outcome:
+    """Test DRIVE-12: a few lost commands keep state and torque."""
+    axis, target = Axis(tester), tester.limits.torque
     axis.enable()
-    before = mean_torque(axis.run(12, _C.ENABLE_OPERATION, wanted)[2 * SHOWN :])
-    heard = bench.states([h for _ in range(RIDDEN) for h in bench.cycle()])
-    heard += axis.run(2 * SHOWN, _C.ENABLE_OPERATION, wanted)
-    least = min((h.values["Torque"] for h in heard), default=math.nan)
-    passed = always(heard, _S.OPERATION_ENABLED) and least >= before - NOISE
-    return Outcome(passed, f"at least {least:+.2f} of {before:+.2f} Nm, {names_of(heard)}")
+    before = mean_torque(axis.run(12, _C.ENABLE_OPERATION, target)[2 * SHOWN :])
+    received = tester.states([frame for _ in range(RIDDEN) for frame in tester.cycle()])
+    received += axis.run(2 * SHOWN, _C.ENABLE_OPERATION, target)
+    least = min((frame.values["Torque"] for frame in received), default=math.nan)
+    passed = all_in(received, _S.OPERATION_ENABLED) and least >= before - NOISE
+    return Outcome(passed, f"at least {least:+.2f} of {before:+.2f} Nm, {names_of(received)}")
 
 
-def latches(bench: Bench) -> Outcome:
-    """DRIVE-13."""
-    axis = Axis(bench)
+def latches(tester: NodeTester) -> Outcome:
+    """Test DRIVE-13: loss of commands leads to QUICK STOP ACTIVE."""
+    axis = Axis(tester)
     axis.enable()
-    heard = bench.states([h for _ in range(LATCHED) for h in bench.cycle()])
-    heard += axis.run(2 * SHOWN, _C.ENABLE_OPERATION)
-    stopped = any(state_of(h) == _S.QUICK_STOP_ACTIVE for h in heard)
-    return Outcome(stopped, names_of(heard))
+    received = tester.states([frame for _ in range(LATCHED) for frame in tester.cycle()])
+    received += axis.run(2 * SHOWN, _C.ENABLE_OPERATION)
+    stopped = any(state_of(frame) == _S.QUICK_STOP_ACTIVE for frame in received)
+    return Outcome(stopped, names_of(received))
 
 
-def releases_only_when_acknowledged(bench: Bench) -> Outcome:
-    """DRIVE-14."""
-    axis = Axis(bench)
+def releases_only_when_acknowledged(tester: NodeTester) -> Outcome:
+    """Test DRIVE-14: only QUICK_STOP and then ENABLE_OPERATION leave the latched hold."""
+    axis = Axis(tester)
     _latch(axis)
     for controlword in (_C.ENABLE_OPERATION, _C.SHUTDOWN, _C.SWITCH_ON, _C.FAULT_RESET, _C.ENABLE_OPERATION):
-        heard = axis.run(STAY, controlword)
-        if not always(heard, _S.QUICK_STOP_ACTIVE):
-            return Outcome(False, f"{controlword.name} alone: {names_of(heard)}")
+        received = axis.run(STAY, controlword)
+        if not all_in(received, _S.QUICK_STOP_ACTIVE):
+            return Outcome(False, f"{controlword.name} alone: {names_of(received)}")
     axis.run(FOLLOW, _C.QUICK_STOP)
     took = axis.follow(_C.ENABLE_OPERATION, _S.OPERATION_ENABLED)
-    text = "stays after QUICK_STOP and ENABLE_OPERATION" if took is None else f"enabled {took} cycles after both"
+    text = (
+        "not enabled after QUICK_STOP and ENABLE_OPERATION"
+        if took is None
+        else f"enabled {took} cycles after QUICK_STOP and ENABLE_OPERATION"
+    )
     return Outcome(took is not None, text)
 
 
-def tells_the_latch(bench: Bench) -> Outcome:
-    """DRIVE-15."""
-    axis = Axis(bench)
+def reports_the_latch(tester: NodeTester) -> Outcome:
+    """Test DRIVE-15: the latched hold raises one emergency."""
+    axis = Axis(tester)
     axis.enable()
-    first = len(bench.heard)
-    bench.idle(20)
-    told = emergencies_of(bench, first)
-    return Outcome(told == [COMMAND_TIMEOUT], f"emergencies: {codes_of(told)}")
+    first = len(tester.received)
+    tester.idle(20)
+    reported = emergencies_of(tester, first)
+    return Outcome(reported == [COMMAND_TIMEOUT], f"emergencies: {codes_of(reported)}")
 
 
-def latches_without_sync(bench: Bench) -> Outcome:
-    """DRIVE-16."""
-    axis = Axis(bench)
+def latches_without_sync(tester: NodeTester) -> Outcome:
+    """Test DRIVE-16: a short loss of SYNC has no effect, a long one latches the hold."""
+    axis = Axis(tester)
     axis.enable()
     for _ in range(3):
-        bench.silent_cycle()
+        tester.silent_cycle()
     short = axis.run(2 * SHOWN, _C.ENABLE_OPERATION)
     for _ in range(20):
-        bench.silent_cycle()
+        tester.silent_cycle()
     long = axis.run(2 * SHOWN, _C.ENABLE_OPERATION)
-    # Whether it stays in the hold is DRIVE-14.
-    passed = always(short, _S.OPERATION_ENABLED) and any(state_of(h) == _S.QUICK_STOP_ACTIVE for h in long)
+    # DRIVE-14 tests that the hold is latched.
+    passed = all_in(short, _S.OPERATION_ENABLED) and any(state_of(frame) == _S.QUICK_STOP_ACTIVE for frame in long)
     return Outcome(passed, f"after 3 ms {names_of(short)}, after 20 ms {names_of(long)}")
 
 
 def _latch(axis: Axis) -> None:
-    """Bring the latched hold about by silence of the HAL. Raises `NotTested`."""
+    """Bring the drive into the latched hold by stopping the commands.
+
+    Raises:
+        NotTested: If the drive does not latch the hold.
+    """
     axis.enable()
-    heard = axis.bench.states(axis.bench.idle(4 * LATCHED))
-    if not heard or state_of(heard[-1]) != _S.QUICK_STOP_ACTIVE:
-        raise NotTested("the drive does not latch a hold when commands stay away")
+    received = axis.tester.states(axis.tester.idle(4 * LATCHED))
+    if not received or state_of(received[-1]) != _S.QUICK_STOP_ACTIVE:
+        raise NotTested("the drive does not latch the hold without commands; see DRIVE-13")

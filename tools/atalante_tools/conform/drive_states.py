@@ -1,4 +1,4 @@
-"""What a drive's state machine owes: the transitions of CiA 402 and no others, a hold that holds, a fault until it is reset."""
+"""Tests of the state machine of a drive: transitions of CiA 402, quick stop, position hold, fault and its reset."""
 
 from __future__ import annotations
 
@@ -14,124 +14,126 @@ from atalante_tools.conform.axis import (
     SHOWN,
     STAY,
     Axis,
-    always,
+    all_in,
     codes_of,
     emergencies_of,
     names_of,
     state_of,
     torque_of,
 )
-from atalante_tools.conform.bench import Bench, NotTested
-from atalante_tools.conform.frames import Heard
+from atalante_tools.conform.bench import NodeTester, NotTested
+from atalante_tools.conform.frames import ReceivedFrame
 from atalante_tools.conform.requirement import Outcome
 from atalante_tools.conform.technician import Action
 
 _S, _C = DriveState, Controlword
 
-#: Cycles a drive may take for a quick stop.
+#: Largest number of cycles for a quick stop.
 STOP: Final = 5
-#: A joint that holds may give way by this much [rad].
+#: Largest movement of a joint on hold [rad].
 GIVE: Final = math.radians(1.0)
-#: Class of emergency codes of temperatures.
+#: CiA 301 class of emergency codes for temperature.
 TEMPERATURE_CLASS: Final = 0x4000
 
 
-def starts_disabled(bench: Bench) -> Outcome:
-    """DRIVE-01."""
-    heard = bench.states(bench.heard) or bench.states(bench.idle(10))
-    return Outcome(always(heard, _S.SWITCH_ON_DISABLED), names_of(heard))
+def starts_disabled(tester: NodeTester) -> Outcome:
+    """Test DRIVE-01: the state after start-up is SWITCH ON DISABLED."""
+    received = tester.states(tester.received) or tester.states(tester.idle(10))
+    return Outcome(all_in(received, _S.SWITCH_ON_DISABLED), names_of(received))
 
 
-def makes_legal_transitions(bench: Bench) -> Outcome:
-    """DRIVE-02."""
-    axis, slowest, wrong = Axis(bench), 0, []
+def makes_legal_transitions(tester: NodeTester) -> Outcome:
+    """Test DRIVE-02: every transition of the standard is made."""
+    axis, slowest, wrong = Axis(tester), 0, []
     for (state, controlword), (number, goal) in LEGAL.items():
         axis.go(state)
         took = axis.follow(controlword, goal)
         stayed = axis.run(STAY, controlword)
-        if took is None or not always(stayed, goal):
+        if took is None or not all_in(stayed, goal):
             wrong.append(f"{number} ({state.name}, {controlword.name}): {names_of(stayed)}")
         slowest = max(slowest, took or FOLLOW)
-    text = f"wrong: {'; '.join(wrong)}" if wrong else f"all, the slowest in {slowest} cycles"
+    text = f"wrong: {'; '.join(wrong)}" if wrong else f"all right, slowest in {slowest} cycles"
     return Outcome(not wrong, text)
 
 
-def refuses_illegal_transitions(bench: Bench) -> Outcome:
-    """DRIVE-03."""
-    axis, wrong, tried = Axis(bench), [], 0
+def refuses_illegal_transitions(tester: NodeTester) -> Outcome:
+    """Test DRIVE-03: every other command leaves the state unchanged."""
+    axis, wrong, tried = Axis(tester), [], 0
     for state in ROUTES:
         axis.go(state)
         for controlword in Controlword:
             if (state, controlword) in LEGAL:
                 continue
             tried += 1
-            heard = axis.run(STAY, controlword)
-            if not always(heard, state):
-                wrong.append(f"({state.name}, {controlword.name}): {names_of(heard)}")
+            received = axis.run(STAY, controlword)
+            if not all_in(received, state):
+                wrong.append(f"({state.name}, {controlword.name}): {names_of(received)}")
                 axis.go(state)
-    return Outcome(not wrong, f"obeyed: {'; '.join(wrong)}" if wrong else f"all {tried} refused")
+    return Outcome(not wrong, f"wrong: {'; '.join(wrong)}" if wrong else f"all {tried} ignored")
 
 
-def stops_quickly(bench: Bench) -> Outcome:
-    """DRIVE-04."""
-    axis = Axis(bench)
+def stops_quickly(tester: NodeTester) -> Outcome:
+    """Test DRIVE-04: QUICK_STOP takes effect within `STOP` cycles."""
+    axis = Axis(tester)
     axis.enable()
     took = axis.follow(_C.QUICK_STOP, _S.QUICK_STOP_ACTIVE)
     return Outcome(took is not None and took <= STOP, f"{took or f'more than {FOLLOW}'} cycles")
 
 
-def holds_its_position(bench: Bench) -> Outcome:
-    """DRIVE-05."""
-    axis = Axis(bench)
+def holds_its_position(tester: NodeTester) -> Outcome:
+    """Test DRIVE-05: the joint moves by at most `GIVE` in QUICK STOP ACTIVE."""
+    axis = Axis(tester)
     axis.enable()
-    axis.run(10, _C.ENABLE_OPERATION, bench.limits.torque)
+    axis.run(10, _C.ENABLE_OPERATION, tester.limits.torque)
     if axis.follow(_C.QUICK_STOP, _S.QUICK_STOP_ACTIVE) is None:
-        raise NotTested("the drive does not go to QUICK_STOP_ACTIVE; see DRIVE-02")
-    heard = axis.run(100, _C.QUICK_STOP)
-    positions = [h.values["Position"] / bench.robot.gear[axis.joint] for h in heard]
-    gave = max(positions) - min(positions) if positions else math.inf
-    return Outcome(gave <= GIVE and always(heard, _S.QUICK_STOP_ACTIVE), f"moved {math.degrees(gave):.2f} degrees")
+        raise NotTested("the drive cannot be brought to QUICK_STOP_ACTIVE; see DRIVE-02")
+    received = axis.run(100, _C.QUICK_STOP)
+    positions = [frame.values["Position"] / tester.robot.gear[axis.joint] for frame in received]
+    moved = max(positions) - min(positions) if positions else math.inf
+    return Outcome(moved <= GIVE and all_in(received, _S.QUICK_STOP_ACTIVE), f"moved {math.degrees(moved):.2f} degrees")
 
 
-def trips_when_hot(bench: Bench) -> Outcome:
-    """DRIVE-22."""
-    axis = Axis(bench)
+def trips_when_hot(tester: NodeTester) -> Outcome:
+    """Test DRIVE-22: overheating leads to FAULT, zero torque and one emergency."""
+    axis = Axis(tester)
     axis.enable()
-    first = len(bench.heard)
+    first = len(tester.received)
 
-    def is_faulty(heard: list[Heard]) -> bool:
-        return any(state_of(h) == _S.FAULT for h in bench.states(heard))
+    def is_faulty(received: list[ReceivedFrame]) -> bool:
+        return any(state_of(frame) == _S.FAULT for frame in tester.states(received))
 
-    def enabled() -> list[Heard]:
-        return bench.cycle(axis.word(_C.ENABLE_OPERATION))
+    def enabled() -> list[ReceivedFrame]:
+        return tester.cycle(axis.command(_C.ENABLE_OPERATION))
 
-    if not bench.ask(Action.OVERHEAT, is_faulty, enabled):
-        return Outcome(False, "does not trip")
-    axis.run(2 * SHOWN, _C.ENABLE_OPERATION, bench.limits.torque)
-    made = torque_of(axis.run(2 * SHOWN, _C.ENABLE_OPERATION, bench.limits.torque))
-    told = emergencies_of(bench, first)
-    hot = [code for code in told if code & 0xF000 == TEMPERATURE_CLASS]
-    return Outcome(len(hot) == 1 and abs(made) <= NOISE, f"emergencies: {codes_of(told)}; {made:+.2f} Nm in FAULT")
+    if not tester.request(Action.OVERHEAT, is_faulty, enabled):
+        return Outcome(False, "no FAULT")
+    axis.run(2 * SHOWN, _C.ENABLE_OPERATION, tester.limits.torque)
+    made = torque_of(axis.run(2 * SHOWN, _C.ENABLE_OPERATION, tester.limits.torque))
+    reported = emergencies_of(tester, first)
+    hot = [code for code in reported if code & 0xF000 == TEMPERATURE_CLASS]
+    return Outcome(len(hot) == 1 and abs(made) <= NOISE, f"emergencies: {codes_of(reported)}; {made:+.2f} Nm in FAULT")
 
 
-def leaves_fault_when_reset(bench: Bench) -> Outcome:
-    """DRIVE-23."""
-    axis = Axis(bench)
-    heard = axis.run(SHOWN, _C.ENABLE_OPERATION)
-    if not always(heard[-1:], _S.FAULT):
+def leaves_fault_when_reset(tester: NodeTester) -> Outcome:
+    """Test DRIVE-23: only FAULT_RESET leaves FAULT."""
+    axis = Axis(tester)
+    received = axis.run(SHOWN, _C.ENABLE_OPERATION)
+    if not all_in(received[-1:], _S.FAULT):
         raise NotTested("the drive is not in FAULT; see DRIVE-22")
-    bench.technician.please(Action.COOL, bench.node.name)
+    tester.technician.request(Action.COOL, tester.node.name)
     for controlword in Controlword:
         if controlword is not _C.FAULT_RESET:
-            heard = axis.run(STAY, controlword)
-            if not always(heard, _S.FAULT):
-                return Outcome(False, f"{controlword.name}: {names_of(heard)}")
+            received = axis.run(STAY, controlword)
+            if not all_in(received, _S.FAULT):
+                return Outcome(False, f"{controlword.name}: {names_of(received)}")
 
-    def is_reset(heard: list[Heard]) -> bool:
-        return any(state_of(h) == _S.SWITCH_ON_DISABLED for h in bench.states(heard))
+    def is_reset(received: list[ReceivedFrame]) -> bool:
+        return any(state_of(frame) == _S.SWITCH_ON_DISABLED for frame in tester.states(received))
 
-    def reset() -> list[Heard]:
-        return bench.cycle(axis.word(_C.FAULT_RESET))
+    def reset() -> list[ReceivedFrame]:
+        return tester.cycle(axis.command(_C.FAULT_RESET))
 
-    passed = bench.until(is_reset, reset)
-    return Outcome(passed, "SWITCH_ON_DISABLED after FAULT_RESET alone" if passed else "stays in FAULT")
+    passed = tester.run_until(is_reset, reset)
+    return Outcome(
+        passed, "SWITCH_ON_DISABLED only after FAULT_RESET" if passed else "still in FAULT after FAULT_RESET"
+    )

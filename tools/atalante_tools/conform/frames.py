@@ -1,4 +1,4 @@
-"""One message as the bench says it, well or deliberately wrong, and as it hears it: without the receiver's usual forgiveness."""
+"""Frames of one message as sent by the node tester, valid or with one defect, and as received, with every defect recorded."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, Frames
 _FD: Final = FLAG_FDF | FLAG_BRS
 
 
-class Outgoing:
-    """Sender of one message, frame by frame. Every defect of a frame is asked for; all else about it is right."""
+class MessageSender:
+    """Sender of one message. A frame is valid except for the defects requested by arguments."""
 
     def __init__(self, message: Message) -> None:
         self.message = message
         self._codec = Codec([message])
         self._template = self._codec.template()
         self._values = np.zeros(self._codec.size)
-        self._counter = 255  # of the last frame
+        self._counter = 255  # alive counter of the last frame
 
     def frame(
         self,
@@ -37,16 +37,16 @@ class Outgoing:
         classic: bool = False,
         flip: int | None = None,
     ) -> Frames:
-        """The next frame. Shape (1,).
+        """Return the next frame, optionally defective. Shape (1,).
 
         Args:
-            values: physical value of each signal that is not 0, DBC units.
-            raw: codes to write instead, whatever the range says.
-            counter: this one instead of the next; the sequence is not moved by it.
-            data_id: protect for another message.
-            length: cut or fill the payload, and protect it as it is then.
-            classic: a frame of classic CAN.
-            flip: bit of the payload to damage after protection.
+            values: physical value of each signal, in DBC units; signals that are missing are 0.
+            raw: raw codes to write in place of values, without range check.
+            counter: alive counter in place of the next one; the sequence does not advance.
+            data_id: E2E Data ID in place of that of the message.
+            length: payload length [byte] in place of that of the message; the CRC is valid for this length.
+            classic: True for a classic CAN frame.
+            flip: payload bit that is inverted after the CRC is written.
         """
         message, codec = self.message, self._codec
         self._values.fill(0.0)
@@ -76,28 +76,28 @@ class Outgoing:
 
     @property
     def counter(self) -> int:
-        """Counter of the last frame in sequence."""
+        """Return the alive counter of the last frame in sequence."""
         return self._counter
 
 
 @dataclass(frozen=True)
-class Heard:
-    """One frame of the node under test. What is wrong with it is noted, not refused."""
+class ReceivedFrame:
+    """Frame of the node under test. Defects are recorded and do not reject the frame."""
 
     message: Message
-    cycle: int  # of the last SYNC before it
-    time: float  # s
-    length_right: bool
-    format_right: bool  # CAN FD with bit rate switch, data frame
-    crc_right: bool
+    cycle: int  # number of the cycle in which it was received
+    time: float  # s, receive time
+    length_valid: bool
+    format_valid: bool  # CAN FD data frame with bit rate switch
+    crc_valid: bool
     counter: int
     reserved_zero: bool
-    outside: tuple[str, ...]  # signals outside their range or with their invalid code
-    values: dict[str, float]  # DBC units; empty when the length is wrong
+    out_of_range: tuple[str, ...]  # signals out of range or with their invalid code
+    values: dict[str, float]  # physical values in DBC units; empty if the length is wrong
 
 
-class Incoming:
-    """Listener to one message."""
+class MessageReceiver:
+    """Receiver of one message."""
 
     def __init__(self, message: Message) -> None:
         self.message = message
@@ -112,31 +112,37 @@ class Incoming:
                 used[bit // 8] |= 1 << bit % 8
         self._reserved = (~used)[: message.length]
 
-    def hear(self, frame: Frames, cycle: int, time: float) -> Heard:
-        """Take one frame apart. Shape (1,)."""
+    def decode(self, frame: Frames, cycle: int, time: float) -> ReceivedFrame:
+        """Decode one frame and record its defects.
+
+        Args:
+            frame: received frame, shape (1,).
+            cycle: number of the current cycle.
+            time: receive time [s].
+        """
         message = self.message
         length = int(frame["len"][0])
         payload = frame["data"][0][:length]
-        length_right = length == message.length
+        length_valid = length == message.length
         values: dict[str, float] = {}
-        outside: tuple[str, ...] = ()
-        if length_right:
+        out_of_range: tuple[str, ...] = ()
+        if length_valid:
             self._frames["data"][0][:length] = payload
             inside = self._codec.decode(self._frames, self._decoded)
             values = dict(zip(self._names, self._decoded.tolist(), strict=True))
             if not inside:
-                outside = tuple(s.name for s in message.signals if not self._is_inside(s.name, values[s.name]))
-        said = int(payload[0]) | int(payload[1]) << 8 if length >= CRC_BYTES else -1
-        return Heard(
+                out_of_range = tuple(s.name for s in message.signals if not self._is_inside(s.name, values[s.name]))
+        reported = int(payload[0]) | int(payload[1]) << 8 if length >= CRC_BYTES else -1
+        return ReceivedFrame(
             message=message,
             cycle=cycle,
             time=time,
-            length_right=length_right,
-            format_right=int(frame["flags"][0]) & _FD == _FD and int(frame["can_id"][0]) == message.frame_id,
-            crc_right=crc(payload[CRC_BYTES:].tobytes(), self._data_id) == said,
+            length_valid=length_valid,
+            format_valid=int(frame["flags"][0]) & _FD == _FD and int(frame["can_id"][0]) == message.frame_id,
+            crc_valid=crc(payload[CRC_BYTES:].tobytes(), self._data_id) == reported,
             counter=int(payload[COUNTER_BYTE]) if length > COUNTER_BYTE else -1,
-            reserved_zero=not length_right or not (payload & self._reserved).any(),
-            outside=outside,
+            reserved_zero=not length_valid or not (payload & self._reserved).any(),
+            out_of_range=out_of_range,
             values=values,
         )
 

@@ -1,4 +1,4 @@
-"""What the haptics node owes its eight motors: each follows its own level like a first-order lag, and stops without commands."""
+"""Requirements for the haptics node: each of its eight motors follows its level as a first-order lag, and stops on timeout."""
 
 from __future__ import annotations
 
@@ -9,65 +9,67 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.wire.frame import Frames
-from atalante_tools.conform.bench import Bench, NotTested
-from atalante_tools.conform.frames import Heard
+from atalante_tools.conform.bench import NodeTester, NotTested
+from atalante_tools.conform.frames import ReceivedFrame
 from atalante_tools.conform.requirement import Outcome, Requirement
 
 Vector = npt.NDArray[np.float64]
 
 E2E: Final = "AUTOSAR E2E Profile 5"
-#: Longest time constant [s], and how far the lag may be from one of first order (share of full amplitude).
-TIME_CONSTANT, LAG = 0.06, 0.05
-#: Cycles in which every motor has reached its level, or stopped.
+#: Largest time constant [s].
+TIME_CONSTANT = 0.06
+#: Largest deviation from a first-order lag, as a fraction of full amplitude.
+LAG = 0.05
+#: Number of cycles after which every motor has reached its level or stopped.
 _SETTLED: Final = 250
-#: An amplitude that is nothing.
+#: Largest amplitude of a motor at rest, as a fraction of full amplitude.
 _STILL: Final = 0.02
-#: Cycles of commands that are to be ignored.
+#: Number of cycles with defective commands.
 _BAD: Final = 40
 
 
-def requirements(bench: Bench) -> list[Requirement]:
-    """Of the haptics node."""
+def requirements(tester: NodeTester) -> list[Requirement]:
+    """Return the requirements for the haptics node."""
     return [
-        Requirement("HAPTICS-01", "Is still at rest.", "50 ms without command", "DBC Amplitude", is_still),
+        Requirement("HAPTICS-01", "Does not vibrate at rest.", "50 ms without command", "DBC Amplitude", is_still),
         Requirement(
             "HAPTICS-02",
             f"Follows its level like a first-order lag of at most {TIME_CONSTANT * 1e3:g} ms.",
-            "all levels from 0 to 1",
+            "all motors from level 0 to 1",
             "DBC Level, Amplitude",
             follows_like_a_lag,
         ),
         Requirement(
             "HAPTICS-03",
-            "Reaches both ends of the range of its level.",
-            f"1 and 0 for {_SETTLED} ms each",
+            "Reaches both ends of the level range.",
+            f"level 1 and level 0 for {_SETTLED} ms each",
             "DBC Level",
             reaches_both_ends,
         ),
         Requirement(
             "HAPTICS-04",
-            "Moves the commanded motor alone.",
-            "one motor after the other at 0.5",
+            "Drives only the commanded motor.",
+            "one motor after the other at level 0.5",
             "DBC Level",
             moves_one_motor,
         ),
         Requirement(
             "HAPTICS-05",
-            "Clamps or refuses a level above its range.",
+            "Clamps or ignores a level above the DBC range.",
             f"codes 201, 230 and 254 for {_BAD} ms at level 0.5",
             "DBC Level range",
             stays_in_range,
         ),
         Requirement(
             "HAPTICS-06",
-            "Does not act on an invalid level.",
+            "Ignores the invalid code of a level.",
             f"the invalid code for {_BAD} ms at level 0",
             "DBC InvalidRaw",
             _ignores(lambda b, _: _command(b, 0.0, raw=_codes(b, 255))),
         ),
         Requirement(
             "HAPTICS-07",
-            "Stops when commands stay away.",
+            "Stops on loss of commands.",
             f"{2 * _SETTLED} ms without command after level 1",
             "DBC HAPTICS_COMMAND TimeoutTime",
             stops_without_commands,
@@ -75,7 +77,7 @@ def requirements(bench: Bench) -> list[Requirement]:
         Requirement(
             "HAPTICS-08",
             "Ignores commands with a wrong CRC.",
-            f"{_BAD} commands with one bit damaged",
+            f"{_BAD} commands with one bit flipped",
             E2E,
             _ignores(lambda b, number: _command(b, 1.0, flip=24 + number)),
         ),
@@ -89,105 +91,109 @@ def requirements(bench: Bench) -> list[Requirement]:
         Requirement(
             "HAPTICS-10",
             "Ignores repeated commands.",
-            f"{_BAD} commands with the counter of the last good one",
+            f"{_BAD} commands with the counter of the last valid command",
             E2E,
             _ignores(lambda b, _: _command(b, 1.0, counter=b.command.counter)),
         ),
         Requirement(
             "HAPTICS-11",
-            "Ignores commands of another length.",
-            f"{_BAD} commands of 20 and 64 bytes, CRC right for that length",
+            "Ignores commands of a wrong length.",
+            f"{_BAD} commands of 20 and 64 bytes, CRC valid for that length",
             "DBC length",
             _ignores(lambda b, number: _command(b, 1.0, length=(20, 64)[number % 2])),
         ),
     ]
 
 
-def is_still(bench: Bench) -> Outcome:
-    """HAPTICS-01."""
-    most = _amplitudes(bench, bench.idle(50)).max()
-    return Outcome(bool(most <= _STILL), f"amplitude {most:.3f} at the most")
+def is_still(tester: NodeTester) -> Outcome:
+    """Test HAPTICS-01: no amplitude without commands."""
+    most = _amplitudes(tester, tester.idle(50)).max()
+    return Outcome(bool(most <= _STILL), f"amplitude {most:.3f} at most")
 
 
-def follows_like_a_lag(bench: Bench) -> Outcome:
-    """HAPTICS-02: what is left to go shrinks by the same factor from one state to the next."""
-    _bring(bench, 0.0)
-    left = 1.0 - _amplitudes(bench, _run(bench, _SETTLED, 1.0))
-    period = bench.state_message.cycle_ms * 1e-3
+def follows_like_a_lag(tester: NodeTester) -> Outcome:
+    """Test HAPTICS-02: the remaining amplitude shrinks by the same factor from one state frame to the next."""
+    _settle(tester, 0.0)
+    remaining = 1.0 - _amplitudes(tester, _run(tester, _SETTLED, 1.0))
+    period = tester.state_message.cycle_ms * 1e-3
     slowest, worst = 0.0, 0.0
-    for motor in left.T:
+    for motor in remaining.T:
         start = int(np.flatnonzero(motor > 0.99)[-1]) + 1 if (motor > 0.99).any() else 0
-        going = motor[start:]
-        if len(going) < 3:
-            return Outcome(False, "a motor does not move")
-        factor = float(going[1:] @ going[:-1] / (going[:-1] @ going[:-1]))  # least squares
-        model = going[0] * factor ** np.arange(len(going))
+        rising = motor[start:]
+        if len(rising) < 3:
+            return Outcome(False, "a motor does not follow its level")
+        factor = float(rising[1:] @ rising[:-1] / (rising[:-1] @ rising[:-1]))  # least squares
+        model = rising[0] * factor ** np.arange(len(rising))
         slowest = max(slowest, -period / np.log(factor) if 0.0 < factor < 1.0 else np.inf)
-        worst = max(worst, float(np.abs(going - model).max()))
-    text = f"time constant {slowest * 1e3:.0f} ms, {worst:.3f} from a first-order lag"
+        worst = max(worst, float(np.abs(rising - model).max()))
+    text = f"time constant {slowest * 1e3:.0f} ms, largest deviation from a first-order lag {worst:.3f}"
     return Outcome(slowest <= TIME_CONSTANT and worst <= LAG, text)
 
 
-def reaches_both_ends(bench: Bench) -> Outcome:
-    """HAPTICS-03."""
-    high = _amplitudes(bench, _run(bench, _SETTLED, 1.0))[-1].min()
-    low = _amplitudes(bench, _run(bench, _SETTLED, 0.0))[-1].max()
-    return Outcome(bool(high >= 1.0 - _STILL and low <= _STILL), f"{high:.3f} at level 1, {low:.3f} at level 0")
+def reaches_both_ends(tester: NodeTester) -> Outcome:
+    """Test HAPTICS-03: full amplitude at level 1, none at level 0."""
+    high = _amplitudes(tester, _run(tester, _SETTLED, 1.0))[-1].min()
+    low = _amplitudes(tester, _run(tester, _SETTLED, 0.0))[-1].max()
+    return Outcome(
+        bool(high >= 1.0 - _STILL and low <= _STILL), f"amplitude {high:.3f} at level 1, {low:.3f} at level 0"
+    )
 
 
-def moves_one_motor(bench: Bench) -> Outcome:
-    """HAPTICS-04."""
+def moves_one_motor(tester: NodeTester) -> Outcome:
+    """Test HAPTICS-04: a level drives its own motor and no other."""
     wrong = []
-    names = _motors(bench)
-    for place, name in enumerate(names):
-        last = _bring(bench, 0.5, only=name)
-        others = np.delete(last, place)
-        if not (abs(last[place] - 0.5) <= LAG and others.max() <= _STILL):
-            wrong.append(f"{name} {last[place]:.2f}, others up to {others.max():.2f}")
-    return Outcome(not wrong, "; ".join(wrong) if wrong else f"{len(names)} motors, each by itself")
+    names = _motors(tester)
+    for index, name in enumerate(names):
+        last = _settle(tester, 0.5, only=name)
+        others = np.delete(last, index)
+        if not (abs(last[index] - 0.5) <= LAG and others.max() <= _STILL):
+            wrong.append(f"{name} {last[index]:.2f}, others up to {others.max():.2f}")
+    return Outcome(not wrong, "; ".join(wrong) if wrong else f"{len(names)} motors, each driven alone")
 
 
-def stays_in_range(bench: Bench) -> Outcome:
-    """HAPTICS-05."""
+def stays_in_range(tester: NodeTester) -> Outcome:
+    """Test HAPTICS-05: the amplitude stays at or below 1 for a level above the range."""
     found, passed = [], True
     for code in (201, 230, 254):
-        _bring(bench, 0.5)
-        heard = [h for _ in range(_BAD) for h in bench.cycle(_command(bench, 0.5, raw=_codes(bench, code)))]
-        amplitudes = _amplitudes(bench, heard)
+        _settle(tester, 0.5)
+        received = [
+            frame for _ in range(_BAD) for frame in tester.cycle(_command(tester, 0.5, raw=_codes(tester, code)))
+        ]
+        amplitudes = _amplitudes(tester, received)
         low, high = amplitudes.min(), amplitudes.max()
         passed &= bool(low >= 0.5 - LAG and high <= 1.0 + 1e-9)
         found.append(f"{code}: {low:.2f} to {high:.2f}")
     return Outcome(passed, ", ".join(found))
 
 
-def stops_without_commands(bench: Bench) -> Outcome:
-    """HAPTICS-07."""
-    _bring(bench, 1.0)
-    last = _amplitudes(bench, bench.idle(2 * _SETTLED))[-1].max()
+def stops_without_commands(tester: NodeTester) -> Outcome:
+    """Test HAPTICS-07: the motors stop on loss of commands."""
+    _settle(tester, 1.0)
+    last = _amplitudes(tester, tester.idle(2 * _SETTLED))[-1].max()
     return Outcome(bool(last <= _STILL), f"amplitude {last:.3f} after {2 * _SETTLED} ms")
 
 
-def _ignores(bad: Callable[[Bench, int], Frames]) -> Callable[[Bench], Outcome]:
-    def test(bench: Bench) -> Outcome:
-        _bring(bench, 0.0)
-        heard = [h for number in range(_BAD) for h in bench.cycle(bad(bench, number))]
-        most = _amplitudes(bench, heard).max()
-        _run(bench, 10, 0.0)
-        return Outcome(bool(most <= _STILL), f"amplitude {most:.3f} at the most")
+def _ignores(bad: Callable[[NodeTester, int], Frames]) -> Callable[[NodeTester], Outcome]:
+    def test(tester: NodeTester) -> Outcome:
+        _settle(tester, 0.0)
+        received = [frame for number in range(_BAD) for frame in tester.cycle(bad(tester, number))]
+        most = _amplitudes(tester, received).max()
+        _run(tester, 10, 0.0)
+        return Outcome(bool(most <= _STILL), f"amplitude {most:.3f} at most")
 
     return test
 
 
-def _motors(bench: Bench) -> list[str]:
-    return [s.name.removesuffix("_Amplitude") for s in bench.state_message.signals if s.name.endswith("_Amplitude")]
+def _motors(tester: NodeTester) -> list[str]:
+    return [s.name.removesuffix("_Amplitude") for s in tester.state_message.signals if s.name.endswith("_Amplitude")]
 
 
-def _codes(bench: Bench, code: int) -> dict[str, int]:
-    return {f"{motor}_Level": code for motor in _motors(bench)}
+def _codes(tester: NodeTester, code: int) -> dict[str, int]:
+    return {f"{motor}_Level": code for motor in _motors(tester)}
 
 
 def _command(
-    bench: Bench,
+    tester: NodeTester,
     level: float,
     *,
     only: str | None = None,
@@ -197,28 +203,37 @@ def _command(
     length: int | None = None,
     flip: int | None = None,
 ) -> Frames:
-    levels = {f"{motor}_Level": level for motor in _motors(bench) if only in (None, motor)}
-    return bench.command.frame(levels, raw=raw, counter=counter, data_id=data_id, length=length, flip=flip)
+    levels = {f"{motor}_Level": level for motor in _motors(tester) if only in (None, motor)}
+    return tester.command.frame(levels, raw=raw, counter=counter, data_id=data_id, length=length, flip=flip)
 
 
-def _run(bench: Bench, cycles: int, level: float, only: str | None = None) -> list[Heard]:
-    return [h for _ in range(cycles) for h in bench.cycle(_command(bench, level, only=only))]
+def _run(tester: NodeTester, cycles: int, level: float, only: str | None = None) -> list[ReceivedFrame]:
+    return [frame for _ in range(cycles) for frame in tester.cycle(_command(tester, level, only=only))]
 
 
-def _bring(bench: Bench, level: float, only: str | None = None) -> Vector:
-    """Command a level until every motor is there, or should be; the amplitudes then. Shape (motors,)."""
-    wanted = np.array([level if only in (None, motor) else 0.0 for motor in _motors(bench)])
-    amplitude = np.full(len(wanted), np.nan)
-    for _ in range(_SETTLED // bench.state_message.cycle_ms):
-        amplitude = _amplitudes(bench, _run(bench, bench.state_message.cycle_ms, level, only))[-1]
-        if np.abs(amplitude - wanted).max() <= _STILL:
+def _settle(tester: NodeTester, level: float, only: str | None = None) -> Vector:
+    """Command a level until every motor has reached it, for at most `_SETTLED` cycles; return the amplitudes.
+
+    Args:
+        tester: tester of the haptics node.
+        level: level of the motors, 0 to 1.
+        only: name of the only motor with that level; None: all motors.
+
+    Returns:
+        Last measured amplitudes, shape (motors,), 0 to 1.
+    """
+    expected = np.array([level if only in (None, motor) else 0.0 for motor in _motors(tester)])
+    amplitude = np.full(len(expected), np.nan)
+    for _ in range(_SETTLED // tester.state_message.cycle_ms):
+        amplitude = _amplitudes(tester, _run(tester, tester.state_message.cycle_ms, level, only))[-1]
+        if np.abs(amplitude - expected).max() <= _STILL:
             break
     return amplitude
 
 
-def _amplitudes(bench: Bench, heard: list[Heard]) -> Vector:
-    """Amplitude of each motor in each state. Shape (states, motors)."""
-    states = bench.states(heard)
+def _amplitudes(tester: NodeTester, received: list[ReceivedFrame]) -> Vector:
+    """Return the amplitude of each motor in each state frame. Shape (states, motors)."""
+    states = tester.states(received)
     if not states:
-        raise NotTested("no state frame was heard")
-    return np.array([[h.values[f"{motor}_Amplitude"] for motor in _motors(bench)] for h in states])
+        raise NotTested("no state frame received")
+    return np.array([[frame.values[f"{motor}_Amplitude"] for motor in _motors(tester)] for frame in states])

@@ -1,38 +1,54 @@
-"""What the pendant owes the operator: every press is told once, the dead-man at once, and nothing is said that nobody did."""
+"""Requirements for the pendant: one request per press, state of the dead-man switch, no request without a press."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Final
 
-from atalante_tools.conform.bench import Bench, NotTested
-from atalante_tools.conform.frames import Heard
+from atalante_tools.conform.bench import NodeTester, NotTested
+from atalante_tools.conform.frames import ReceivedFrame
 from atalante_tools.conform.requirement import Outcome, Requirement
 from atalante_tools.conform.technician import Action
 
 #: Values of `PENDANT_STATE.Request`.
 START, STOP, HOLD = 1, 2, 3
-#: Cycles after a press in which nothing more may be told.
+#: Number of cycles after a press without another request.
 _AFTER: Final = 50
 SOURCE: Final = "DBC PENDANT_STATE"
 
 
-def requirements(_bench: Bench) -> list[Requirement]:
-    """Of the pendant. A technician has to press."""
+def requirements(_tester: NodeTester) -> list[Requirement]:
+    """Return the requirements for the pendant. A technician presses the buttons."""
     return [
-        Requirement("PENDANT-01", "Asks for nothing by itself.", "200 ms untouched", SOURCE, asks_for_nothing),
+        Requirement("PENDANT-01", "Sends no request without a press.", "200 ms untouched", SOURCE, sends_no_request),
         Requirement(
             "PENDANT-02",
-            "Tells the dead-man, released and pressed.",
-            "both once",
+            "Reports the dead-man switch, released and pressed.",
+            "released and pressed once",
             "fault matrix F56",
-            tells_the_dead_man,
+            reports_the_dead_man,
         ),
         Requirement(
-            "PENDANT-03", "Tells START once a press.", "START pressed", SOURCE, _tells(Action.PRESS_START, START)
+            "PENDANT-03",
+            "Reports START once per press.",
+            "START pressed",
+            SOURCE,
+            _reports_press(Action.PRESS_START, START),
         ),
-        Requirement("PENDANT-04", "Tells STOP once a press.", "STOP pressed", SOURCE, _tells(Action.PRESS_STOP, STOP)),
-        Requirement("PENDANT-05", "Tells HOLD once a press.", "HOLD pressed", SOURCE, _tells(Action.PRESS_HOLD, HOLD)),
+        Requirement(
+            "PENDANT-04",
+            "Reports STOP once per press.",
+            "STOP pressed",
+            SOURCE,
+            _reports_press(Action.PRESS_STOP, STOP),
+        ),
+        Requirement(
+            "PENDANT-05",
+            "Reports HOLD once per press.",
+            "HOLD pressed",
+            SOURCE,
+            _reports_press(Action.PRESS_HOLD, HOLD),
+        ),
         Requirement(
             "PENDANT-06",
             "Sets the assistance factor when the dial is turned.",
@@ -43,57 +59,62 @@ def requirements(_bench: Bench) -> list[Requirement]:
     ]
 
 
-def asks_for_nothing(bench: Bench) -> Outcome:
-    """PENDANT-01."""
-    heard = bench.states(bench.idle(200))
-    counters = {int(h.values["RequestCounter"]) for h in heard}
-    return Outcome(len(counters) == 1, f"{len(counters) - 1} requests in {len(heard)} frames")
+def sends_no_request(tester: NodeTester) -> Outcome:
+    """Test PENDANT-01: the request counter does not change."""
+    received = tester.states(tester.idle(200))
+    counters = {int(frame.values["RequestCounter"]) for frame in received}
+    return Outcome(len(counters) == 1, f"{len(counters) - 1} requests in {len(received)} frames")
 
 
-def tells_the_dead_man(bench: Bench) -> Outcome:
-    """PENDANT-02."""
+def reports_the_dead_man(tester: NodeTester) -> Outcome:
+    """Test PENDANT-02: the dead-man switch is reported as released and as pressed."""
 
-    def says(pressed: bool) -> Callable[[list[Heard]], bool]:
-        return lambda heard: any(bool(h.values["DeadMan"]) is pressed for h in bench.states(heard))
+    def reports(pressed: bool) -> Callable[[list[ReceivedFrame]], bool]:
+        return lambda received: any(bool(frame.values["DeadMan"]) is pressed for frame in tester.states(received))
 
-    if not bench.until(says(True)):
-        bench.ask(Action.SQUEEZE_DEAD_MAN, says(True))
+    if not tester.run_until(reports(True)):
+        tester.request(Action.SQUEEZE_DEAD_MAN, reports(True))
     for action, pressed in ((Action.RELEASE_DEAD_MAN, False), (Action.SQUEEZE_DEAD_MAN, True)):
-        if not bench.ask(action, says(pressed)):
-            return Outcome(False, f"{'pressing' if pressed else 'releasing'} it does not show")
+        if not tester.request(action, reports(pressed)):
+            return Outcome(False, f"{'pressing' if pressed else 'releasing'} the dead-man switch is not reported")
     return Outcome(True, "released, then pressed")
 
 
-def sets_the_factor(bench: Bench) -> Outcome:
-    """PENDANT-06."""
-    before = _last(bench, bench.idle(3))["AssistanceFactor"]
+def sets_the_factor(tester: NodeTester) -> Outcome:
+    """Test PENDANT-06: turning the dial changes the assistance factor."""
+    before = _last(tester, tester.idle(3))["AssistanceFactor"]
 
-    def is_set(heard: list[Heard]) -> bool:
-        return any(h.values["AssistanceSet"] and h.values["AssistanceFactor"] != before for h in bench.states(heard))
+    def is_set(received: list[ReceivedFrame]) -> bool:
+        return any(
+            frame.values["AssistanceSet"] and frame.values["AssistanceFactor"] != before
+            for frame in tester.states(received)
+        )
 
-    passed = bench.ask(Action.TURN_DIAL, is_set)
-    now = _last(bench, bench.idle(3))["AssistanceFactor"]
+    passed = tester.request(Action.TURN_DIAL, is_set)
+    now = _last(tester, tester.idle(3))["AssistanceFactor"]
     return Outcome(passed, f"factor {before:g} -> {now:g}")
 
 
-def _tells(action: Action, request: int) -> Callable[[Bench], Outcome]:
-    def test(bench: Bench) -> Outcome:
-        before = _last(bench, bench.idle(3))["RequestCounter"]
+def _reports_press(action: Action, request: int) -> Callable[[NodeTester], Outcome]:
+    def test(tester: NodeTester) -> Outcome:
+        before = _last(tester, tester.idle(3))["RequestCounter"]
 
-        def is_told(heard: list[Heard]) -> bool:
-            return any(h.values["RequestCounter"] != before for h in bench.states(heard))
+        def is_reported(received: list[ReceivedFrame]) -> bool:
+            return any(frame.values["RequestCounter"] != before for frame in tester.states(received))
 
-        if not bench.ask(action, is_told):
-            return Outcome(False, "the press does not show")
-        now = _last(bench, bench.idle(_AFTER))
+        if not tester.request(action, is_reported):
+            return Outcome(False, "the press is not reported")
+        now = _last(tester, tester.idle(_AFTER))
         presses = int(now["RequestCounter"] - before) & 0xFF
-        return Outcome(presses == 1 and now["Request"] == request, f"{presses} presses, request {now['Request']:g}")
+        return Outcome(
+            presses == 1 and now["Request"] == request, f"{presses} requests, request code {now['Request']:g}"
+        )
 
     return test
 
 
-def _last(bench: Bench, heard: list[Heard]) -> dict[str, float]:
-    states = bench.states(heard)
+def _last(tester: NodeTester, received: list[ReceivedFrame]) -> dict[str, float]:
+    states = tester.states(received)
     if not states:
-        raise NotTested("no state frame was heard")
+        raise NotTested("no state frame received")
     return states[-1].values

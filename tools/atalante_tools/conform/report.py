@@ -1,4 +1,4 @@
-"""The acceptance protocol: every requirement with how it was tested, what was measured, and the verdict."""
+"""Acceptance protocol: each requirement with its test, the measured values and the verdict."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from collections.abc import Sequence
 from textwrap import wrap
 from typing import Any
 
-from atalante_tools.conform.bench import Bench
+from atalante_tools.conform.bench import NodeTester
 from atalante_tools.conform.requirement import Result, Verdict
 
 _WIDTH = 110
 
 
-def as_object(bench: Bench, result: Result) -> dict[str, Any]:
-    """One requirement for programs."""
+def as_object(tester: NodeTester, result: Result) -> dict[str, Any]:
+    """Return one result as a JSON object."""
     requirement = result.requirement
     return {
-        "node": bench.node.name,
+        "node": tester.node.name,
         "id": requirement.id,
         "verdict": result.verdict.value.lower(),
         "requirement": requirement.text,
@@ -27,17 +27,17 @@ def as_object(bench: Bench, result: Result) -> dict[str, Any]:
     }
 
 
-def heading(bench: Bench, where: str, date: str) -> str:
-    """What was examined, against what."""
-    torque = f", at most {bench.limits.torque:g} Nm" if bench.node.kind == "drive" else ""
+def heading(tester: NodeTester, target: str, date: str) -> str:
+    """Return the head of the protocol: node, bus, date, network hash and torque limit."""
+    torque = f", at most {tester.limits.torque:g} Nm" if tester.node.kind == "drive" else ""
     return (
-        f"ACCEPTANCE PROTOCOL  {bench.node.name} ({bench.node.kind})\n"
-        f"on {where}, {date}; network {bench.network.hash32:#010x}{torque}\n"
+        f"ACCEPTANCE PROTOCOL  {tester.node.name} ({tester.node.kind})\n"
+        f"on {target}, {date}; network {tester.network.hash32:#010x}{torque}\n"
     )
 
 
 def entry(result: Result) -> str:
-    """One requirement for people."""
+    """Return one result as lines of text."""
     requirement = result.requirement
     lines = [f"{requirement.id:<11}{result.verdict.value:<11}{requirement.text}"]
     for label, text in (("tested", requirement.how), ("measured", result.measured), ("source", requirement.source)):
@@ -46,9 +46,9 @@ def entry(result: Result) -> str:
     return "\n".join(lines)
 
 
-def conclusion(bench: Bench, results: Sequence[Result]) -> str:
-    """One line."""
+def conclusion(tester: NodeTester, results: Sequence[Result]) -> str:
+    """Return the last line of the protocol: number of passed requirements, and ids of the others."""
     counts = Counter(result.verdict for result in results)
     missed = [r.requirement.id for r in results if r.verdict is not Verdict.PASSED]
-    text = f"{bench.node.name}: {counts[Verdict.PASSED]} of {len(results)} requirements passed"
+    text = f"{tester.node.name}: {counts[Verdict.PASSED]} of {len(results)} requirements passed"
     return f"{text}; not passed: {', '.join(missed)}" if missed else text

@@ -1,4 +1,4 @@
-"""Requirements, and the examination that turns them into verdicts, one after the other on the same bench."""
+"""Requirements, and the examination that tests them one after the other and gives each a verdict."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from atalante_tools.conform.bench import Bench, NotTested
+from atalante_tools.conform.bench import NodeTester, NotTested
 
-#: Delay of a cycle [s] by which this computer, not the node, may have spoilt a test; and how often it is repeated then.
+#: Cycle delay [s]. After a longer delay, a failed test may be the fault of this computer, not of the node.
 LATE: Final = 2e-3
+#: Number of attempts for a test that fails after a longer delay.
 ATTEMPTS: Final = 3
 
 
 class Verdict(Enum):
-    """What came of a requirement."""
+    """Verdict on a requirement."""
 
     PASSED = "pass"
     FAILED = "FAIL"
@@ -24,10 +25,10 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a test found."""
+    """Outcome of one test."""
 
     passed: bool
-    measured: str  # in figures, with units
+    measured: str  # measured values with units
 
 
 @dataclass(frozen=True)
@@ -35,37 +36,37 @@ class Requirement:
     """One line of the acceptance protocol."""
 
     id: str
-    text: str  # what the node shall do
+    text: str  # required behaviour of the node
     how: str  # how it is tested
-    source: str  # where the requirement comes from
-    test: Callable[[Bench], Outcome]
+    source: str  # document the requirement comes from
+    test: Callable[[NodeTester], Outcome]
 
 
 @dataclass(frozen=True)
 class Result:
-    """A requirement and what came of it."""
+    """Requirement with its verdict and the measured values."""
 
     requirement: Requirement
     verdict: Verdict
     measured: str
 
 
-def examine(bench: Bench, requirements: Sequence[Requirement]) -> Iterator[Result]:
-    """Test one requirement after the other, in their order, which is that of the node's life."""
+def examine(tester: NodeTester, requirements: Sequence[Requirement]) -> Iterator[Result]:
+    """Test the requirements in their order, from start-up on, and yield each result."""
     for requirement in requirements:
-        yield _result(bench, requirement)
+        yield _result(tester, requirement)
 
 
-def _result(bench: Bench, requirement: Requirement) -> Result:
+def _result(tester: NodeTester, requirement: Requirement) -> Result:
     for _ in range(ATTEMPTS):
-        bench.clock.late = 0.0
+        tester.clock.delay = 0.0
         try:
-            outcome = requirement.test(bench)
+            outcome = requirement.test(tester)
         except NotTested as error:
             return Result(requirement, Verdict.NOT_TESTED, str(error))
         if outcome.passed:
             return Result(requirement, Verdict.PASSED, outcome.measured)
-        if bench.clock.late < LATE:
+        if tester.clock.delay < LATE:
             return Result(requirement, Verdict.FAILED, outcome.measured)
-    reason = f"this computer was late by {bench.clock.late * 1e3:.1f} ms; it found: {outcome.measured}"
+    reason = f"this computer was late by {tester.clock.delay * 1e3:.1f} ms; measured: {outcome.measured}"
     return Result(requirement, Verdict.NOT_TESTED, reason)

@@ -1,4 +1,4 @@
-"""Who does to the node what no frame can do: switch it on, heat it, press its buttons."""
+"""Manual actions on the node that no frame can cause: power-up, overheating, buttons."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
 
 class Action(Enum):
-    """What can be asked for; the value is how a person is asked."""
+    """Manual action; the value is the instruction for a person."""
 
     POWER_UP = "switch {node} off and on again"
-    OVERHEAT = "make {node} believe it is too hot (its temperature input at the trip level)"
-    COOL = "let {node} be cool again"
-    RELEASE_DEAD_MAN = "let the dead-man of {node} go"
-    SQUEEZE_DEAD_MAN = "press the dead-man of {node} and keep it pressed"
+    OVERHEAT = "set the temperature input of {node} to its trip level"
+    COOL = "set the temperature input of {node} back to normal"
+    RELEASE_DEAD_MAN = "release the dead-man switch of {node}"
+    SQUEEZE_DEAD_MAN = "press the dead-man switch of {node} and keep it pressed"
     PRESS_START = "press START on {node} once"
     PRESS_STOP = "press STOP on {node} once"
     PRESS_HOLD = "press HOLD on {node} once"
@@ -28,31 +28,31 @@ class Action(Enum):
 
 
 class Technician(Protocol):
-    """Does what is asked, now or within `patience`."""
+    """Executor of manual actions, immediately or within `patience`."""
 
-    patience: float  # s a requirement waits for the action to show
-    fresh: bool  # the node has just been switched on, when the examination begins
-    certain: bool  # what is asked is done, whether it shows or not
+    patience: float  # s, time to wait for the effect of an action
+    fresh: bool  # True: the node was switched on at the start of the examination
+    certain: bool  # True: the action is carried out even if no effect is measured
 
-    def please(self, action: Action, node: str) -> None:
-        """Do it, or say that it is wanted."""
+    def request(self, action: Action, node: str) -> None:
+        """Carry the action out, or ask for it."""
 
 
-class Person:
-    """Somebody at the bench who reads the terminal."""
+class HumanTechnician:
+    """Person beside the node, asked on the terminal."""
 
     def __init__(self, patience: float) -> None:
         self.patience = patience
         self.fresh = False
         self.certain = False
 
-    def please(self, action: Action, node: str) -> None:
-        """Ask on stderr."""
+    def request(self, action: Action, node: str) -> None:
+        """Ask for the action on stderr."""
         say(f"please {action.value.format(node=node)}  (waiting {self.patience:.0f} s)")
 
 
 class EmulatorTechnician:
-    """Reaches into an emulated robot in this process, which was started for this examination."""
+    """Executor of manual actions on an emulated robot in this process, started for this examination."""
 
     def __init__(self, emulator: Emulator, operator: Operator) -> None:
         self._emulator, self._operator = emulator, operator
@@ -60,12 +60,12 @@ class EmulatorTechnician:
         self.fresh = True
         self.certain = True
 
-    def please(self, action: Action, node: str) -> None:
-        """Do it at once."""
+    def request(self, action: Action, node: str) -> None:
+        """Carry the action out immediately."""
         operator = self._operator
         match action:
             case Action.POWER_UP:
-                pass  # it has just begun
+                pass  # the emulator was started for this examination
             case Action.OVERHEAT | Action.COOL:
                 drive = [joint.upper() for joint in JOINTS].index(node)
                 self._emulator.drives.heat(drive, 150.0 if action is Action.OVERHEAT else 25.0)

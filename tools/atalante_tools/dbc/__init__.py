@@ -1,4 +1,4 @@
-"""`atalante dbc`: look at a network description, compare two, and make C of one. All commands take `--json`."""
+"""Command `atalante dbc`: check, print and compare DBC files, and generate C code. All commands take `--json`."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from atalante_tools.console.outcome import FAILED, Failed
 from atalante_tools.console.terminal import say, show_json, table
 
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
-#: A DBC, by default the robot's.
+#: Optional DBC file; the default is the network of the robot.
 _file_argument = click.argument("file", type=_FILE, required=False)
 
 
 @click.group()
 def command() -> None:
-    """Check, print and compare DBC files, and make C code of one. FILE is the robot's own network unless given.
+    """Check, print and compare DBC files, and generate C code. Without FILE, the network of the robot is used.
 
     \b
     Example: atalante dbc lint
@@ -25,11 +25,11 @@ def command() -> None:
     """
 
 
-@command.command(short_help="What keeps the strict loader from trusting FILE.")
+@command.command(short_help="List the errors of FILE.")
 @_file_argument
 @json_option
 def lint(file: Path | None, as_json: bool) -> None:
-    """Everything that keeps the strict loader from trusting FILE, with its line; exit code 1 if there is anything."""
+    """List the errors that the strict loader finds in FILE, with line numbers; the exit code is 1 if there are any."""
     from atalante_tools.dbc.lint import findings
 
     path = file or _own()
@@ -40,17 +40,17 @@ def lint(file: Path | None, as_json: bool) -> None:
         else:
             click.echo(f"{path}:{finding.line or ''}{':' if finding.line else ''} {finding.text}")
     if found:
-        say(f"{path}: {len(found)} finding{'s' * (len(found) > 1)}")
+        say(f"{path}: {len(found)} error{'s' * (len(found) > 1)}")
         raise SystemExit(FAILED)
-    say(f"{path}: the strict loader finds nothing wrong")
+    say(f"{path}: no errors")
 
 
 @command.command("table")
 @_file_argument
-@click.option("--signals", is_flag=True, help="Every signal of every message, with unit, range and invalid code.")
+@click.option("--signals", is_flag=True, help="Print one row per signal, with unit, range and invalid code.")
 @json_option
 def print_table(file: Path | None, signals: bool, as_json: bool) -> None:
-    """The messages of FILE, one a line."""
+    """Print the messages of FILE, one per line."""
     import atalante_dbc
     from atalante_tools.dbc.tables import message_rows, signal_rows
 
@@ -58,14 +58,19 @@ def print_table(file: Path | None, signals: bool, as_json: bool) -> None:
     _show(signal_rows(network) if signals else message_rows(network), as_json)
 
 
-@command.command(short_help="Worst-case load of each bus, message by message.")
+@command.command(short_help="Print the worst-case load of each bus.")
 @_file_argument
 @click.option(
-    "--limit", type=Between(min=0.0), default=60.0, show_default=True, metavar="PERCENT", help="Percent a bus may have."
+    "--limit",
+    type=Between(min=0.0),
+    default=60.0,
+    show_default=True,
+    metavar="PERCENT",
+    help="Largest load of a bus, in percent.",
 )
 @json_option
 def busload(file: Path | None, limit: float, as_json: bool) -> None:
-    """Worst-case load of each bus and what each message has of it; exit code 1 if a bus has more than the limit."""
+    """Print the worst-case load of each bus and its messages; the exit code is 1 if a bus exceeds the limit."""
     import atalante_dbc
     from atalante_tools.dbc.tables import load_rows
 
@@ -80,15 +85,15 @@ def busload(file: Path | None, limit: float, as_json: bool) -> None:
         _show([{**row, "us": f"{row['us']:.1f}", "percent": f"{row['percent']:.2f}"} for row in rows], as_json)
         click.echo()
     if over := [f"{bus} ({percent:.1f} %)" for bus, percent in load.items() if percent > limit]:
-        raise Failed(f"more than {limit:g} % of the time in the worst case: {', '.join(over)}")
+        raise Failed(f"worst-case bus load must be at most {limit:g} %, got {', '.join(over)}")
 
 
-@command.command(short_help="What changes on the wire from OLD to NEW.")
+@command.command(short_help="List the changes on the bus from OLD to NEW.")
 @click.argument("old", type=_FILE)
 @click.argument("new", type=_FILE)
 @json_option
 def diff(old: Path, new: Path, as_json: bool) -> None:
-    """What changes on the wire from OLD to NEW; exit code 1 if a node built for one cannot talk to one built for the other."""
+    """List the changes on the bus from OLD to NEW; the exit code is 1 if nodes of both versions cannot communicate."""
     import atalante_dbc
     from atalante_tools.dbc.diff import changes
 
@@ -105,7 +110,7 @@ def diff(old: Path, new: Path, as_json: bool) -> None:
         raise SystemExit(FAILED)
 
 
-@command.command("c-code", short_help="C code for FILE, compared with Python.")
+@command.command("c-code", short_help="Generate C code for FILE.")
 @_file_argument
 @click.option(
     "-o",
@@ -113,21 +118,30 @@ def diff(old: Path, new: Path, as_json: bool) -> None:
     type=click.Path(file_okay=False, path_type=Path),
     required=True,
     metavar="DIR",
-    help="Folder of the files; made if it is not there.",
+    help="Folder of the generated files; created if it does not exist.",
 )
-@click.option("--node", metavar="NODE", help="Only what this node sends and receives.")
+@click.option("--node", metavar="NODE", help="Generate only the messages that this node sends and receives.")
 @click.option(
-    "--check", is_flag=True, help="Compile the host test and compare with the Python codec on --images images."
+    "--check",
+    is_flag=True,
+    help="Compile the host test and compare the C code with the Python codec on --images random images.",
 )
 @click.option(
-    "--images", type=click.IntRange(min=1), default=10_000, show_default=True, help="Random images of --check."
+    "--images",
+    type=click.IntRange(min=1),
+    default=10_000,
+    show_default=True,
+    help="Number of random images for --check.",
 )
-@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Of the random images.")
+@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the random images.")
 @json_option
 def c_code(
     file: Path | None, output: Path, node: str | None, check: bool, images: int, seed: int, as_json: bool
 ) -> None:
-    """C code for FILE: pack, unpack, E2E protect and check, test vectors, and a host test that proves it equal to Python."""
+    """Generate C code for FILE: pack, unpack, E2E protect and check, with test vectors and a host test.
+
+    The host test compares the C code with the Python codec. An image is one payload of every message.
+    """
     from atalante_tools.dbc.build import Build
     from atalante_tools.dbc.c_code import write
     from atalante_tools.dbc.host_test import compile_host_test, run_host_test

@@ -14,20 +14,24 @@ from atalante_tools.console.names import find
 
 @dataclass(frozen=True)
 class Build:
-    """What is generated: a whole network, or one node's share of it."""
+    """Input of the generators: a whole network, or the messages of one node."""
 
     network: Network
-    text: str  # of the DBC
-    name: str  # prefix of every C name
-    node: str | None
+    text: str  # content of the DBC file
+    name: str  # prefix of every C identifier
+    node: str | None  # None: whole network
 
     @classmethod
     def of(cls, path: Path, node: str | None) -> Build:
-        """Read a DBC.
+        """Read a DBC file.
+
+        Args:
+            path: DBC file.
+            node: name of the node whose messages are generated; None: all messages.
 
         Raises:
-            DbcError: the strict loader refuses it.
-            click.UsageError: there is no such node.
+            DbcError: If the strict loader rejects the file.
+            click.UsageError: If there is no such node.
         """
         network = atalante_dbc.load(path)
         names = [n.name for n in network.nodes]
@@ -36,17 +40,17 @@ class Build:
 
     @property
     def messages(self) -> tuple[Message, ...]:
-        """Messages with any C code, in DBC order."""
+        """Return the messages with C code, in DBC order."""
         return tuple(m for m in self.network.messages if self.sends(m) or self.received(m))
 
     def sends(self, message: Message) -> bool:
-        """Whether there is a pack function."""
+        """Return whether the message has a pack function."""
         return self.node in (None, message.sender)
 
     def received(self, message: Message) -> tuple[Signal, ...]:
-        """Signals the unpack function fills; empty: there is none."""
+        """Return the signals that the unpack function fills; empty: there is no unpack function."""
         return tuple(s for s in message.signals if self.node is None or self.node in s.receivers)
 
     def c_name(self, message: Message) -> str:
-        """What the C names of a message begin with, and behind an underscore the signal."""
+        """Return the prefix of the C identifiers of a message, without the trailing underscore."""
         return f"{self.name}_{camel_to_snake_case(message.name)}"

@@ -1,6 +1,6 @@
-"""C of a network: pack and unpack by cantools' generator, E2E Profile 5 in the same style, and the files that prove both.
+"""C code of a network: pack and unpack from the generator of cantools, E2E Profile 5, and files to test both.
 
-DBC -> Build -> NAME.h NAME.c (cantools)  NAME_e2e.h NAME_e2e.c (here)  host_test.c vectors.bin vectors.json Makefile
+DBC -> Build -> NAME.h NAME.c (cantools)  NAME_e2e.h NAME_e2e.c (`e2e_c`)  host_test.c vectors.bin vectors.json Makefile
 """
 
 from __future__ import annotations
@@ -19,13 +19,19 @@ from atalante_tools.dbc.e2e_c import e2e_header, e2e_source
 from atalante_tools.dbc.host_test import makefile, source
 from atalante_tools.dbc.vectors import Vectors
 
-#: Images in the vector file of the folder: enough for a test without Python.
+#: Number of images in the vector file of the folder, for a test without Python.
 _IMAGES: Final = 100
 _HOST_TEST, _VECTORS, _EXAMPLES, _MAKEFILE = "host_test.c", "vectors.bin", "vectors.json", "Makefile"
 
 
 def write(build: Build, folder: Path, seed: int) -> list[Path]:
-    """Write every file of the build and return their paths. The same DBC gives the same bytes."""
+    """Write every file of the build and return the paths. The same DBC gives the same bytes.
+
+    Args:
+        build: network and node.
+        folder: folder of the files; created if it does not exist.
+        seed: seed of the random images of the test vectors.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     name = build.name
     header, code = _cantools(build)
@@ -47,7 +53,7 @@ def write(build: Build, folder: Path, seed: int) -> list[Path]:
 
 
 def _cantools(build: Build) -> tuple[str, str]:
-    # Not strict: cantools' own checks refuse less than the loader, which has already passed.
+    # Not strict, because the strict loader has already accepted the file and checks more than cantools.
     database = cantools.database.load_string(build.text, database_format="dbc", strict=False)
     assert isinstance(database, Database)
     header, code, _, _ = generate(
@@ -57,8 +63,8 @@ def _cantools(build: Build) -> tuple[str, str]:
         f"{build.name}.c",
         "",
         node_name=build.node,
-        use_round=True,  # or the encoder truncates, and 0.0375 Nm leaves as 0.025
+        use_round=True,  # otherwise the encoder truncates, and 0.0375 Nm is sent as 0.025 Nm
     )
-    # The date of the day would make every run another file.
+    # Remove the date, so that the files depend only on the DBC.
     header, code = (re.sub(r"(by cantools version \S+) .*", r"\1.", part) for part in (header, code))
     return header, code

@@ -1,7 +1,8 @@
-"""Two versions of a network: what a node built for one and a node built for the other would disagree about on the wire.
+"""Differences between two versions of a network on the bus.
 
-Breaking is judged by this stack's own receivers, which are strict: they refuse another length, another Data ID, a value outside
-the range, and call a message late after its timeout.
+A change is breaking if a node of one version and a node of the other version cannot communicate. The receivers of this
+project set the criterion: they reject another length, another Data ID and a value out of range, and report a message as
+late after its timeout.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from atalante_dbc import Message, Network, Signal
 
 @dataclass(frozen=True)
 class Change:
-    """One difference; `subject` is what kind of thing changed, `where` names it."""
+    """One difference. `subject` is the kind of the changed property, `where` the name of its message, signal or node."""
 
     breaking: bool
     subject: str
@@ -23,34 +24,34 @@ class Change:
 
 
 def changes(old: Network, new: Network) -> list[Change]:
-    """Every difference between two networks, in the order of `new`, what is gone last."""
+    """Return every difference between two networks, in the order of `new`; removed items come last."""
     return [*_network(old, new), *_messages(old, new)]
 
 
 def _network(old: Network, new: Network) -> Iterator[Change]:
     if old.hash32 != new.hash32:
-        text = f"{old.hash32:#010x} -> {new.hash32:#010x}: a HAL stays OFF until every node reports the new one"
+        text = f"{old.hash32:#010x} -> {new.hash32:#010x}: a HAL stays in OFF until every node reports the new hash"
         yield Change(False, "hash", "network", text)
-    for what, before, after in (
+    for rate, before, after in (
         ("nominal bit rate", old.nominal_bitrate, new.nominal_bitrate),
         ("data bit rate", old.data_bitrate, new.data_bitrate),
     ):
         if before != after:
-            yield Change(True, "bit rate", "network", f"{what} {before} -> {after} bit/s")
+            yield Change(True, "bit rate", "network", f"{rate} {before} -> {after} bit/s")
     was, now = ({node.name: node for node in network.nodes} for network in (old, new))
     for name, node in now.items():
         known = was.get(name)
         if known is None:
-            yield Change(False, "node", name, f"new node, a {node.kind}")
+            yield Change(False, "node", name, f"new node of kind {node.kind}")
         elif known != node:
             yield Change(False, "node", name, f"{known.kind} {known.number} -> {node.kind} {node.number}")
     for name in was.keys() - now.keys():
-        yield Change(False, "node", name, "node is gone")
+        yield Change(False, "node", name, "node removed")
 
 
 def _messages(old: Network, new: Network) -> Iterator[Change]:
     was, now = ({m.name: m for m in network.messages} for network in (old, new))
-    # A message under another name is the same to the wire: found by its identifier and Data ID.
+    # A renamed message is unchanged on the bus. Identifier and Data ID identify it.
     lost = {(m.frame_id, m.data_id): m for name, m in was.items() if name not in now}
     for name, message in now.items():
         before = was.get(name)
@@ -59,10 +60,10 @@ def _messages(old: Network, new: Network) -> Iterator[Change]:
             if before is None:
                 yield Change(False, "message", name, f"new message {message.frame_id:#x} from {message.sender}")
                 continue
-            yield Change(False, "name", name, f"was called {before.name}; identifier and Data ID are the same")
+            yield Change(False, "name", name, f"renamed from {before.name}; identifier and Data ID are unchanged")
         yield from _message(before, message)
     for message in lost.values():
-        yield Change(True, "message", message.name, f"message {message.frame_id:#x} is gone")
+        yield Change(True, "message", message.name, f"message {message.frame_id:#x} removed")
 
 
 def _message(old: Message, new: Message) -> Iterator[Change]:
@@ -72,11 +73,11 @@ def _message(old: Message, new: Message) -> Iterator[Change]:
     if old.frame_id != new.frame_id:
         yield breaking("id", f"identifier {old.frame_id:#x} -> {new.frame_id:#x}")
     if old.length != new.length:
-        yield breaking("length", f"{old.length} -> {new.length} bytes; receivers want the exact length")
+        yield breaking("length", f"{old.length} -> {new.length} bytes; receivers accept only the exact length")
     if old.data_id != new.data_id:
-        yield breaking("data id", f"E2E Data ID {old.data_id:#06x} -> {new.data_id:#06x}: no CRC holds")
+        yield breaking("data id", f"E2E Data ID {old.data_id:#06x} -> {new.data_id:#06x}: every CRC check fails")
     if old.sender != new.sender:
-        yield breaking("sender", f"sender {old.sender} -> {new.sender}: both would send, or none")
+        yield breaking("sender", f"sender {old.sender} -> {new.sender}: with mixed versions both nodes send, or none")
     if old.bus != new.bus:
         yield breaking("bus", f"bus {old.bus} -> {new.bus}")
     yield from _timing(old, new)
@@ -89,7 +90,7 @@ def _timing(old: Message, new: Message) -> Iterator[Change]:
     elif old.cycle_ms != new.cycle_ms:
         yield Change(True, "timing", new.name, f"cycle {old.cycle_ms} -> {new.cycle_ms} ms")
     if old.timeout_ms != new.timeout_ms:
-        # How long a receiver waits is its own affair, unless the sender is slower than that.
+        # A changed timeout is breaking only if it is not longer than the cycle time of the other version.
         late = 0 < old.timeout_ms <= new.cycle_ms or 0 < new.timeout_ms <= old.cycle_ms
         yield Change(late, "timing", new.name, f"timeout {old.timeout_ms} -> {new.timeout_ms} ms")
     if old.inhibit_ms != new.inhibit_ms:
@@ -98,7 +99,7 @@ def _timing(old: Message, new: Message) -> Iterator[Change]:
 
 def _signals(old: Message, new: Message) -> Iterator[Change]:
     was, now = ({s.name: s for s in message.signals} for message in (old, new))
-    # As with messages: another name for the same bits.
+    # A renamed signal is unchanged on the bus. Its bits identify it.
     lost = {(s.start, s.length): s for name, s in was.items() if name not in now}
     for name, signal in now.items():
         where = f"{new.name}.{name}"
@@ -109,10 +110,10 @@ def _signals(old: Message, new: Message) -> Iterator[Change]:
                 yield _new_signal(old, signal, where)
                 continue
             del lost[signal.start, signal.length]
-            yield Change(False, "name", where, f"was called {before.name}; the bits are the same")
+            yield Change(False, "name", where, f"renamed from {before.name}; the bits are unchanged")
         yield from _signal(before, signal, where)
     for signal in lost.values():
-        text = f"signal is gone; bits {signal.start} to {signal.start + signal.length - 1} now say 0"
+        text = f"signal removed; bits {signal.start} to {signal.start + signal.length - 1} are now 0"
         yield Change(True, "signal", f"{new.name}.{signal.name}", text)
 
 
@@ -120,12 +121,12 @@ def _new_signal(old: Message, signal: Signal, where: str) -> Change:
     bits = set(range(signal.start, signal.start + signal.length))
     taken = [s.name for s in old.signals if bits & set(range(s.start, s.start + s.length))]
     if taken:
-        return Change(True, "signal", where, f"new signal in bits that were {', '.join(taken)}")
+        return Change(True, "signal", where, f"new signal in bits of {', '.join(taken)}")
     if signal.start + signal.length > 8 * old.length:
-        return Change(True, "signal", where, "new signal behind the old end of the message")
+        return Change(True, "signal", where, "new signal after the old end of the message")
     zero = signal.minimum <= signal.offset <= signal.maximum
-    text = f"new signal in reserved bits; an old sender says {signal.offset:g} {signal.unit}"
-    return Change(not zero, "signal", where, text if zero else f"{text}, which is outside its range")
+    text = f"new signal in reserved bits; an old sender sends {signal.offset:g} {signal.unit}"
+    return Change(not zero, "signal", where, text if zero else f"{text}, which is out of range")
 
 
 def _signal(old: Signal, new: Signal, where: str) -> Iterator[Change]:
@@ -147,8 +148,10 @@ def _signal(old: Signal, new: Signal, where: str) -> Iterator[Change]:
         text = f"[{old.minimum:.10g}|{old.maximum:.10g}] -> [{new.minimum:.10g}|{new.maximum:.10g}]"
         wider = new.minimum < old.minimum or new.maximum > old.maximum
         narrower = new.minimum > old.minimum or new.maximum < old.maximum
-        who = [who for who, does in (("an old", wider), ("a new", narrower)) if does]
-        yield Change(True, "range", where, f"{text}; {' and '.join(who)} receiver refuses what it does not know")
+        rejecting = [version for version, rejects in (("an old", wider), ("a new", narrower)) if rejects]
+        yield Change(
+            True, "range", where, f"{text}; {' and '.join(rejecting)} receiver rejects values out of its range"
+        )
     if old.invalid_raw != new.invalid_raw:
         code = [f"{raw:#x}" if raw is not None else "none" for raw in (old.invalid_raw, new.invalid_raw)]
         yield Change(True, "invalid code", where, f"{code[0]} -> {code[1]}")

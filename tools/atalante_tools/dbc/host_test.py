@@ -1,6 +1,6 @@
-"""The generated C against the Python codec on this machine: the test program, how it is compiled, and how it is fed.
+"""Host test: a C program that compares the generated C code with the Python codec on this machine.
 
-The program reads the stream of `vectors.Vectors` from a file or from stdin, so that any number of images costs no disk.
+The program reads the stream of `vectors.Vectors` from a file or from stdin. A stream on stdin needs no disk space.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from atalante_dbc import Message, Signal
 from atalante_hal.wire.e2e import check_counter
 from atalante_tools.console.outcome import Failed
 from atalante_tools.dbc.e2e_c import invalid_name
-from atalante_tools.dbc.vectors import MAGIC, Vectors, behind_header
+from atalante_tools.dbc.vectors import MAGIC, Vectors, signals_after_header
 
 if TYPE_CHECKING:
     from atalante_tools.dbc.build import Build
 
-#: Contraction would round once where the codec rounds twice: values are compared to the last bit.
+#: Compiler flags. Values are compared bit for bit, so fused multiply-add (contraction) is off: it rounds once, the codec twice.
 FLAGS: Final = (
     "-std=c11 -Wall -Wextra -Werror -O1 -g -ffp-contract=off -fsanitize=undefined,address -fno-sanitize-recover=all"
 )
@@ -30,31 +30,41 @@ _PROGRAM: Final = "host_test"
 
 
 def compile_host_test(build: Build, folder: Path) -> Path:
-    """Compile what `c_code.write` wrote, sanitizers on, warnings as errors; `CC` names another compiler than gcc.
+    """Compile the files of `c_code.write` with sanitizers and warnings as errors, and return the program.
+
+    The environment variable `CC` selects another compiler than gcc.
+
+    Args:
+        build: network and node.
+        folder: folder of the generated files.
 
     Raises:
-        Failed: no compiler, or it complains.
+        Failed: If there is no compiler, or it reports an error or a warning.
     """
     compiler = os.environ.get("CC", "gcc")
     if shutil.which(compiler) is None:
-        raise Failed(
-            f"there is no C compiler {compiler}; install one (Debian: apt-get install gcc libc6-dev) or set CC"
-        )
+        raise Failed(f"C compiler {compiler} not found: install one (Debian: apt-get install gcc libc6-dev) or set CC")
     program = folder / _PROGRAM
     sources = [folder / file for file in _sources(build)]
     done = subprocess.run(
         [compiler, *FLAGS.split(), *sources, "-o", program, "-lm"], capture_output=True, text=True, check=False
     )
     if done.returncode:
-        raise Failed(f"{compiler} does not accept the generated code: {done.stderr.strip()}")
+        raise Failed(f"{compiler} rejects the generated code: {done.stderr.strip()}")
     return program
 
 
 def run_host_test(build: Build, program: Path, images: int, seed: int) -> int:
-    """Feed the program random images and return how many frames it compared.
+    """Run the program on random images and return the number of frames it compared.
+
+    Args:
+        build: network and node.
+        program: compiled host test.
+        images: number of random images.
+        seed: seed of the random images.
 
     Raises:
-        Failed: the C code and the Python codec disagree, or a sanitizer complains; with what the program said.
+        Failed: If the C code and the Python codec differ, or a sanitizer reports an error.
     """
     vectors = Vectors(build, seed)
     with subprocess.Popen(
@@ -68,18 +78,18 @@ def run_host_test(build: Build, program: Path, images: int, seed: int) -> int:
                 process.stdin.write(image)
             process.stdin.close()
         except BrokenPipeError:
-            pass  # it has stopped at the first difference; it says which
-        said = process.stdout.read().decode(errors="replace").strip()
+            pass  # the program stops at the first difference and prints it
+        output = process.stdout.read().decode(errors="replace").strip()
     if process.returncode:
-        raise Failed(f"the generated C disagrees with the Python codec: {said}")
-    return int(said.split()[0])
+        raise Failed(f"the generated C code differs from the Python codec: {output}")
+    return int(output.split()[0])
 
 
 def makefile(build: Build) -> str:
-    """Compiles and runs the host test on the vector file, without Python."""
+    """Return a Makefile that compiles and runs the host test on the vector file, without Python."""
     sources = " ".join(_sources(build))
     return f"""\
-# `make test` compares the generated C with the vectors of the Python codec, under the sanitizers.
+# `make test` compares the generated C code with the test vectors of the Python codec, with sanitizers.
 CC = gcc
 CFLAGS = {FLAGS}
 
@@ -101,18 +111,18 @@ def _sources(build: Build) -> tuple[str, ...]:
 
 
 def source(build: Build) -> str:
-    """`host_test.c`."""
+    """Return the source of `host_test.c`."""
     messages = build.messages
-    functions = "\n".join(_message(build, m, messages[(place + 1) % len(messages)]) for place, m in enumerate(messages))
+    functions = "\n".join(_message(build, m, messages[(row + 1) % len(messages)]) for row, m in enumerate(messages))
     table = "\n".join(f"    {{ {_size(build, m)}u, test_{camel_to_snake_case(m.name)} }}," for m in messages)
     magic = ", ".join(f"{byte:#04x}" for byte in MAGIC)
     counters = ", ".join(str(int(check_counter(0, counter))) for counter in range(256))
     name = build.name
     return f"""\
 /**
- * Compares {name}.c and {name}_e2e.c with test vectors of the Python codec: host_test vectors.bin, or - for stdin.
+ * Compares {name}.c and {name}_e2e.c with test vectors of the Python codec. Usage: host_test vectors.bin, or - for stdin.
  *
- * Generated by `atalante dbc c-code`, which describes the vectors in atalante_tools/dbc/vectors.py.
+ * Generated by `atalante dbc c-code`. The module atalante_tools/dbc/vectors.py describes the test vectors.
  */
 
 #include <math.h>
@@ -136,7 +146,7 @@ static void expect(bool holds, const char *condition_p, const char *where_p, int
     }}
 }}
 
-/* The test vectors are little endian, as this program's host must be. */
+/* The test vectors are little endian, so the host of this program must be little endian. */
 static double next(const uint8_t **in_pp)
 {{
     double value;
@@ -147,7 +157,7 @@ static double next(const uint8_t **in_pp)
     return value;
 }}
 
-/* Status of each counter after 0, by the Python checker. */
+/* Result of the Python check for each counter that follows counter 0. */
 static const uint8_t after_zero[256] = {{ {counters} }};
 
 static void test_counters(void)
@@ -192,7 +202,7 @@ int main(int argc, char **argv)
     file_p = (strcmp(argv[1], "-") == 0) ? stdin : fopen(argv[1], "rb");
 
     if (file_p == NULL || fread(header, sizeof(header), 1, file_p) != 1 || memcmp(header, magic, sizeof(magic)) != 0) {{
-        printf("%s is no vector file\\n", argv[1]);
+        printf("%s is not a vector file\\n", argv[1]);
         return (2);
     }}
 
@@ -200,7 +210,7 @@ int main(int argc, char **argv)
     memcpy(&images, &header[12], sizeof(images));
 
     if (hash != {name.upper()}_DBC_HASH) {{
-        printf("%s is of another network\\n", argv[1]);
+        printf("%s belongs to another network\\n", argv[1]);
         return (2);
     }}
 
@@ -208,7 +218,7 @@ int main(int argc, char **argv)
 
     for (image = 0; image < images; image++) {{
         for (size_t i = 0; i < sizeof(tests) / sizeof(tests[0]); i++) {{
-            /* A buffer of exactly this size, for the address sanitizer. */
+            /* The buffer has exactly this size, so that the address sanitizer finds a read past its end. */
             buffer_p = malloc(tests[i].size);
 
             if (buffer_p == NULL || fread(buffer_p, tests[i].size, 1, file_p) != 1) {{
@@ -232,11 +242,11 @@ int main(int argc, char **argv)
 def _size(build: Build, message: Message) -> int:
     received = build.received(message)
     size = message.length + 1 + 8 * len(received) if received else 0
-    return size + (8 * len(behind_header(message)) + message.length if build.sends(message) else 0)
+    return size + (8 * len(signals_after_header(message)) + message.length if build.sends(message) else 0)
 
 
 def _message(build: Build, message: Message, other: Message) -> str:
-    """Test of one message; `other` has another Data ID."""
+    """Return the C test function of one message; `other` is a message with another Data ID."""
     body = ""
     if received := build.received(message):
         body += _receive(build, message, received, other)
@@ -253,8 +263,8 @@ def _receive(build: Build, message: Message, received: tuple[Signal, ...], other
     names = [camel_to_snake_case(s.name) for s in received]
     values = "\n".join(f"        EXPECT({prefix}_{name}_decode(message.{name}) == next(&in_p));" for name in names)
     wrong_id = f"{build.name}_e2e_check(&copy, payload, sizeof(payload), sizeof(payload), {other.data_id:#06x}u)"
-    # A network of one message has no other Data ID.
-    stranger = f"            EXPECT({wrong_id} == {upper}_E2E_CRC);\n" if other is not message else ""
+    # A network with one message has no other Data ID.
+    other_id = f"            EXPECT({wrong_id} == {upper}_E2E_CRC);\n" if other is not message else ""
     return f"""
     {{
         static struct {build.name}_e2e_receiver_t receiver;
@@ -269,7 +279,7 @@ def _receive(build: Build, message: Message, received: tuple[Signal, ...], other
         if (image < 2u) {{
             struct {build.name}_e2e_receiver_t copy = receiver;
 
-{stranger}            EXPECT({prefix}_check(&copy, payload, sizeof(payload) - 1u) == {upper}_E2E_LENGTH);
+{other_id}            EXPECT({prefix}_check(&copy, payload, sizeof(payload) - 1u) == {upper}_E2E_LENGTH);
             EXPECT({prefix}_unpack(&message, payload, sizeof(payload) - 1u) < 0);
 
             for (size_t bit = 0; bit < 8u * sizeof(payload); bit++) {{
@@ -293,7 +303,7 @@ def _receive(build: Build, message: Message, received: tuple[Signal, ...], other
 def _send(build: Build, message: Message) -> str:
     prefix = build.c_name(message)
     lines = []
-    for signal in behind_header(message):
+    for signal in signals_after_header(message):
         name = camel_to_snake_case(signal.name)
         encoded = f"{prefix}_{name}_encode(value)"
         if signal.invalid_raw is not None:

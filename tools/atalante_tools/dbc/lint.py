@@ -1,4 +1,4 @@
-"""The strict loader's verdict as findings: what a receiver could misread, each with its line."""
+"""Errors of the strict loader as findings with line numbers."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _LINE = re.compile(r"at line (\d+)")
 
 @dataclass(frozen=True)
 class Finding:
-    """One broken rule; `line` is None when the file as a whole is meant."""
+    """One broken rule. `line` is None if the rule applies to the whole file."""
 
     line: int | None
     text: str
 
 
 def findings(path: Path) -> list[Finding]:
-    """Why `path` is refused, in the order of its lines; empty: the loader takes it."""
+    """Return the errors in `path` in the order of its lines; empty if the strict loader accepts the file."""
     try:
         atalante_dbc.load(path)
     except atalante_dbc.DbcError as error:
@@ -33,5 +33,5 @@ def _finding(path: Path, line: str) -> Finding:
     number, colon, rest = text.partition(":")
     if colon and number.isdigit():
         return Finding(int(number), rest.strip())
-    found = _LINE.search(text)  # as the parser says it
+    found = _LINE.search(text)  # format of the parser
     return Finding(int(found[1]) if found else None, text.strip())

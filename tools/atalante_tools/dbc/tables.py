@@ -1,4 +1,4 @@
-"""A network as rows for people and programs: messages, signals, and who has what share of a bus."""
+"""Tables of a network: messages, signals, and the share of each message in the load of a bus."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ Row = dict[str, object]
 
 
 def message_rows(network: Network) -> list[Row]:
-    """One row a message, in the order of the file."""
+    """Return one row per message, in the order of the file."""
     return [
         {
             "id": f"{m.frame_id:#05x}",
@@ -27,7 +27,7 @@ def message_rows(network: Network) -> list[Row]:
 
 
 def signal_rows(network: Network) -> list[Row]:
-    """One row a signal, in the order of the file."""
+    """Return one row per signal, in the order of the file."""
     return [
         {
             "message": m.name,
@@ -49,8 +49,14 @@ def signal_rows(network: Network) -> list[Row]:
 
 
 def load_rows(network: Network, bus: str) -> list[Row]:
-    """The messages of a bus by their share of its time in the worst case, largest first: cyclic ones at their cycle, events
-    at their inhibit time (as `Network.bus_load` adds them up)."""
+    """Return one row per message of a bus with its worst-case load, largest first.
+
+    As in `Network.bus_load`, cyclic messages count with their cycle time, event messages with their inhibit time.
+
+    Args:
+        network: network with the bus.
+        bus: name of the bus.
+    """
     rows: list[tuple[float, Row]] = []
     for m in network.messages:
         if m.bus == bus:

@@ -1,12 +1,12 @@
-"""Test vectors of a network: random images as the Python codec sees them, as a binary stream and as readable examples.
+"""Test vectors of a network: random images with the values of the Python codec, as a binary stream and as JSON examples.
 
-The stream is what the generated host test reads, little endian: 8 bytes magic, u32 network hash, u32 images; then an image after
-the other, and in it the messages of the build in DBC order:
+An image is one payload of every message. The generated host test reads the stream, which is little endian: 8 bytes magic,
+u32 network hash, u32 number of images, then the images. Each image has the messages of the build in DBC order:
 
 - received: payload, u8 "every signal in range", f64 value of each received signal;
-- sent: f64 of each signal behind the E2E header (NaN: no value), payload they make.
+- sent: f64 value of each signal after the E2E header (NaN: invalid code), resulting payload.
 
-Every other received payload is random bits, valid or not; the rest are what the sender makes. Counters are the image's number.
+Every second received payload has random bits; the others are encoded from values. The counter is the number of the image.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ HEADER: Final = Struct("<8sII")
 
 
 class Vectors:
-    """Random images of a build; one seed, one sequence."""
+    """Random images of a build. The same seed gives the same sequence."""
 
     def __init__(self, build: Build, seed: int) -> None:
         self._build = build
@@ -51,21 +51,21 @@ class Vectors:
         ]
         self._minimum = np.array([s.minimum for _, s in codec.signals])
         self._maximum = np.array([s.maximum for _, s in codec.signals])
-        # NaN is encoded as the invalid code; what has none stays at its minimum.
+        # NaN is encoded as the invalid code. A signal without invalid code is sent with its minimum.
         no_code = [s.invalid_raw is None for _, s in codec.signals]
         self._invalid = np.where(no_code, self._minimum, np.nan)
         self._order = self._stream_order()
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Where each byte of an image of the stream is in `_record`'s parts."""
+        """Return the index of each byte of a stream image in the concatenated parts of `images`."""
         build, codec = self._build, self._codec
         rows = len(build.messages)
         parts = (FRAME_BYTES * rows, FRAME_BYTES * rows, 8 * codec.size, 8 * codec.size, rows)
-        received, sent, decoded, wanted, in_range = (sum(parts[:place]) for place in range(len(parts)))
+        received, sent, decoded, encoded, in_range = (sum(parts[:index]) for index in range(len(parts)))
 
         def values(start: int, message: Message, signals: Iterable[Signal]) -> list[int]:
-            places = [start + 8 * codec.index(message.name, s.name) for s in signals]
-            return [place + byte for place in places for byte in range(8)]
+            offsets = [start + 8 * codec.index(message.name, s.name) for s in signals]
+            return [offset + byte for offset in offsets for byte in range(8)]
 
         def payload(start: int, row: int, message: Message) -> range:
             first = start + FRAME_BYTES * row + HEADER_BYTES
@@ -73,26 +73,26 @@ class Vectors:
 
         order: list[int] = []
         for row, message in enumerate(build.messages):
-            if heard := build.received(message):
-                order += [*payload(received, row, message), in_range + row, *values(decoded, message, heard)]
+            if signals := build.received(message):
+                order += [*payload(received, row, message), in_range + row, *values(decoded, message, signals)]
             if build.sends(message):
-                order += [*values(wanted, message, behind_header(message)), *payload(sent, row, message)]
+                order += [*values(encoded, message, signals_after_header(message)), *payload(sent, row, message)]
         return np.array(order, np.intp)
 
     def header(self, images: int) -> bytes:
-        """What the stream begins with."""
+        """Return the head of the stream for a number of images."""
         return HEADER.pack(MAGIC, self._build.network.hash32, images)
 
     def images(self, count: int) -> Iterator[bytes]:
-        """The stream, an image at a time; call it once. The first ones are the edges of the ranges and the invalid codes."""
+        """Yield the images of the stream, first the range limits and invalid codes. Call it once per instance."""
         for image in range(count):
-            wanted = self._next(image)
-            parts = (self._received, self._sender.frames, self._decoded, wanted, self._in_range)
+            encoded = self._next(image)
+            parts = (self._received, self._sender.frames, self._decoded, encoded, self._in_range)
             yield np.concatenate([part.view(np.uint8) for part in parts])[self._order].tobytes()
 
     def examples(self) -> Iterator[dict[str, Any]]:
-        """Readable vectors: the edges and one random image, a message each. Call it once."""
-        for image, what in enumerate(("minimum", "maximum", "invalid codes", "random")):
+        """Yield JSON objects of all messages with range limits, invalid codes and random values. Call it once per instance."""
+        for image, kind in enumerate(("minimum", "maximum", "invalid codes", "random")):
             self._next(image)
             for row, message in enumerate(self._build.messages):
                 values = {
@@ -100,7 +100,7 @@ class Vectors:
                 }
                 yield {
                     "message": message.name,
-                    "what": what,
+                    "what": kind,
                     "id": message.frame_id,
                     "data_id": message.data_id,
                     "payload": self._received["data"][row][: message.length].tobytes().hex(),
@@ -109,12 +109,12 @@ class Vectors:
                 }
 
     def _next(self, image: int) -> Vector:
-        """Make one image and return the values that were sent."""
-        edges = (self._minimum, self._maximum, self._invalid)
-        wanted = edges[image] if image < len(edges) else self._random.uniform(self._minimum, self._maximum)
-        self._sender.values[:] = wanted
+        """Make image number `image` and return the values that were encoded, shape (signals,)."""
+        limits = (self._minimum, self._maximum, self._invalid)
+        encoded = limits[image] if image < len(limits) else self._random.uniform(self._minimum, self._maximum)
+        self._sender.values[:] = encoded
         self._sender.seal()
-        if image % 2 and image > len(edges):
+        if image % 2 and image > len(limits):
             data = self._received["data"]
             data[:] = self._random.integers(0, 256, data.shape, np.uint8)
             self._counters.fill(image & 0xFF)
@@ -124,9 +124,9 @@ class Vectors:
         self._in_range.fill(1)
         if not self._codec.decode(self._received, self._decoded):
             self._in_range[self._codec.rows_outside()] = 0
-        return wanted
+        return encoded
 
 
-def behind_header(message: Message) -> list[Signal]:
-    """The signals that are the sender's business: all but those E2E protect writes."""
+def signals_after_header(message: Message) -> list[Signal]:
+    """Return the signals without the CRC and counter of the E2E header."""
     return [s for s in message.signals if s.name not in ("Crc", "Counter")]

@@ -1,4 +1,4 @@
-"""`atalante gait`: make a library of gaits, fit the network to it, and see whether the network knows gaits it never saw."""
+"""Command `atalante gait`: solve gaits, collect them in a library, fit the gait network to it and check the network."""
 
 from __future__ import annotations
 
@@ -20,16 +20,20 @@ _FILE = click.Path(dir_okay=False, path_type=Path)
 
 
 def levels_of(text: str) -> tuple[float, ...]:
-    """Levels of a parameter, numbers with commas between them: an option's type."""
+    """Return the levels of a grid parameter from comma-separated numbers.
+
+    Raises:
+        click.BadParameter: If the text is not a list of numbers.
+    """
     try:
         return tuple(map(float, text.split(",")))
     except ValueError:
-        raise click.BadParameter(f"{text!r} is no list of levels; write numbers with commas, 58,75,91") from None
+        raise click.BadParameter(f"levels must be numbers separated by commas (58,75,91), got {text!r}") from None
 
 
 @click.group()
 def command() -> None:
-    """Solve gaits, collect them in a library, and fit the network that the controller walks with.
+    """Solve gaits, collect them in a library, and fit and check the gait network of the controller.
 
     \b
     Example: atalante gait solve --mass 75 --height 175
@@ -44,30 +48,35 @@ command.add_command(solve)
 
 @command.command(short_help="Solve the gaits of a grid of patients and steps.")
 @click.option(
-    "--out", type=_FOLDER, required=True, metavar="DIR", help="Folder of the library; made if it is not there."
+    "--out", type=_FOLDER, required=True, metavar="DIR", help="Folder of the library; created if it does not exist."
 )
-@click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, metavar="N", help="Processes.")
+@click.option(
+    "--jobs", type=click.IntRange(min=1), default=1, show_default=True, metavar="N", help="Number of processes."
+)
 @click.option(
     "--compile/--no-compile",
     "machine_code",
     default=False,
-    help="Compile the program with gcc first: minutes, once on a machine; then a gait takes half the time.",
+    help="Compile the nonlinear program with gcc first. This takes minutes once per machine and halves the time per gait.",
 )
-@click.option("--dask", "cluster", metavar="ADDRESS", help="Solve on the workers of this dask scheduler instead.")
+@click.option("--dask", "cluster", metavar="ADDRESS", help="Solve on the workers of this dask scheduler.")
 @click.option(
-    "--mass", type=levels_of, metavar="KG,...", help="Levels of the grid.  [default: four over the paper's subjects]"
+    "--mass",
+    type=levels_of,
+    metavar="KG,...",
+    help="Patient masses of the grid, in kg.  [default: four levels over the subjects of the paper]",
 )
-@click.option("--height", type=levels_of, metavar="M,...", help="Levels of the grid.")
-@click.option("--step-length", type=levels_of, metavar="M,...", help="Levels of the grid.")
-@click.option("--step-duration", type=levels_of, metavar="S,...", help="Levels of the grid.")
+@click.option("--height", type=levels_of, metavar="M,...", help="Patient heights of the grid, in m.")
+@click.option("--step-length", type=levels_of, metavar="M,...", help="Step lengths of the grid, in m.")
+@click.option("--step-duration", type=levels_of, metavar="S,...", help="Step durations of the grid, in s.")
 @json_option
 def library(
     out: Path, jobs: int, machine_code: bool, cluster: str | None, as_json: bool, **levels: tuple[float, ...] | None
 ) -> None:
-    """Solve the gait of every point of a grid of patients and steps, one file each in DIR/gaits.
+    """Solve the gait of every point of a grid of patients and steps, and write one file per gait to DIR/gaits.
 
-    Interrupted, the same command goes on where it stopped. A gait that fails is listed, here and in DIR/failed, and tried
-    again by the next call; exit code 1 if there is one.
+    After an interruption, the same command solves the missing gaits. Failed gaits are listed on stderr and in DIR/failed,
+    and the next call retries them. The exit code is 1 if a gait failed.
 
     \b
     Example: atalante gait library --out runs/library --jobs 2
@@ -82,37 +91,37 @@ def library(
         raise click.UsageError(str(error)) from error
     collection = Library(out, grid)
     points, todo = len(grid.points()), len(collection.missing())
-    say(f"{points} gaits in {out}, {points - todo} of them solved before")
-    progress, began = Progress(), time.monotonic()
+    say(f"{points} gaits in {out}, {points - todo} of them already solved")
+    progress, start = Progress(), time.monotonic()
     solve = solve_compiled if machine_code else solve_subject
-    # The optimiser keeps an exception to itself and gives up: a gait that is begun is finished, or it would count as failed.
+    # The optimiser swallows exceptions, so a signal takes effect after the current gait. Else that gait would count as failed.
     with stop_requested() as stop, closing(collection.generate(solve, jobs=jobs, cluster=cluster)) as outcomes:
         for done, (_, solved) in enumerate(outcomes, 1):
             if as_json:
                 show_json({**solved.gait.parameters, **solved.gait.solver})
             if progress.due():
-                left = (time.monotonic() - began) / done * (todo - done)
+                left = (time.monotonic() - start) / done * (todo - done)
                 progress.show(f"{_bar(done / todo)} {done}/{todo} gaits, {_minutes(left)} left")
             if stop.wanted:
                 break
     progress.clear()
     if stop.wanted:
-        say(f"interrupted, {points - len(collection.missing())} of {points} gaits solved; the same command goes on")
+        say(f"interrupted, {points - len(collection.missing())} of {points} gaits solved; repeat the command to resume")
         raise SystemExit(stop.exit_code)
     failures = collection.failures()
     for index, status in failures.items():
         say(f"failed: {grid.subject(index)}: {status}")
-    say(f"{points - len(collection.missing())} of {points} gaits solved, {_minutes(time.monotonic() - began)}")
+    say(f"{points - len(collection.missing())} of {points} gaits solved, {_minutes(time.monotonic() - start)}")
     if failures:
         raise Failed(f"{len(failures)} gaits failed; their records are in {out / 'failed'}")
 
 
 @command.command()
-@click.option("--library", "folder", type=_FOLDER, required=True, metavar="DIR", help="What `gait library` made.")
-@click.option("--out", type=OutputFile(".npz"), required=True, metavar="FILE", help="The network, .npz.")
+@click.option("--library", "folder", type=_FOLDER, required=True, metavar="DIR", help="Folder of the gait library.")
+@click.option("--out", type=OutputFile(".npz"), required=True, metavar="FILE", help="File for the network, .npz.")
 @json_option
 def fit(folder: Path, out: Path, as_json: bool) -> None:
-    """Fit the gait network to a library; takes a minute. The same library gives the same network.
+    """Fit the gait network to a library in about a minute. The same library gives the same network.
 
     \b
     Example: atalante gait fit --library runs/library --out runs/network.npz
@@ -129,10 +138,10 @@ def fit(folder: Path, out: Path, as_json: bool) -> None:
     gaits = collection.gaits(load_robot())
     if missing := collection.missing():
         say(
-            f"{len(missing)} of {len(gaits) + len(missing)} gaits are missing in {folder}: the network will be worse there"
+            f"{len(missing)} of {len(gaits) + len(missing)} gaits are missing in {folder}; the network is less accurate there"
         )
     say(f"fitting {len(gaits)} gaits")
-    began = time.monotonic()
+    start = time.monotonic()
     fitted = fit_network(list(gaits.values()), collection.grid)
     save_network(fitted.network, out)
     summary = {
@@ -140,26 +149,28 @@ def fit(folder: Path, out: Path, as_json: bool) -> None:
         "directions": fitted.directions,
         "rms_deg": math.degrees(fitted.rms),
         "worst_deg": math.degrees(fitted.worst),
-        "seconds": time.monotonic() - began,
+        "seconds": time.monotonic() - start,
         "bytes": out.stat().st_size,
     }
     if as_json:
         show_json(summary)
     say(
-        f"{out}: {summary['bytes'] / 1024:.0f} KiB, joint error at the library's own gaits {summary['rms_deg']:.3f} deg rms, "
-        f"{summary['worst_deg']:.3f} deg worst; `atalante gait check --network {out}` says how it is elsewhere"
+        f"{out}: {summary['bytes'] / 1024:.0f} KiB, joint error on the gaits of the library {summary['rms_deg']:.3f} deg rms, "
+        f"{summary['worst_deg']:.3f} deg worst; measure the error between them with `atalante gait check --network {out}`"
     )
 
 
 @command.command(short_help="Compare the network with freshly solved gaits.")
-@click.option("--network", "file", type=_FILE, metavar="FILE", help="The network.  [default: the one that ships]")
 @click.option(
-    "--count", type=click.IntRange(min=1), default=50, show_default=True, metavar="N", help="Random subjects."
+    "--network", "file", type=_FILE, metavar="FILE", help="Network file.  [default: the network of the package]"
 )
-@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Of the subjects.")
+@click.option(
+    "--count", type=click.IntRange(min=1), default=50, show_default=True, metavar="N", help="Number of random subjects."
+)
+@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the random subjects.")
 @json_option
 def check(file: Path | None, count: int, seed: int, as_json: bool) -> None:
-    """Compare the network with freshly solved gaits of subjects it never saw; exit code 1 if it is not near enough.
+    """Compare the network with newly solved gaits of random subjects; the exit code is 1 if a deviation exceeds its limit.
 
     \b
     Example: atalante gait check
@@ -190,7 +201,7 @@ def check(file: Path | None, count: int, seed: int, as_json: bool) -> None:
             show_json({**finding._asdict(), "ok": finding.ok})
     else:
         rows = [[f.name, f"{f.value:.4f}", f"{f.limit:g}", f.unit, "ok" if f.ok else "FAIL"] for f in found]
-        click.echo(table([["of the network against solved gaits", "found", "limit", "unit", ""], *rows]))
+        click.echo(table([["network against solved gaits", "value", "limit", "unit", ""], *rows]))
     if not all(finding.ok for finding in found):
         raise SystemExit(FAILED)
 

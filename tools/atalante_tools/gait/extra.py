@@ -1,4 +1,4 @@
-"""The extra that makes gaits may be missing: walking them does without."""
+"""Optional dependencies of the gait optimisation, which are not needed to walk a gait."""
 
 from __future__ import annotations
 
@@ -10,10 +10,16 @@ from atalante_tools.console.outcome import Failed
 
 @contextmanager
 def extra() -> Iterator[None]:
-    """Imports of what makes gaits: a library that is missing becomes a sentence that says what to install."""
+    """Import optional dependencies inside this context; a missing one becomes an error with the install command.
+
+    Raises:
+        Failed: If casadi, joblib or scikit-learn is not installed.
+    """
     try:
         yield
     except ModuleNotFoundError as error:
         if error.name is None or error.name.split(".")[0] not in ("casadi", "joblib", "sklearn"):
             raise
-        raise Failed(f"making gaits needs {error.name}: type `pip install 'atalante-hal[gaits]'`") from error
+        raise Failed(
+            f"solving gaits needs {error.name}: install it with `pip install 'atalante-hal[gaits]'`"
+        ) from error

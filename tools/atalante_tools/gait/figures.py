@@ -1,4 +1,4 @@
-"""A gait as pictures: what it demands over the step, and a stick figure that walks it."""
+"""Figures of a gait: angles, torques, centre of pressure and clearance over the step, and an animated stick figure."""
 
 from __future__ import annotations
 
@@ -28,17 +28,23 @@ _COLOURS = {"left": "tab:orange", "right": "tab:blue"}
 
 
 class _Demands(NamedTuple):
-    """What a step demands, sampled; shapes (n,) and (n, ...)."""
+    """Sampled joint angles, torques, centre of pressure and clearance of a step; n samples."""
 
-    phase: Vector
+    phase: Vector  # (n,), 0 to 1
     q: Vector  # (n, 12) rad
     torque: Vector  # (n, 12) Nm
-    pressure: Vector  # (n, 2) m, centre of pressure from the sole's centre, in the stance foot's axes
-    clearance: Vector  # (n,) m, lowest corner of the swing sole over the ground
+    pressure: Vector  # (n, 2) m, centre of pressure relative to the sole centre, in the axes of the stance foot
+    clearance: Vector  # (n,) m, height of the lowest corner of the swing sole above the ground
 
 
 def draw_plot(gait: Gait, patient: Patient, picture: Path) -> None:
-    """Joint angles and torques of both legs, centre of pressure under the stance sole, clearance of the swing sole."""
+    """Draw joint angles and torques of both legs, centre of pressure and swing clearance over the step.
+
+    Args:
+        gait: gait to draw.
+        patient: patient in the exoskeleton.
+        picture: file to write; the suffix sets the format.
+    """
     demands, exo, robot = _demands(gait, patient), ExoskeletonParameters(), load_robot()
     figure, axes = plt.subplots(2, 3, figsize=(13.0, 7.0))
     time = demands.phase * gait.duration
@@ -67,7 +73,7 @@ def draw_plot(gait: Gait, patient: Patient, picture: Path) -> None:
 
     axis = axes[1, 2]
     axis.plot(time, 1e3 * demands.clearance, color=_COLOURS["left"])
-    axis.set(title="swing sole, lowest corner over the ground", xlabel="time [s]", ylabel="clearance [mm]")
+    axis.set(title="swing sole, lowest corner above the ground", xlabel="time [s]", ylabel="clearance [mm]")
     axis.grid(alpha=0.3)
     figure.suptitle(gait.name)
     figure.tight_layout()
@@ -76,7 +82,13 @@ def draw_plot(gait: Gait, patient: Patient, picture: Path) -> None:
 
 
 def draw_animation(gait: Gait, patient: Patient, picture: Path) -> None:
-    """The step as a stick figure, from the side and from behind, at real speed."""
+    """Animate the step as a stick figure in real time, seen from the side and from behind.
+
+    Args:
+        gait: gait to animate.
+        patient: patient in the exoskeleton.
+        picture: GIF file to write.
+    """
     frames = max(2, round(gait.duration * _FRAMES_A_SECOND) + 1)
     q, _, _ = motion(gait.coefficients, gait.duration, np.linspace(0.0, 1.0, frames))
     sticks = _Sticks(patient)
@@ -89,7 +101,7 @@ def draw_animation(gait: Gait, patient: Patient, picture: Path) -> None:
         low, high = everything[:, across].min() - 0.1, everything[:, across].max() + 0.1
         axis.set(xlim=(low, high), ylim=(-0.05, everything[:, 2].max() + 0.1), title=title, aspect="equal")
         lines.append({name: axis.plot([], [], "o-", markersize=3, color=_colour(name))[0] for name in poses[0]})
-    axes[1].invert_xaxis()  # seen from behind: left is left
+    axes[1].invert_xaxis()  # the view is from behind, so left is on the left
     figure.suptitle(gait.name, fontsize=9)
     figure.tight_layout()
 
@@ -109,7 +121,7 @@ def _colour(name: str) -> str:
 
 
 class _Sticks:
-    """Points of the body in the walking frame, which stands at the stance ankle's foot on the ground."""
+    """Points of the body in the walking frame, whose origin is on the ground below the stance ankle."""
 
     def __init__(self, patient: Patient) -> None:
         self._exo = ExoskeletonParameters()
@@ -118,10 +130,10 @@ class _Sticks:
         self._walking = pinocchio.SE3(
             pinocchio.utils.rotate("z", -self._exo.toe_out), np.array([0.0, 0.0, -self._exo.sole_centre[1]])
         )
-        self._trunk = np.array([[-0.05, 0.0, 0.0], [-0.05, 0.0, 0.55]])  # drawn, in the pelvis
+        self._trunk = np.array([[-0.05, 0.0, 0.0], [-0.05, 0.0, 0.55]])  # m, in the pelvis frame
 
     def points(self, pose: Vector) -> dict[str, Vector]:
-        """Polylines of trunk and legs, each shape (n, 3) [m]."""
+        """Return the polylines of trunk and legs at a pose of shape (12,) [rad], each of shape (n, 3) [m]."""
         model, data = self._articulated.model, self._data
         q = pinocchio.neutral(model)
         q[self._articulated.q] = pose

@@ -1,4 +1,4 @@
-"""`atalante gait solve`: one gait, with what it demands of the machine as figures, a table, a plot and an animation."""
+"""Command `atalante gait solve`: one gait, its torques and constraints as tables, a plot and an animation."""
 
 from __future__ import annotations
 
@@ -28,23 +28,25 @@ if TYPE_CHECKING:
     type=click.Choice(["periodic", "start", "stop"]),
     default="periodic",
     show_default=True,
-    help="The step that repeats, the one from rest into it, or the one from it to rest.",
+    help="Periodic step, start step from rest into it, or stop step from it to rest.",
 )
-@click.option("--out", type=OutputFile(".json"), metavar="FILE", help="Write the gait, .json.")
+@click.option("--out", type=OutputFile(".json"), metavar="FILE", help="Write the gait to this .json file.")
 @click.option(
     "--plot",
     type=OutputFile(".png", ".svg", ".pdf"),
     metavar="FILE",
-    help="Angles, torques, centre of pressure, clearance: .png, .svg, .pdf.",
+    help="Plot angles, torques, centre of pressure and clearance to this .png, .svg or .pdf file.",
 )
-@click.option("--animate", type=OutputFile(".gif"), metavar="FILE", help="The step as a stick figure, .gif.")
+@click.option(
+    "--animate", type=OutputFile(".gif"), metavar="FILE", help="Animate the step as a stick figure in this .gif file."
+)
 @json_option
 def solve(
     subject: Subject | None, kind: Kind, out: Path | None, plot: Path | None, animate: Path | None, as_json: bool
 ) -> None:
-    """Optimise the gait of a patient; exit code 1 and the constraint that cannot hold where there is none.
+    """Optimise the gait of a patient. The exit code is 1 if there is no gait; stderr names the constraint that cannot hold.
 
-    The solved gait is judged by Pinocchio, which shares no code with the optimiser. Torques are Nm, angles degrees.
+    Pinocchio verifies the solved gait independently of the code of the optimiser. Torques are in Nm, angles in degrees.
 
     \b
     Example: atalante gait solve --mass 75 --height 175
@@ -52,7 +54,7 @@ def solve(
              atalante gait solve --mass 75 --height 175 --kind start --animate start.gif
     """
     if subject is None:
-        raise click.UsageError("a gait is a patient's: --mass and --height")
+        raise click.UsageError("a gait needs a patient: give --mass and --height")
     with extra():
         from atalante_control.gait_optimization.solve import solve as optimise
     from atalante_control.gait.gait import write_gait
@@ -60,13 +62,13 @@ def solve(
     from atalante_hal.robot import load_robot
 
     progress = Progress()
-    progress.show(f"{subject}: building the program")
+    progress.show(f"{subject}: building the nonlinear program")
 
     def show(iteration: int, violation: float) -> None:
         if progress.due():
             progress.show(f"{subject}: iteration {iteration}, constraints violated by up to {violation:.1e}")
 
-    # The optimiser keeps an exception to itself and gives up: it is let finish, or it would say that there is no such gait.
+    # The optimiser swallows an exception and reports that there is no gait, so a signal waits until it has finished.
     with stop_requested() as stop:
         solved = optimise(subject, kind=kind, progress=show)
     progress.clear()
@@ -82,7 +84,7 @@ def solve(
         click.echo()
         click.echo(_residuals(solved))
         click.echo()
-        click.echo(_judgement(checks))
+        click.echo(_verification(checks))
     say(f"{kind} step of {subject}: {solved.iterations} iterations, {solved.solve_s:.2f} s")
     if failed := [check.name for check in checks if not check.holds]:
         raise Failed(f"Pinocchio does not confirm the gait: {', '.join(failed)}")
@@ -94,7 +96,7 @@ def solve(
 
 
 def _summary(subject: Subject, solved: SolvedGait) -> dict[str, Any]:
-    """What scripts get. `status` is "solved" or the sentence; `peak_torque` is the largest of `peak_torques`, Nm."""
+    """Return the JSON object. `status` is "solved" or the reason; `peak_torque` is the largest of `peak_torques` [Nm]."""
     from atalante_hal.robot import JOINTS
 
     return {
@@ -109,7 +111,7 @@ def _summary(subject: Subject, solved: SolvedGait) -> dict[str, Any]:
 
 
 def _torques(solved: SolvedGait) -> str:
-    """Peaks by leg joint: right leg stands, left leg swings."""
+    """Return a table of peak torques and angle ranges per joint; the right leg is in stance, the left leg in swing."""
     from atalante_hal.robot import LEG_JOINTS, load_robot
 
     limits = load_robot().torque_max
@@ -130,17 +132,17 @@ def _residuals(solved: SolvedGait) -> str:
     return table([["constraint", "violated by", "unit"], *rows])
 
 
-def _judgement(checks: tuple[Check, ...]) -> str:
+def _verification(checks: tuple[Check, ...]) -> str:
     rows = [[c.name, f"{c.value:.3g}", f"{c.limit:.3g}", c.unit, "ok" if c.holds else "FAIL"] for c in checks]
-    return table([["by Pinocchio", "found", "limit", "unit", ""], *rows])
+    return table([["by Pinocchio", "value", "limit", "unit", ""], *rows])
 
 
 def _draw(solved: SolvedGait, subject: Subject, plot: Path | None, animate: Path | None) -> None:
     try:
         from atalante_tools.gait.figures import draw_animation, draw_plot
     except ModuleNotFoundError as error:
-        raise Failed(f"a picture needs {error.name}: type `pip install 'atalante-hal[plot]'`") from error
-    for draw, file, what in ((draw_plot, plot, "plot"), (draw_animation, animate, "animation")):
+        raise Failed(f"a picture needs {error.name}: install it with `pip install 'atalante-hal[plot]'`") from error
+    for draw, file, kind in ((draw_plot, plot, "plot"), (draw_animation, animate, "animation")):
         if file is not None:
             draw(solved.gait, subject.patient, file)
-            say(f"{what} in {file}")
+            say(f"{kind} in {file}")

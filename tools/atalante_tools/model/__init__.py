@@ -1,4 +1,4 @@
-"""`atalante model`: the patient-exoskeleton model as a table, a URDF, a picture, and the checks that it is sound."""
+"""Command `atalante model`: the patient-exoskeleton model as a table, a URDF and a picture, with consistency checks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     "urdf_file",
     type=OutputFile(".urdf", ".xml"),
     metavar="FILE",
-    help="Write the URDF, for PyBullet, Pinocchio and viewers.",
+    help="Write the URDF to this file, for PyBullet, Pinocchio and viewers.",
 )
 @click.option(
     "--show",
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
     is_flag=False,
     flag_value=Path("model.png"),
     metavar="[FILE]",
-    help="Draw the model from behind and from the side; .png, .svg or .pdf.  [FILE: model.png]",
+    help="Draw the model from behind and from the side; .png, .svg or .pdf.  [FILE if omitted: model.png]",
 )
 @json_option
 def command(patient: Patient | None, urdf_file: Path | None, picture: Path | None, as_json: bool) -> None:  # fmt: skip
-    """The links of the exoskeleton with a patient in it, and whether the model is sound; exit code 1 if it is not.
+    """Print the links of the patient-exoskeleton model and check its consistency; the exit code is 1 if a check fails.
 
-    Without --mass and --height it is the exoskeleton alone, the model of joint idealization. Masses are kg, centres of
-    mass m in the frame of the link, moments of inertia kg m2 about them.
+    Without --mass and --height the model is the exoskeleton without a patient, the model of joint idealization. Masses are
+    in kg, centres of mass in m in the frame of the link, moments of inertia in kg m2 about the centre of mass.
 
     \b
     Example: atalante model --mass 75 --height 175
@@ -46,11 +46,11 @@ def command(patient: Patient | None, urdf_file: Path | None, picture: Path | Non
     """
     from atalante_control.model import ExoskeletonParameters, links, urdf
     from atalante_hal.robot import load_robot
-    from atalante_tools.model.checks import checks
+    from atalante_tools.model.checks import model_checks
 
     robot, parameters = load_robot(), ExoskeletonParameters()
     bodies = links(parameters, patient)
-    found = list(checks(parameters, robot, patient))
+    found = list(model_checks(parameters, robot, patient))
     if as_json:
         for body in bodies:
             show_json({"link": body.name, "parent": body.parent or None, "joint": body.joint, **_numbers(body)})
@@ -67,13 +67,13 @@ def command(patient: Patient | None, urdf_file: Path | None, picture: Path | Non
     if picture is not None:
         _draw(picture, bodies)
     if failed := [check.name for check in found if check.ok is False]:
-        raise Failed(f"the model is not sound: {', '.join(failed)}")
+        raise Failed(f"the model is inconsistent: {', '.join(failed)}")
 
 
 def _numbers(body: Link) -> dict[str, object]:
     return {
         "mass": body.inertia.mass,
-        "centre": [value + 0.0 for value in body.inertia.centre],  # + 0.0: no negative zero
+        "centre": [value + 0.0 for value in body.inertia.centre],  # + 0.0 removes a negative zero
         "origin": [value + 0.0 for value in body.origin],
         "inertia": {
             name: value + 0.0
@@ -98,6 +98,6 @@ def _draw(picture: Path, bodies: tuple[Link, ...]) -> None:
     try:
         from atalante_tools.model.picture import draw
     except ModuleNotFoundError as error:
-        raise Failed(f"a picture needs {error.name}: type `pip install 'atalante-hal[plot]'`") from error
+        raise Failed(f"a picture needs {error.name}: install it with `pip install 'atalante-hal[plot]'`") from error
     draw(bodies, picture)
     say(f"picture in {picture}")

@@ -1,4 +1,4 @@
-"""Is a model sound? `parameters, patient -> checks`, each an independent reason to trust the dynamics."""
+"""Consistency checks of the model: `parameters, patient -> checks`. Each check is independent of the others."""
 
 from __future__ import annotations
 
@@ -13,48 +13,66 @@ from atalante_control.model import ExoskeletonParameters, Patient, links, pinocc
 from atalante_hal.robot import Robot
 from atalante_tools.session.body import no_banner
 
-#: Random states the two engines are compared in, and the largest difference relative to the largest entry.
+#: Number of random states in which two engines are compared, and largest difference relative to the largest entry.
 STATES, AGREEMENT = 100, 1e-6
 
 
 @dataclass(frozen=True)
-class Check:
-    """One answer."""
+class ModelCheck:
+    """Result of one check of the model."""
 
     name: str
-    ok: bool | None  # None: could not be asked
+    ok: bool | None  # None: the check could not be run
     text: str
 
 
-def checks(parameters: ExoskeletonParameters, robot: Robot, patient: Patient | None) -> Iterator[Check]:
-    """Total mass, mirror symmetry, physical inertias, and the agreement of two engines on the URDF."""
+def model_checks(parameters: ExoskeletonParameters, robot: Robot, patient: Patient | None) -> Iterator[ModelCheck]:
+    """Check total mass, mirror symmetry, physical inertias, and the agreement of two engines on the URDF.
+
+    Args:
+        parameters: parameters of the exoskeleton.
+        robot: robot with the joint limits.
+        patient: patient in the exoskeleton; None: no patient.
+    """
     bodies = links(parameters, patient)
     total, empty = (math.fsum(body.inertia.mass for body in tree) for tree in (bodies, links(parameters)))
     worn = patient.mass if patient else 0.0
-    yield Check("mass", abs(total - empty - worn) < 1e-10, f"{total:g} kg: exoskeleton {empty:g}, patient {worn:g}")
+    yield ModelCheck(
+        "mass", abs(total - empty - worn) < 1e-10, f"{total:g} kg: exoskeleton {empty:g}, patient {worn:g}"
+    )
 
     by_name = {body.name: body for body in bodies}
     left = [body for body in bodies if body.name.startswith("left_")]
-    unlike = [body.name for body in left if by_name[body.mirrored().name] != body.mirrored()]
-    text = f"{unlike[0]} and the right one differ" if unlike else f"{len(left)} links are exact images of each other"
-    yield Check("mirror", not unlike, text)
+    asymmetric = [body.name for body in left if by_name[body.mirrored().name] != body.mirrored()]
+    text = (
+        f"{asymmetric[0]} and its right counterpart differ"
+        if asymmetric
+        else f"{len(left)} pairs of links are exact mirror images"
+    )
+    yield ModelCheck("mirror", not asymmetric, text)
 
     moments = {body.name: np.linalg.eigvalsh(body.inertia.matrix()) for body in bodies if body.inertia.mass}
     slack = {name: float((a + b - c) / c) if a > 0.0 else -math.inf for name, (a, b, c) in moments.items()}
     worst = min(slack, key=lambda name: slack[name])
-    text = f"all {len(moments)} positive definite, triangle inequality tightest in {worst} ({slack[worst]:.2f} left)"
-    yield Check("inertias", slack[worst] > -1e-12, text if slack[worst] > -1e-12 else f"{worst} is no real body")
+    text = f"all {len(moments)} positive definite, smallest triangle inequality margin {slack[worst]:.2f} in {worst}"
+    yield ModelCheck(
+        "inertias", slack[worst] > -1e-12, text if slack[worst] > -1e-12 else f"the inertia of {worst} is not physical"
+    )
     yield _engines(urdf(parameters, robot, patient), robot)
 
 
-def _engines(text: str, robot: Robot) -> Check:
+def _engines(text: str, robot: Robot) -> ModelCheck:
     try:
         with no_banner():
             from atalante_emulator.engine_dynamics import EngineDynamics
     except ModuleNotFoundError as error:
         if error.name != "pybullet":
             raise
-        return Check("engines", None, "not compared, PyBullet is missing: type `pip install 'atalante-hal[emulator]'`")
+        return ModelCheck(
+            "engines",
+            None,
+            "not compared, PyBullet is not installed: install it with `pip install 'atalante-hal[emulator]'`",
+        )
     model, into, out_of = pinocchio_model(text)
     data = model.createData()
     rng = np.random.default_rng(0)
@@ -73,4 +91,4 @@ def _engines(text: str, robot: Robot) -> Check:
             ):
                 largest = max(largest, float(np.abs(theirs - ours).max() / np.abs(ours).max()))
     text = f"Pinocchio and PyBullet differ by at most {largest:.1e} (relative, {STATES} random states)"
-    return Check("engines", largest < AGREEMENT, text)
+    return ModelCheck("engines", largest < AGREEMENT, text)

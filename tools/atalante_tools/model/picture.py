@@ -1,4 +1,4 @@
-"""The model as a picture: the boxes of every link at a pose with slightly bent knees, from behind and from the side."""
+"""Picture of the model: the boxes of every link at a pose with slightly bent knees, from behind and from the side."""
 
 from __future__ import annotations
 
@@ -24,22 +24,27 @@ _MACHINE, _PATIENT, _SENSOR = "0.75", "tab:orange", "tab:red"
 
 
 def draw(bodies: Sequence[Link], picture: Path) -> None:
-    """Draw a tree of links, parents first; the format follows the suffix."""
+    """Draw a tree of links.
+
+    Args:
+        bodies: links, each after its parent.
+        picture: file to write; the suffix sets the format.
+    """
     figure, axes = plt.subplots(1, 2, figsize=(8.0, 6.4), sharey=True)
     frames = _frames(bodies)
     for axis, (across, name) in zip(axes, ((1, "y (left) [m]"), (0, "x (forward) [m]")), strict=True):
         for body in bodies:
             rotation, origin = frames[body.name]
-            for place, box in enumerate(body.boxes):
+            for index, box in enumerate(body.boxes):
                 corners = (_corners(box) @ rotation.T + origin)[:, [across, 2]]
-                colour = _PATIENT if place else _MACHINE
+                colour = _PATIENT if index else _MACHINE
                 axis.add_patch(Polygon(_hull(corners), facecolor=colour, edgecolor="0.2", alpha=0.45, linewidth=0.8))
             if not body.boxes:
                 axis.plot(origin[across], origin[2], ".", color=_SENSOR, markersize=5)
         axis.set_xlabel(name)
         axis.set_aspect("equal")
         axis.autoscale_view()
-    axes[0].invert_xaxis()  # seen from behind: left is left
+    axes[0].invert_xaxis()  # the view is from behind, so left is on the left
     axes[0].set_ylabel("z from the hips [m]")
     figure.suptitle("grey: exoskeleton, orange: patient, red: IMUs and force cells")
     figure.tight_layout()
@@ -48,7 +53,7 @@ def draw(bodies: Sequence[Link], picture: Path) -> None:
 
 
 def _frames(bodies: Sequence[Link]) -> dict[str, tuple[Vector, Vector]]:
-    """Rotation and origin of every link in the pelvis frame."""
+    """Return rotation (3, 3) and origin (3,) [m] of every link in the pelvis frame."""
     frames: dict[str, tuple[Vector, Vector]] = {"": (np.eye(3), np.zeros(3))}
     for body in bodies:
         rotation, origin = frames[body.parent]
@@ -59,7 +64,7 @@ def _frames(bodies: Sequence[Link]) -> dict[str, tuple[Vector, Vector]]:
 
 
 def _turn(axis: Sequence[float], angle: float) -> Vector:
-    """Rodrigues' formula."""
+    """Return the rotation about a unit axis by an angle [rad] with the formula of Rodrigues."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)
@@ -71,7 +76,7 @@ def _corners(box: Box) -> Vector:
 
 
 def _hull(points: Vector) -> Vector:
-    """Outline of the projected corners: Andrew's monotone chain."""
+    """Return the convex hull of points of shape (n, 2) with the monotone chain of Andrew."""
     ordered = sorted(map(tuple, points.tolist()))
     outline: list[tuple[float, ...]] = []
     for half in (ordered, ordered[::-1]):
