@@ -182,6 +182,8 @@ class Heartbeats:
         if status.node not in self._heard:
             self._heard.add(status.node)
             self.known = self._heard.issuperset(self._needed)
+            if self.known:
+                self.quiet = False  # the robot may become READY now
         elif values[status.state] != OPERATIONAL:
             self._reset.add(status.node)
 

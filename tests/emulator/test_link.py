@@ -184,7 +184,7 @@ class TestContent:
 
     def test_frozen_counter(self, line: Make) -> None:
         run = line(Fault("freeze_counter", KNEE, 2, 4)).run(8)
-        assert run.knee == [OK] * 3 + [Check.REPEATED] * 3 + [LOST, OK]
+        assert run.knee == [OK] * 3 + [Check.CONFLICT] * 3 + [LOST, OK]
         assert len({f["data"][0, 4:8].tobytes() for f in run.to_hal}) == 8
 
     def test_masquerade(self, line: Make, network: Network) -> None:
