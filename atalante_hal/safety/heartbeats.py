@@ -74,6 +74,8 @@ class Heartbeats:
         self._seen = 0  # cycle up to which ages count
         #: Node -> what it said last of an error that is not gone: code and emergency error code.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
+        #: Nodes whose emergency was cleared in this cycle. Their state frame of the same cycle may still report FAULT.
+        self.cleared: set[str] = set()
         #: Emergencies that only inform, since the last `judge`.
         self._notices: list[tuple[str, Dtc, int]] = []
         self._reset: set[str] = set()  # nodes that began anew since the last `judge`
@@ -160,6 +162,7 @@ class Heartbeats:
 
     def _age(self, cycle: int) -> None:
         if cycle != self._seen:
+            self.cleared.clear()
             refused = self.image.refused
             self.image.new_cycle(cycle - self._seen)
             self.image.refused = refused
@@ -191,7 +194,8 @@ class Heartbeats:
         dtc = emergency(code)
         self.quiet = False
         if dtc is None:
-            self.emergencies.pop(node, None)
+            if self.emergencies.pop(node, None) is not None:
+                self.cleared.add(node)
         elif dtc.reaction is Reaction.INFO:
             self._notices.append((node, dtc, code))
         else:

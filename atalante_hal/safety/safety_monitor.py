@@ -213,8 +213,9 @@ class SafetyMonitor:
             return
         for node, drive in zip(DRIVE_NODES, state.drive_state.tolist(), strict=True):
             if drive in _FAULTY:
-                # A drive that said why is judged by that.
-                if node not in self._heartbeats.emergencies and (nodes_well or state.supervisor is not _S.OFF):
+                # The emergency message of a drive decides about its reaction.
+                explained = node in self._heartbeats.emergencies or node in self._heartbeats.cleared
+                if not explained and (nodes_well or state.supervisor is not _S.OFF):
                     memory.raise_dtc(state.cycle, Dtc.DRIVE_FAULT, node, value=drive)
             elif drive != DriveState.OPERATION_ENABLED and self.moving:
                 memory.raise_dtc(state.cycle, Dtc.DRIVE_STATE, node, value=drive)

@@ -296,3 +296,17 @@ def test_two_senders_of_a_slow_message_are_confirmed_at_the_fifth_conflict(well:
     well.hear(well.frame("HAPTICS", "STATE"))
     assert well.judge() == {}
     assert well.heartbeats.quiet
+
+
+def test_a_cleared_emergency_is_known_for_the_cycle_in_which_it_was_cleared(well: Nodes):
+    well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0x7305))
+    well.judge()
+    assert well.heartbeats.cleared == set()
+    well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0))
+    well.judge()
+    assert well.heartbeats.cleared == {"LEFT_SK"}
+    well.now += 1
+    well.judge()
+    assert well.heartbeats.cleared == set()
+    well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0))
+    assert well.heartbeats.cleared == set(), "nothing was there to be cleared"
