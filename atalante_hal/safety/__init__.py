@@ -1,1 +1,1 @@
-"""The safety core: what is wrong in a cycle, which state follows, and what may leave for the drives."""
+"""Safety core: detects faults in each cycle, derives the robot state, and limits the commands sent to the drives."""

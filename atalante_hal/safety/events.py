@@ -1,13 +1,16 @@
-"""Events (diagnostics, changes of state) as records of a ring of their own: seldom, small, and never dropped for a stream."""
+"""Events (diagnostics, state changes) packed as records of a separate ring buffer.
+
+Events are rare and small. With their own ring they are not dropped when the telemetry stream is full.
+"""
 
 from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
 
-#: In the order of the enum `Severity` of messages.proto.
+#: Severity names, in the order of the enum `Severity` in messages.proto.
 SEVERITIES = ("info", "warning", "error")
-#: Number of the run, cycle, value, severity, code, node, text.
+#: Packed fields: run number, cycle, value, severity, code, node, text.
 _RECORD = struct.Struct("<qqdB39s32s216s")
 EVENT_BYTES = _RECORD.size
 EVENT_SLOTS = 1024
@@ -15,14 +18,14 @@ EVENT_SLOTS = 1024
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened, once."""
+    """Record of a single occurrence, such as a new diagnostic or a state change."""
 
     cycle: int
-    code: str  # e.g. NODE_TIMEOUT; 39 bytes are carried
-    text: str  # one sentence for people; 216 bytes are carried
+    code: str  # e.g. NODE_TIMEOUT; cut to 39 bytes when packed
+    text: str  # one sentence for the operator; cut to 216 bytes when packed
     severity: str = "info"  # one of `SEVERITIES`
-    node: str = "HAL"  # DBC name of the node; 32 bytes are carried
-    value: float = 0.0  # what was measured; its meaning depends on the code
+    node: str = "HAL"  # DBC name of the node; cut to 32 bytes when packed
+    value: float = 0.0  # measured value; quantity and unit depend on the code
 
     def __post_init__(self) -> None:
         if self.severity not in SEVERITIES:
@@ -32,7 +35,12 @@ class Event:
 
 
 def pack(event: Event, run: int) -> bytes:
-    """Bytes of an event of the run of that number. Too long texts are cut."""
+    """Return an event as bytes; texts that are too long are cut.
+
+    Args:
+        event: event to pack.
+        run: number of the run that the event belongs to.
+    """
     return _RECORD.pack(
         run,
         event.cycle,
@@ -45,7 +53,7 @@ def pack(event: Event, run: int) -> bytes:
 
 
 def unpack(packed: bytes) -> tuple[Event, int]:
-    """The event and the number of its run."""
+    """Return the event in packed bytes and its run number."""
     run, cycle, value, severity, code, node, text = _RECORD.unpack(packed)
     return Event(cycle, _text(code), _text(text), SEVERITIES[severity], _text(node), value), run
 

@@ -1,6 +1,6 @@
-"""The fault memory: which diagnostics are active, since when, and the events that say so once.
+"""Fault memory: the active diagnostics, and one event for each new diagnostic.
 
-`message monitor, heartbeats, transceiver, plausibility, loop -> fault memory -> supervisor (confirmed codes), telemetry (events)`
+`monitors, transceiver, plausibility, loop -> fault memory -> state machine (confirmed codes), telemetry (events)`
 """
 
 from __future__ import annotations
@@ -13,47 +13,47 @@ from itertools import islice
 from atalante_hal.safety.diagnostics import Dtc, Reaction, Severity, event_code, worst
 from atalante_hal.safety.events import Event
 
-#: A diagnostic that ends and begins again is told anew after so many cycles, pending or confirmed: a bad line does not fill
-#: the log.
+#: Shortest time between two events of the same diagnostic, pending and confirmed [cycles]. It keeps a poor connection from
+#: filling the log.
 QUIET_PENDING, QUIET_CONFIRMED = 1000, 20
 
 
-#: Newest events that are kept: about 2 MB, in a process whose memory is locked.
+#: Number of newest events that are kept: about 2 MB of locked process memory.
 EVENTS_KEPT = 4096
 
 
 class EventLog:
-    """Keep the newest events and count all of them.
+    """Log of the newest events, with a count of all events.
 
-    Events are numbered from 0 in the order they are appended. The number of an event stays the same when older ones are
-    dropped; its index among those that are kept does not.
+    Events are numbered from 0 in the order they are appended. The number of an event never changes. Its index in the log
+    changes when older events are dropped.
 
     Args:
-        capacity: largest number of events that are kept.
+        capacity: maximum number of events in the log.
     """
 
     def __init__(self, capacity: int = EVENTS_KEPT) -> None:
         self._kept: deque[Event] = deque(maxlen=capacity)
-        #: Events appended so far, which is the number of the next one.
+        #: Number of events appended so far, which is the number of the next event.
         self.count = 0
 
     def append(self, event: Event) -> None:
-        """Add an event; the oldest is dropped if the log is full."""
+        """Append an event; drop the oldest event if the log is full."""
         self._kept.append(event)
         self.count += 1
 
     def since(self, number: int) -> list[Event]:
-        """Return the events from a number on, oldest first, as far as they are kept.
+        """Return the events from a given number on that are still in the log, oldest first.
 
         Args:
-            number: of the first event, such as an earlier `count`.
+            number: number of the first event to return, such as an earlier `count`.
         """
         wanted = min(self.count - number, len(self._kept))
         return list(islice(reversed(self._kept), max(0, wanted)))[::-1]
 
     @property
     def dropped(self) -> int:
-        """Events that are not kept any more."""
+        """Return the number of events dropped so far."""
         return self.count - len(self._kept)
 
     def __len__(self) -> int:
@@ -71,25 +71,26 @@ class EventLog:
 
 @dataclass(slots=True)
 class Entry:
-    """One diagnostic of one node while it is active."""
+    """Active diagnostic of one node."""
 
     confirmed: bool
     text: str
     value: float
-    cycle: int  # raised last
+    cycle: int  # cycle in which the diagnostic was last raised
 
 
 class FaultMemory:
-    """Everything that is raised in a cycle, then `close_cycle`: what was not raised again is over.
+    """Set of active diagnostics of all nodes.
 
-    A diagnostic is noted as an event when it begins, and again when it is confirmed.
+    Call `raise_dtc` for every diagnostic that holds in a cycle, then `close_cycle`, which ends every diagnostic that was not
+    raised in this cycle. An event is logged when a diagnostic becomes active, and another one when it becomes confirmed.
     """
 
     def __init__(self) -> None:
-        #: What began, in order.
+        #: Logged events, in order of time.
         self.events = EventLog()
         self.active: dict[tuple[Dtc, str], Entry] = {}
-        #: Bits of the active codes, of the confirmed ones: `diagnostics.dtcs_of`.
+        #: Bit set of the active codes, pending and confirmed, as of the last `close_cycle`; see `diagnostics.dtcs_of`.
         self.bits = 0
         self.confirmed: frozenset[Dtc] = frozenset()
         self._noted: dict[tuple[Dtc, str, bool], int] = {}
@@ -97,13 +98,15 @@ class FaultMemory:
     def raise_dtc(
         self, cycle: int, dtc: Dtc, node: str, *, value: float = 0.0, confirmed: bool = True, text: str = ""
     ) -> None:
-        """A diagnostic holds in this cycle.
+        """Mark a diagnostic as active in this cycle, and log an event if it is new or newly confirmed.
 
         Args:
-            node: DBC name of the node it is about.
-            value: what was measured; its meaning depends on the code.
-            confirmed: its bound is passed and its reaction is due.
-            text: one sentence for people; the code's meaning unless given.
+            cycle: number of the current cycle.
+            dtc: diagnostic trouble code.
+            node: DBC name of the affected node.
+            value: measured value; quantity and unit depend on the code.
+            confirmed: True if the fault exceeds its bound, so that its reaction is due.
+            text: one sentence for the operator; default: node name and meaning of the code.
         """
         entry = self.active.get((dtc, node))
         before = entry is not None and (entry.confirmed or not confirmed)
@@ -116,7 +119,7 @@ class FaultMemory:
             self._note(cycle, dtc, node, entry)
 
     def close_cycle(self, cycle: int) -> None:
-        """Forget what did not hold in this cycle, and sum up what did."""
+        """Remove the diagnostics that were not raised in this cycle, then update `bits` and `confirmed`."""
         self.active = {key: entry for key, entry in self.active.items() if entry.cycle == cycle}
         bits = 0
         for dtc, _ in self.active:
@@ -125,16 +128,16 @@ class FaultMemory:
         self.confirmed = frozenset(dtc for (dtc, _), entry in self.active.items() if entry.confirmed)
 
     def worst(self) -> frozenset[Dtc]:
-        """Return the confirmed codes that demand the worst reaction; empty when none demands any."""
+        """Return the confirmed codes with the most severe reaction; empty if that reaction is INFO."""
         reaction = worst(self.confirmed)
         return frozenset(dtc for dtc in self.confirmed if dtc.reaction is reaction is not Reaction.INFO)
 
     def nodes_of(self, dtcs: frozenset[Dtc]) -> list[str]:
-        """Nodes one of these codes is confirmed for."""
+        """Return the nodes for which one of these codes is confirmed."""
         return [node for (dtc, node), entry in self.active.items() if dtc in dtcs and entry.confirmed]
 
     def text_of(self, dtcs: frozenset[Dtc]) -> str:
-        """What is said about the first of these codes; empty when none is active."""
+        """Return the text of the first active diagnostic among these codes; empty if none is active."""
         return next((entry.text for (dtc, _), entry in self.active.items() if dtc in dtcs), "")
 
     def _note(self, cycle: int, dtc: Dtc, node: str, entry: Entry) -> None:

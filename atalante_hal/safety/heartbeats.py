@@ -1,9 +1,9 @@
-"""What the nodes say now and then: status (their heartbeat) and emergencies.
+"""Monitor of the slow messages of all nodes: status messages (heartbeats) and emergencies.
 
-`slow process image -> heartbeats -> diagnostics`
+    slow process image -> heartbeats -> fault memory
 
-After CiA 301: a heartbeat consumer with a timeout, the boot-up message as the sign of a reset, and emergencies that hold until
-the node says that the error is gone.
+It follows CiA 301: each heartbeat has a timeout, a boot-up message reports a reset of its node, and an emergency stays active
+until the node sends error code 0 or the operator acknowledges it.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from atalante_hal.wire.e2e import FULL, Check, suspect
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: NMT states of a node that has just begun, and of one that works.
+#: NMT states (CiA 301) of a node that has just started, and of a node in normal operation.
 BOOT_UP, OPERATIONAL = 0, 5
-#: Largest `Check` whose data is new, as a plain integer: numpy compares it ten times faster.
+#: Largest `Check` whose data is new. It is a plain integer because numpy compares that ten times faster.
 _FRESH = int(Check.SOME_LOST)
 
 
 class _Status(NamedTuple):
     node: str
-    drive: bool  # hangs on the supply that moves the robot
-    row: int
-    timeout: int
-    state: int  # place of NodeState in the image's values, as for the two below
-    dbc_hash: int
-    supply: int
+    drive: bool  # True if the node is powered by the motor supply
+    row: int  # row of the status message in the process image
+    timeout: int  # cycles
+    state: int  # index of NodeState in the values of the process image
+    dbc_hash: int  # index of DbcHash in the same values
+    supply: int  # index of SupplyVoltage in the same values
 
 
 class Heartbeats:
-    """Status and emergencies of all nodes.
+    """Monitor of the status messages and emergencies of all nodes.
 
-    `quiet` says that nothing is wrong, so that nothing has to be judged.
+    While `quiet` is True no node has a fault, and `judge` need not be called.
     """
 
     def __init__(self, network: Network, thresholds: Thresholds) -> None:
@@ -63,7 +63,7 @@ class Heartbeats:
         self._status_rows = np.array([s.row for s in self._statuses])
         self._timeouts = np.array([s.timeout for s in self._statuses])
         self._needed = {s.node for s in self._statuses if network.node(s.node).kind != "pendant"}
-        self._heard: set[str] = set()  # nodes that sent a status
+        self._heard: set[str] = set()  # nodes that have sent a status message
         self._emergency_of = {
             m.frame_id: (m.sender, codec.rows[m.name], codec.index(m.name, "ErrorCode"))
             for m in messages
@@ -71,30 +71,32 @@ class Heartbeats:
         }
         self._status_of = {codec.messages[s.row].frame_id: s for s in self._statuses}
         self._amplitude, self._amplitude_row = codec.slice("Amplitude"), codec.rows["HAPTICS_STATE"]
-        self._seen = 0  # cycle up to which ages count
-        #: Node -> what it said last of an error that is not gone: code and emergency error code.
+        self._seen = 0  # cycle up to which the ages of the process image are counted
+        #: Node -> diagnostic and error code of its last emergency, until the error is cleared.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         #: Nodes whose emergency was cleared in this cycle. Their state frame of the same cycle may still report FAULT.
         self.cleared: set[str] = set()
-        #: Emergencies that only inform, since the last `judge`.
+        #: Emergencies since the last `judge` whose reaction is INFO: node, diagnostic, error code.
         self._notices: list[tuple[str, Dtc, int]] = []
-        self._reset: set[str] = set()  # nodes that began anew since the last `judge`
-        #: Row -> evidence of two senders, of the rows that have any, one step a frame.
+        self._reset: set[str] = set()  # nodes that restarted since the last `judge`
+        #: Row -> evidence of two senders, 1 to `FULL`, updated with each frame. Rows without evidence may be missing.
         self._evidence: dict[int, int] = {}
-        #: Nodes that sent a boot-up message since the last `judge` was used: its reader clears it.
+        #: Nodes that sent a boot-up message. The safety monitor clears this set after it has used it.
         self.booted: set[str] = set()
-        #: Every node that has to has sent a status.
+        #: True when every required node (all but the pendant) has sent a status message.
         self.known = False
         self.quiet = True
 
     def accept(self, frames: Frames, cycle: int, vibration: Vector) -> list[int]:
-        """Take the frames of a cycle that are not of the fast image, one by one: each counts.
+        """Process the frames of a cycle that are not in the fast process image, one by one and in order.
 
         Args:
-            vibration: gets the measured amplitudes, shape (8,).
+            frames: received frames, shape (n,).
+            cycle: number of the current cycle.
+            vibration: output for the measured vibration amplitudes, shape (8,); written if a new haptics state was received.
 
         Returns:
-            Places in `frames` of those nobody may send to the HAL.
+            Indices in `frames` of the frames that the DBC does not define as messages to the HAL.
         """
         image = self.image
         self._age(cycle)
@@ -119,7 +121,7 @@ class Heartbeats:
         return unknown
 
     def judge(self, cycle: int, memory: FaultMemory) -> None:
-        """Raise what is wrong with any node."""
+        """Raise the diagnostics of all nodes in the fault memory."""
         self._age(cycle)
         messages = self.image.codec.messages
         for row, why in self.image.refused:
@@ -144,17 +146,21 @@ class Heartbeats:
             self._judge_status(cycle, memory, status)
 
     def overdue(self, cycle: int) -> bool:
-        """Whether a status is late: asked now and then, because nothing comes that would say so."""
+        """Return whether a status message timed out; call it periodically, because a lost message triggers no other check."""
         self._age(cycle)
         ages = self.image.age[self._status_rows]
         return bool(((ages >= self._timeouts) & (ages < NEVER)).any())
 
     def acknowledge(self, still_faulty: set[str]) -> None:
-        """The operator starts again: emergencies are over, but of the drives that are still in FAULT."""
+        """Clear the emergencies of all nodes except the drives that are still in FAULT; called when the operator presses START.
+
+        Args:
+            still_faulty: DBC names of the drives that are still in FAULT.
+        """
         self.emergencies = {node: said for node, said in self.emergencies.items() if node in still_faulty}
 
     def missing(self) -> set[str]:
-        """Nodes without a status, or of another DBC."""
+        """Return the required nodes that have sent no status message, and the nodes that use a different DBC."""
         values = self.image.values
         return (self._needed - self._heard) | {
             s.node for s in self._statuses if s.node in self._heard and values[s.dbc_hash] != self._hash
@@ -169,7 +175,14 @@ class Heartbeats:
             self._seen = cycle
 
     def _suspect(self, row: int, *, rival: bool) -> None:
-        """Weigh one more frame of a row. A sender that begins anew may meet the last counter once, two senders do often."""
+        """Update the evidence of two senders of a row with one more frame.
+
+        A restarted sender can repeat the last counter once. Two senders repeat it often.
+
+        Args:
+            row: row of the frame in the process image.
+            rival: True if the frame has the last counter but other bytes.
+        """
         before = self._evidence.get(row, 0)
         if rival or before:
             self.quiet = False

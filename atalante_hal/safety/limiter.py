@@ -1,19 +1,21 @@
-"""The limiter: the last thing between any command and the bus. It cannot be switched off.
+"""Limiter: the last stage between the requested torque and the bus. It cannot be switched off.
 
-    torque asked for -> derated torque limit, envelope of position and velocity -> torque rate -> torque sent
+    requested torque -> derated torque limit, envelope of position and velocity -> torque rate -> torque sent
 
-*Envelope.* Torque that drives a joint towards a position limit fades with where the joint will be `look_ahead` from now at its
-velocity: whole up to the limit, none from `position_margin` past it. Torque along the velocity fades likewise from `velocity_max`
-to `velocity_margin` past it. The torque the other way, which brakes, keeps the whole limit: the envelope never turns a torque
-around and never weakens a brake. It is no controller: a joint that nobody brakes reaches its end stop, which stands at the limit
-or less than the margin past it and has to bear the torque pressed onto it at rest. A gait may use the whole range.
+*Envelope.* Torque towards a position limit is faded out by the predicted position of the joint, `look_ahead` from now at the
+present velocity. The torque limit is full up to the position limit and falls to zero at `position_margin` beyond it. Torque in
+the direction of the velocity is faded out in the same way between `velocity_max` and `velocity_margin` beyond it. Torque in the
+opposite direction, which brakes, keeps the full limit: the envelope never reverses a torque and never weakens braking. The
+envelope is not a controller: without braking a joint reaches its end stop. The end stop is at the position limit or less than
+the margin beyond it, and must withstand the torque that presses the joint against it at rest. A gait may use the full range.
 
-*Rate.* The limit of torque, derated or faded, is approached at the rate limit: where it falls under the torque of the last cycle,
-the torque follows at `torque_rate_max`. So the rate holds without exception.
+*Rate.* The torque changes by at most `torque_rate_max`, without exception. Where the derated or faded limit falls below the
+torque of the last cycle, the torque approaches the new limit at this rate.
 
-What holds of every pair (k-1, k) of command frames with ENABLE_OPERATION for a joint in both, with u the TargetTorque, M the
-MaxTorque of the frame, q and v the position and velocity of the joint's last state frame that was good before frame k (or of
-an earlier one, no older than the node's timeout), r = torque_rate_max * 1 ms, e one step of TargetTorque on the wire:
+*Guarantee.* The inequalities below hold for every pair (k-1, k) of command frames that both have ENABLE_OPERATION for a joint.
+u is the TargetTorque and M the MaxTorque of a frame. q and v are the position and velocity in the last good state frame of the
+joint before frame k, or in an earlier one no older than the node's timeout. r = torque_rate_max * 1 ms, and e is one step of
+TargetTorque on the wire.
 
 - |u_k| <= torque_max, M_k <= torque_max
 - |u_k - u_(k-1)| <= r + e
@@ -23,8 +25,8 @@ an earlier one, no older than the node's timeout), r = torque_rate_max * 1 ms, e
   F_down = min(S((position_min - q - look_ahead v) / position_margin), S((-v - velocity_max) / velocity_margin)),
   S(x) = 1 - x clipped to [0, 1]
 
-and of every frame with another controlword for a joint: u_k = 0, or the torque the drive reported, |u_k| <= M_k.
-All numbers are those of robot.toml.
+For every frame with another controlword for a joint: u_k is 0 or the torque that the drive reported, and |u_k| <= M_k.
+All limits are defined in robot.toml.
 """
 
 from __future__ import annotations
@@ -39,27 +41,27 @@ from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, Robot, Vector
 
 _COUNT = len(JOINTS)
-#: What `limit` did.
+#: Results of `limit`: torque unchanged, torque of at least one joint cut, input not finite.
 _AS_ASKED, _CUT, _NOT_FINITE = range(3)
 
 
 @dataclass(frozen=True)
 class Limited:
-    """What the limiter did to one command."""
+    """Result of limiting one command."""
 
-    finite: bool  # False: a number was NaN or infinite and nothing of the command was used
-    clamped: bool  # the torque of a joint was cut
+    finite: bool  # False: an input was NaN or infinite and the whole command was ignored
+    clamped: bool  # the torque of at least one joint was cut
 
 
 class Limiter:
-    """The limits of the robot, applied once a cycle.
+    """Torque limiter of all joints, applied once per cycle.
 
-    A torque that needs no cutting leaves with the bits it came with.
+    A torque within the limits is passed on bit for bit.
 
     Attributes:
-        last: what was sent last, shape (12,) [Nm]; the rate limit counts from here.
-        limit: torque limit in force, shape (12,) [Nm].
-        cut: joints whose torque was cut in the last `apply`, shape (12,), for an anti-windup.
+        last: torque sent last, shape (12,) [Nm]; the rate limit refers to it.
+        limit: present torque limit, shape (12,) [Nm].
+        cut: True for each joint whose torque was cut in the last `apply`, shape (12,); input of an anti-windup.
         saturated: cycles in a row, up to the last `apply`, in which a torque was cut.
     """
 
@@ -73,17 +75,20 @@ class Limiter:
         self.last: Vector = np.zeros(_COUNT)
         self.cut: npt.NDArray[np.bool_] = np.zeros(_COUNT, np.bool_)
         self.saturated = 0
-        # Whatever the torque comes as, the machine code gets the arrays it was compiled for.
+        # Copies of the inputs, because the compiled code accepts only the array type and layout that it was compiled for.
         self._asked, self._motion = np.zeros(_COUNT), np.zeros((2, _COUNT))
         self._apply = compiled(limit)
         self.apply(self.last, np.zeros((2, _COUNT)))  # nothing; from now on it is machine code
 
     def apply(self, torque: Vector, motion: Vector) -> Limited:
-        """Limit a command; the result is in `last`.
+        """Limit a command and store the result in `last`.
 
         Args:
-            torque: shape (12,) [Nm], not changed.
-            motion: position [rad] and velocity [rad/s], shape (2, 12), NaN where nothing is known.
+            torque: requested torque, shape (12,) [Nm]; not changed.
+            motion: position [rad] and velocity [rad/s], shape (2, 12); NaN where they are unknown.
+
+        Returns:
+            Whether the inputs were finite and whether a torque was cut. If an input is not finite, `last` keeps its value.
         """
         self._asked[:] = torque
         self._motion[:] = motion
@@ -95,11 +100,19 @@ class Limiter:
         return _LIMITED[done]
 
     def derate(self, limit: Vector) -> None:
-        """Lower the torque limit, or raise it again up to the robot's own. Shape (12,) [Nm], none negative."""
+        """Set the torque limit, but no higher than the maximum torque of the robot.
+
+        Args:
+            limit: new torque limit, shape (12,) [Nm], at least 0.
+        """
         np.minimum(limit, self._torque_max, out=self.limit)
 
     def restart(self, torque: Vector) -> None:
-        """Count the rate limit from a torque the drives exert by themselves, within the limits. Shape (12,) [Nm]."""
+        """Restart the rate limit from the torque that the drives exert, clipped to the torque limit.
+
+        Args:
+            torque: torque reported by the drives, shape (12,) [Nm]; NaN and infinity count as 0.
+        """
         finite = np.nan_to_num(torque, nan=0.0, posinf=0.0, neginf=0.0)
         np.clip(finite, -self.limit, self.limit, out=self.last)
         self.saturated = 0
@@ -121,18 +134,22 @@ def limit(
     velocity_margin: float,
     cut: npt.NDArray[np.bool_],
 ) -> int:
-    """The limits of all joints, see above.
+    """Limit the torque of all joints by torque limit, envelope and rate, as described in the module docstring.
 
     Args:
-        asked: torque [Nm]; `motion`: position [rad] and velocity [rad/s], shape (2, 12).
-        last: torque of the last cycle [Nm], rewritten by that of this one.
-        torque_limit: [Nm]; `step`: largest change of torque in a cycle [Nm].
-        envelope: lowest and highest position [rad], highest velocity [rad/s], shape (3, 12).
-        look_ahead: [s]; `position_margin`: [rad]; `velocity_margin`: [rad/s].
-        cut: whose torque is not what was asked for; rewritten.
+        asked: requested torque, shape (12,) [Nm].
+        motion: position [rad] and velocity [rad/s], shape (2, 12).
+        last: torque sent in the last cycle, shape (12,) [Nm]; overwritten with the torque to be sent in this cycle.
+        torque_limit: torque limit, shape (12,) [Nm].
+        step: maximum change of the torque in one cycle, shape (12,) [Nm].
+        envelope: lowest position [rad], highest position [rad] and highest velocity [rad/s], shape (3, 12).
+        look_ahead: prediction time of the position [s].
+        position_margin: distance beyond a position limit at which the torque is zero [rad].
+        velocity_margin: excess over the highest velocity at which the torque is zero [rad/s].
+        cut: True for each joint whose torque differs from the requested torque, shape (12,); overwritten.
 
     Returns:
-        `_AS_ASKED`, `_CUT`, or `_NOT_FINITE`: then nothing is changed.
+        `_AS_ASKED`, `_CUT`, or `_NOT_FINITE`; with `_NOT_FINITE` no output is changed.
     """
     for joint in range(len(asked)):
         if not (math.isfinite(asked[joint]) and math.isfinite(motion[0, joint]) and math.isfinite(motion[1, joint])):
@@ -148,7 +165,7 @@ def limit(
         too_fast_down = (-velocity - envelope[2, joint]) / velocity_margin
         up = torque_limit[joint] * share(max(too_high, too_fast_up))
         down = torque_limit[joint] * share(max(too_low, too_fast_down))
-        # A limit that falls under the torque of the last cycle is approached at the rate limit.
+        # If the limit falls below the torque of the last cycle, the torque approaches it at the rate limit.
         lowest, highest = last[joint] - step[joint], last[joint] + step[joint]
         sent = min(max(asked[joint], within(-down, lowest, highest)), within(up, lowest, highest))
         cut[joint] = sent != asked[joint]
@@ -159,10 +176,14 @@ def limit(
 
 
 def share(beyond: float) -> float:
-    """S: the share of the torque that is left so far beyond a limit."""
+    """Return S(x), the fraction of the torque limit that remains at some distance beyond a position or velocity limit.
+
+    Args:
+        beyond: distance beyond the limit as a fraction of the margin; negative within the limit.
+    """
     return within(1.0 - beyond, 0.0, 1.0)
 
 
 def within(value: float, low: float, high: float) -> float:
-    """The value nearest to `value` in [low, high]."""
+    """Return `value` clipped to [low, high]."""
     return min(max(value, low), high)

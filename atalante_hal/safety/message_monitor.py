@@ -1,15 +1,17 @@
-"""Whether what the nodes say every cycle may be used: E2E, age and trust of each message.
+"""Message monitor: checks E2E result, age and trust of each cyclic message, and decides whether its data is valid.
 
-`process image -> message monitor -> validity of each message, diagnostics -> supervisor`
+    process image -> message monitor -> validity of each message; diagnostics -> fault memory -> state machine
 
-A message that was not committed is pending trouble; it is confirmed when its data is as old as the DBC's timeout. A message
-that loses more than a fifth of its frames trips its leaky bucket. What tripped is trusted again after 16 good cycles in a row.
+A message that was not committed raises a pending diagnostic. The diagnostic is confirmed when the data is as old as the timeout
+in the DBC. A leaky bucket for each message fills when more than a fifth of its frames are lost. A message whose bucket is full
+loses its trust. It is trusted again after 16 good cycles in a row.
 
-Two senders of one message are recognised by their frames: beside the accepted frame of a cycle comes an intact one with the same
-counter and other bytes, or with a counter that is no successor. Four such cycles in a row are confirmed and take the trust away.
+Two senders of one message are detected by a second intact frame in the same cycle. This frame has the same counter as the
+accepted frame and other bytes, or a counter out of sequence. Four such cycles in a row confirm the diagnostic, and the message
+loses its trust.
 
-Who stands on one leg had better put the other one down: a joint of the swing leg that is not heard has its step finished, and
-is held like any other when it still is not heard after twice the timeout, 10 cycles.
+In single support it is safer to finish the step than to stop. If a joint of the swing leg times out, the step is finished first.
+If no message has arrived after twice the timeout, 10 cycles, the robot goes to HOLD as for any other joint.
 """
 
 from __future__ import annotations
@@ -27,17 +29,17 @@ from atalante_hal.safety.fault_memory import FaultMemory
 from atalante_hal.wire.e2e import FULL, SETTLED, Check, Qualification, qualify, suspect
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Why a message was not committed -> what is noted at once.
+#: Check result of a rejected message -> diagnostic that becomes pending in the same cycle.
 PENDING = {
     Check.REPEATED: Dtc.E2E_REPEATED,
-    Check.CONFLICT: Dtc.E2E_REPEATED,  # alone in its cycle; beside another frame it is a rival, see `rivals_of`
+    Check.CONFLICT: Dtc.E2E_REPEATED,  # if it is the only frame of its cycle; with another frame see `rivals_of`
     Check.WRONG_SEQUENCE: Dtc.E2E_SEQUENCE,
     Check.CRC: Dtc.E2E_CRC,
     Check.LENGTH: Dtc.FRAME_LENGTH,
     Check.RANGE: Dtc.SIGNAL_RANGE,
     Check.INVALID: Dtc.SIGNAL_RANGE,
 }
-#: What is confirmed when the data has become too old.
+#: Last check result of a message -> diagnostic that is confirmed when the data is too old.
 CONFIRMED = {
     **PENDING,
     Check.OK: Dtc.NODE_LATE,
@@ -46,17 +48,20 @@ CONFIRMED = {
     Check.REPEATED: Dtc.E2E_FROZEN,
     Check.CONFLICT: Dtc.E2E_FROZEN,
 }
-#: Beside another intact frame of the same cycle these are a second sender's.
+#: Check results that prove a second sender if the same cycle has another intact frame of the message.
 _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
-#: Frames that were not committed, but whose format and CRC are right.
+#: Check results of rejected frames with correct format and CRC.
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)
 _FRESH = int(Check.SOME_LOST)
-#: Timeouts for which a joint of the swing leg may not be heard before the robot holds.
+#: Age of a swing leg joint's data at which the robot goes to HOLD, in multiples of the message timeout.
 SWING_TIMEOUTS = 2
 
 
 class MessageMonitor:
-    """Judges the rows of the fast image; the pendant's is judged alike, what follows from its loss is the operator's stop."""
+    """Monitor of the messages in the fast process image.
+
+    The pendant message is monitored in the same way, but confirms no diagnostic here: its loss counts as a stop by the operator.
+    """
 
     def __init__(self, network: Network, image: ReceiveImage) -> None:
         self._image = image
@@ -71,41 +76,43 @@ class MessageMonitor:
         self._confirms = [kind != "pendant" for kind in kinds]
         self._needed = [row for row, kind in enumerate(kinds) if kind != "pendant"]
         self.qualification = [Qualification()] * len(messages)
-        #: Evidence of two senders of each row, 0 to `FULL`.
+        #: Evidence of two senders for each row, 0 to `FULL`.
         self._evidence = [0] * len(messages)
-        #: Rows that were trusted once: of the others nobody knows whether they should speak.
+        #: True for each row that has been trusted at least once. Other rows may belong to nodes that are not connected.
         self._known = [False] * len(messages)
-        #: New, intact, trusted and plausible data came in this cycle, shape (rows,).
+        #: True for each row with new, intact, trusted and plausible data in this cycle, shape (rows,).
         self.valid: npt.NDArray[np.bool_] = np.zeros(len(messages), np.bool_)
         self.joints_valid = False
-        #: Everything is trusted and nothing is on its way to trip: a perfect cycle changes nothing here.
+        #: True if all rows are trusted and all buckets are empty, so that a perfect cycle would change nothing here.
         self.settled = False
 
     @property
     def nodes_well(self) -> bool:
-        """Every message but the pendant's is trusted and not too old."""
+        """Return whether every message except that of the pendant is trusted, and so not too old."""
         return all(self.qualification[row].trusted for row in self._needed)
 
     def trusts(self, row: int) -> bool:
-        """Whether a row's sender is trusted."""
+        """Return whether the sender of a row is trusted."""
         return self.qualification[row].trusted
 
     def hears(self, row: int) -> bool:
-        """Return whether a row's data is younger than its timeout, trusted or not."""
+        """Return whether the data of a row is younger than its timeout, trusted or not."""
         return bool(self._image.age[row] < self._timeouts[row])
 
     def judge(self, cycle: int, memory: FaultMemory, swing: int | None = None) -> None:
-        """Judge a cycle that is not perfect, or follows one that was not.
+        """Check all rows in one cycle; it may be skipped for a perfect cycle while `settled` is True.
 
         Args:
-            swing: leg that swings while the other one stands, by its place in SIDES; None: none does.
+            cycle: number of the current cycle.
+            memory: fault memory in which diagnostics are raised.
+            swing: index in SIDES of the swing leg while the other leg stands; None if there is no swing leg.
         """
         image = self._image
         checks, ages = image.check.tolist(), image.age.tolist()
         rivals = rivals_of(image.refused, checks) if image.refused else frozenset()
         for row, why in image.refused:
             if why is Check.CONFLICT and row in rivals:
-                continue  # raised with its evidence below
+                continue  # `_judge_senders` raises it with its evidence
             dtc = self._invalid[row] if why is Check.INVALID else PENDING[why]
             value = ages[row] if ages[row] < NEVER else 0
             memory.raise_dtc(cycle, dtc, self._senders[row], value=value, confirmed=False)
@@ -118,10 +125,16 @@ class MessageMonitor:
         self.settled = image.all_fresh and not any(self._evidence) and all(q is SETTLED for q in self.qualification)
 
     def _judge_senders(self, cycle: int, memory: FaultMemory, row: int, rival: bool) -> bool:
-        """Return whether two senders of a row are confirmed in this cycle.
+        """Update the evidence of two senders of a row, raise a diagnostic for it, and return whether it is confirmed.
 
         Args:
-            rival: a frame of a second sender came beside the accepted one.
+            cycle: number of the current cycle.
+            memory: fault memory in which the diagnostic is raised.
+            row: row of the message.
+            rival: True if this cycle has a frame of a second sender in addition to the accepted frame.
+
+        Returns:
+            Whether two senders are confirmed in this cycle.
         """
         evidence = self._evidence[row] = suspect(self._evidence[row], rival=rival)
         confirmed = rival and evidence == FULL
@@ -144,12 +157,12 @@ class MessageMonitor:
     ) -> None:
         sender, two_senders = self._senders[row], self._judge_senders(cycle, memory, row, rival)
         fresh, late = check <= Check.SOME_LOST, age >= self._timeouts[row]
-        # What a frame says may be impossible: the way it came is good all the same.
+        # Impossible signal values do not reduce the trust, because the frame itself was transmitted correctly.
         good = (fresh or check >= Check.RANGE) and not rival
         now = self.qualification[row] = qualify(self.qualification[row], good=good, timed_out=late or two_senders)
         self._known[row] |= now.trusted
         confirmed = late and self._known[row] and self._confirms[row]
-        if confirmed and check is not Check.IMPLAUSIBLE:  # which `plausibility` tells
+        if confirmed and check is not Check.IMPLAUSIBLE:  # `plausibility` raises that diagnostic
             dtc = self._invalid[row] if check is Check.INVALID else CONFIRMED[check]
             text = f"{sender}: {dtc.meaning}; its data is {age} cycles old"
             in_swing = swing is not None and self._legs[row] == swing
@@ -164,23 +177,25 @@ class MessageMonitor:
             memory.raise_dtc(cycle, Dtc.E2E_LOSS_RATE, sender, value=now.bucket)
 
     def missing(self) -> set[str]:
-        """Senders that are not heard in time or not trusted yet."""
+        """Return the required senders that timed out or are not trusted yet."""
         return {self._senders[row] for row in self._needed if not self.qualification[row].trusted}
 
 
 def rivals_of(refused: Sequence[tuple[int, Check]], checks: Sequence[int]) -> frozenset[int]:
-    """Return the rows with a frame that the sender of another frame of the same cycle cannot have sent.
+    """Return the rows with evidence of a second sender in this cycle.
+
+    Such a row has at least two intact frames, one of which cannot come from the sender of the other.
 
     Args:
-        refused: frames that were not committed, row and why.
-        checks: `Check` of each row.
+        refused: row and check result of each rejected frame.
+        checks: `Check` of each row, shape (rows,).
     """
     intact = Counter(row for row, why in refused if why in _INTACT)
     for row in intact:
-        intact[row] += checks[row] <= _FRESH or checks[row] == Check.IMPLAUSIBLE  # which was committed, then refused
+        intact[row] += checks[row] <= _FRESH or checks[row] == Check.IMPLAUSIBLE  # committed first
     return frozenset(row for row, why in refused if why in _RIVAL and intact[row] > 1)
 
 
 def _leg(drive: str) -> int:
-    """Leg of a drive, by its place in SIDES."""
+    """Return the index in SIDES of the leg of a drive."""
     return SIDES.index(drive.split("_")[0].lower())

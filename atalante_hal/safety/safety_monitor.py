@@ -1,9 +1,9 @@
-"""Safety monitor: what is wrong in a cycle, which state the robot is in, and what follows for its drives and the assistance.
+"""Safety monitor: collects the faults of each cycle, runs the state machine, and sets torque limits and assistance factor.
 
-    process image, heartbeats, transceiver, plausibility, loop, controller -> fault memory -> supervisor -> state
+    process image, heartbeats, transceiver, plausibility, loop, controller -> fault memory -> state machine -> state
 
-The HAL moves the data of every cycle; this judges it. A perfect cycle of a robot that goes on as it did is not judged: nothing
-can have changed.
+The HAL transfers the data of each cycle, and the safety monitor evaluates it. The evaluation is skipped in a perfect cycle in
+which all its inputs are the same as before, because its result could not change.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Cycles within which every drive must have followed to OPERATION ENABLED.
+#: Time from START within which all drives must reach OPERATION ENABLED [cycles].
 ENABLE_CYCLES = 200
-#: Longest time FINISH_STEP goes on [cycles]: more than a step.
+#: Maximum duration of FINISH_STEP [cycles]; longer than a step.
 FINISH_STEP_CYCLES = 2000
 
-#: How `SafetyMonitor.reason` begins after a START that was refused, until the state changes.
+#: Prefix of `SafetyMonitor.reason` after a refused START, until the state changes.
 REFUSED = "START refused: "
 
 #: DBC names of the drives, in joint order.
@@ -43,20 +43,20 @@ DRIVE_NODES = tuple(joint.upper() for joint in JOINTS)
 _ENABLED = np.full(len(JOINTS), float(DriveState.OPERATION_ENABLED)).tobytes()
 _FAULTY = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 _S = SupervisorState
-#: States that START leads out of; in the others a press acknowledges and is over.
+#: States in which START can change the state. In all other states START only acknowledges faults.
 _STARTABLE = (_S.READY, _S.FULL_ASSIST, _S.HOLD, _S.LOWER, _S.FAULT)
 
 
 class SafetyMonitor:
-    """The judge of one HAL.
+    """Safety monitor of one HAL.
 
     Attributes:
-        reason: why the robot is in the state it is in, one sentence.
-        moving: the controller's torques are used.
-        step: of the controller, by its own count; None: it takes no steps.
-        start_wanted: cycles left for a START to change the state; 0: none was pressed since the last change.
-        enabling: drives are being enabled, and torque is sent to those that are.
-        lowered: drives that cannot hold.
+        reason: reason for the present state, one sentence for the operator.
+        moving: True if the controller's torques are sent to the drives.
+        step: step number reported by the controller; None if the controller does not walk.
+        start_wanted: cycles left in which a pressed START can change the state; 0 if no START is being processed.
+        enabling: True while drives are being enabled; a drive that is already enabled receives torque.
+        lowered: DBC names of the drives that cannot hold and are being lowered.
     """
 
     def __init__(
@@ -72,11 +72,19 @@ class SafetyMonitor:
         limiter: Limiter,
         commands: Commands,
     ) -> None:
-        """Begin in OFF.
+        """Create the safety monitor in state OFF.
 
         Args:
-            period: of the cycle [s].
-            state: the HAL's, whose supervisor, assistance factor and validity are written here.
+            network: messages and nodes of the DBC.
+            robot: limits and thresholds of the robot.
+            period: cycle time [s].
+            parts: record of the HAL; state, assistance factor, CRC errors and active diagnostics are written to its header.
+            state: state of the HAL; supervisor state, assistance factor and message validity are written to it.
+            image: process image of the fast messages.
+            plausibility: plausibility checks, run by the HAL before `judge`.
+            transceiver: source of bus faults.
+            limiter: torque limiter; its limit is derated with the drive temperatures.
+            commands: command frames, which receive the torque limit and the supervisor state.
         """
         self._robot, self._period, self._parts, self._state, self._image = robot, period, parts, state, image
         self._plausibility, self._transceiver = plausibility, transceiver
@@ -93,18 +101,18 @@ class SafetyMonitor:
         self.start_wanted = 0
         self.enabling = False
         self.lowered: set[str] = set()
-        self._steady = False  # a perfect cycle would change nothing
-        #: What loop and controller did wrong since the last `judge`: code, whether confirmed, value, sentence.
+        self._steady = False  # True if a perfect cycle would change nothing
+        #: Faults that loop and controller reported since the last `judge`: code, confirmed, value, text.
         self._reports: list[tuple[Dtc, bool, float, str]] = []
         self._ending = False
-        self._barred = False  # another HAL was heard before this one moved anything
-        self._assistance_factor = state.assistance_factor  # the operator's
-        self._leading = False  # the assistance factor is on its way to 1 or back
-        self._finish: tuple[int | None, int] = None, 0  # step in which FINISH_STEP began, last cycle it may go on
-        self._drives_judged = b""  # what the drives said when they were judged last
+        self._barred = False  # True if another HAL was detected in OFF or READY
+        self._assistance_factor = state.assistance_factor  # assistance factor set by the operator
+        self._leading = False  # True while the assistance factor ramps to 1 or back
+        self._finish: tuple[int | None, int] = None, 0  # step at the begin of FINISH_STEP, and its last cycle
+        self._drives_judged = b""  # drive states and temperatures of the last evaluation
 
     def judge(self) -> None:
-        """Judge the cycle whose frames were accepted and checked for plausibility, unless nothing can have changed."""
+        """Evaluate this cycle unless all inputs are unchanged; call it after the plausibility checks."""
         pendant = self._pendant
         if not (
             self._steady
@@ -117,7 +125,11 @@ class SafetyMonitor:
             self._judge()
 
     def accept(self, frames: Frames) -> None:
-        """Frames that are no cyclic message to the HAL: status, emergencies, and what nobody may send. Shape (n,)."""
+        """Process the frames that are not fast cyclic messages to the HAL: status, emergencies and unknown frames.
+
+        Args:
+            frames: received frames, shape (n,).
+        """
         unknown = self._heartbeats.accept(frames, self._state.cycle, self._state.vibration)
         if unknown:
             self._transceiver.foreign(frames[unknown])
@@ -125,32 +137,40 @@ class SafetyMonitor:
             self._steady = False
 
     def report(self, dtc: Dtc, text: str, confirmed: bool = True, value: float = 0.0, cycle: int | None = None) -> None:
-        """What loop or controller did wrong: told at once, judged in the next cycle. `cycle`: it happened in, default: this."""
+        """Report a fault of the loop or the controller: log it immediately, and evaluate it in the next `judge`.
+
+        Args:
+            dtc: diagnostic trouble code.
+            text: one sentence for the operator.
+            confirmed: True if the reaction is due, False if the diagnostic is pending.
+            value: measured value; quantity and unit depend on the code.
+            cycle: cycle in which the fault occurred; default: the current cycle.
+        """
         cycle = self._state.cycle if cycle is None else cycle
         self.memory.raise_dtc(cycle, dtc, "HAL", value=value, confirmed=confirmed, text=text)
         self._reports.append((dtc, confirmed, value, text))
         self._steady = False
 
     def end(self) -> None:
-        """The program ends: HOLD from the next cycle on."""
+        """Request HOLD from the next cycle on, because the program is ending."""
         self._ending, self._steady = True, False
 
     def look_for_heartbeats(self) -> None:
-        """See whether a status is late: asked now and then, because nothing comes that would say so."""
+        """Check for status messages that timed out; call it periodically, because a lost message triggers no other check."""
         if self._heartbeats.overdue(self._state.cycle):
             self._steady = False
 
     @property
     def crc_errors(self) -> int:
-        """Frames refused for their CRC so far."""
+        """Return the number of frames rejected so far because of a wrong CRC."""
         return self._image.crc_errors + self._heartbeats.image.crc_errors
 
     def missing(self) -> set[str]:
-        """Nodes that keep the robot out of READY: not heard in time or not trusted yet, no status, another DBC."""
+        """Return the nodes that prevent READY: timed out, not trusted yet, without a status message, or with a different DBC."""
         return self._message_monitor.missing() | self._heartbeats.missing()
 
     def _judge(self) -> None:
-        """Everything that is wrong in this cycle, and what the supervisor makes of it."""
+        """Raise all diagnostics of this cycle, run the state machine, and apply the reactions."""
         state, memory, cycle = self._state, self.memory, self._state.cycle
         message_monitor, pendant = self._message_monitor, self._pendant
         message_monitor.judge(cycle, memory, self._plausibility.swing)
@@ -213,7 +233,7 @@ class SafetyMonitor:
             return
         for node, drive in zip(DRIVE_NODES, state.drive_state.tolist(), strict=True):
             if drive in _FAULTY:
-                # The emergency message of a drive decides about its reaction.
+                # If the drive sent an emergency, the reaction follows from the emergency and not from the drive state.
                 explained = node in self._heartbeats.emergencies or node in self._heartbeats.cleared
                 if not explained and (nodes_well or state.supervisor is not _S.OFF):
                     memory.raise_dtc(state.cycle, Dtc.DRIVE_FAULT, node, value=drive)
@@ -236,7 +256,11 @@ class SafetyMonitor:
                 )
 
     def _judge_start(self, nodes_well: bool) -> None:
-        """From START until the supervisor moves, the drives take too long, or the start is refused."""
+        """Process a START until the state changes, the drives exceed `ENABLE_CYCLES`, or the start is refused.
+
+        Args:
+            nodes_well: True if every required node is trusted and has sent a status message.
+        """
         state, pendant = self._state, self._pendant
         if pendant.started and state.supervisor is not _S.ACTIVE and not self._ending:
             faulty = {
@@ -260,18 +284,22 @@ class SafetyMonitor:
 
     @property
     def hindered(self) -> bool:
-        """A confirmed diagnostic keeps the drives from being enabled."""
+        """Return whether a confirmed diagnostic prevents the drives from being enabled."""
         return worst(self.memory.confirmed) is not Reaction.INFO
 
     def _hindrance(self, nodes_well: bool) -> str:
-        """Return why a start that was asked for cannot go on, one sentence; empty: it can."""
+        """Return the reason why the START being processed must be refused, one sentence; empty if it may continue.
+
+        Args:
+            nodes_well: True if every required node is trusted and has sent a status message.
+        """
         pendant = self._pendant
         if self._ending:
             return "the program is ending"
         if pendant.stop_requested or not pendant.dead_man:
             return _WORDS[pendant.stop_requested]
         if self._state.supervisor in (_S.LOWER, _S.FAULT):
-            return ""  # START acknowledges the cause, which may take some cycles to go
+            return ""  # START acknowledges the fault, which may take some cycles to clear
         if self.hindered:
             return self.memory.text_of(self.memory.worst())
         return "" if nodes_well else f"not heard or not trusted yet: {', '.join(sorted(self.missing()))}"
@@ -287,7 +315,7 @@ class SafetyMonitor:
     def _enter(self, before: SupervisorState, after: SupervisorState, reasons: frozenset[Dtc]) -> None:
         state, memory = self._state, self.memory
         state.supervisor = after
-        # One press, one move.
+        # One START changes the state only once.
         self.start_wanted = 0
         self._pendant.forget_press()
         self.moving = after in MOVING
@@ -308,7 +336,7 @@ class SafetyMonitor:
         self.memory.events.append(Event(state.cycle, after.name, text, severity, value=after))
 
     def _lead_assistance(self) -> None:
-        """The operator's assistance factor, and what FULL_ASSIST makes of it."""
+        """Set the assistance factor: the operator's value, or a ramp to 1 in FULL_ASSIST and FINISH_STEP and back."""
         state, wanted = self._state, self._pendant.assistance_factor
         if wanted is not None:
             self._assistance_factor = wanted
@@ -322,7 +350,7 @@ class SafetyMonitor:
             state.assistance_factor = target
 
     def _let_down(self) -> None:
-        """Joints whose drives cannot hold, while LOWER or FAULT lasts."""
+        """Update `lowered`: in LOWER and FAULT the drives with a confirmed LOWER diagnostic, otherwise none."""
         if self._state.supervisor in (_S.LOWER, _S.FAULT):
             lower = frozenset(dtc for dtc in self.memory.confirmed if dtc.reaction is Reaction.LOWER)
             self.lowered.update(node for node in self.memory.nodes_of(lower) if node in DRIVE_NODES)
@@ -330,5 +358,5 @@ class SafetyMonitor:
             self.lowered.clear()
 
 
-#: What the operator did, by whether it was a request.
+#: Reason of an operator stop, indexed by whether STOP or HOLD was requested.
 _WORDS = ("the dead-man was released or the pendant is lost", "the operator asked to stop")

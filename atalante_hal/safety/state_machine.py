@@ -1,7 +1,8 @@
-"""The supervisor: which state the robot is in, as a pure function of the last state and what holds this cycle.
+"""State machine of the robot: the next state as a pure function of the last state and the conditions of this cycle.
 
-Moves to a worse state are automatic, recovery is the operator's. A standing patient cannot be dropped: the safe state is
-HOLD, where every drive holds its position by itself. `SUPERVISOR.md` is the table of this function.
+Transitions to a worse state are automatic. Recovery requires the operator's START. The safe state is HOLD, in which every drive
+holds its position without commands of the HAL, because a standing patient would fall if the drives were switched off.
+`SUPERVISOR.md` is the generated table of this function.
 """
 
 from __future__ import annotations
@@ -14,24 +15,24 @@ from atalante_hal.types import SupervisorState
 
 @dataclass(frozen=True)
 class Conditions:
-    """What holds in a cycle: the confirmed diagnostics, and the facts a start or a stop hangs on."""
+    """Inputs of the state machine in one cycle: confirmed diagnostics, and the conditions for a start or a stop."""
 
     diagnostics: frozenset[Dtc] = frozenset()
-    nodes_well: bool = False  # every node was heard, speaks this DBC and is trusted
+    nodes_well: bool = False  # every required node is trusted and has sent its status
     drives_enabled: bool = False  # all twelve drives are in OPERATION ENABLED
-    dead_man: bool = False  # the pendant is heard and its dead-man is pressed
-    stop_requested: bool = False  # the operator, or the program's end, asks for STOP or HOLD
-    start_wanted: bool = False  # the operator pressed START and the drives are being enabled for it
-    step_finished: bool = False  # since FINISH_STEP began the controller has changed feet, or may not go on any longer
+    dead_man: bool = False  # the pendant has not timed out and its dead-man is pressed
+    stop_requested: bool = False  # the operator requested STOP or HOLD, or the program is ending
+    start_wanted: bool = False  # START was pressed and the drives are being enabled
+    step_finished: bool = False  # the stance leg has changed since FINISH_STEP began, or its time limit is over
 
 
 _OFF, _READY, _ACTIVE = SupervisorState.OFF, SupervisorState.READY, SupervisorState.ACTIVE
 _FULL_ASSIST, _FINISH_STEP = SupervisorState.FULL_ASSIST, SupervisorState.FINISH_STEP
 _HOLD, _LOWER, _FAULT = SupervisorState.HOLD, SupervisorState.LOWER, SupervisorState.FAULT
 
-#: States in which the controller's torques are used.
+#: States in which the HAL sends the controller's torques to the drives.
 MOVING = frozenset({_ACTIVE, _FULL_ASSIST, _FINISH_STEP})
-#: What a reaction makes of a robot that moves; a better state than the present one is never taken.
+#: State that a reaction demands of a moving robot. `_move` ignores it if it is better than the present state.
 _STATE_OF = {
     Reaction.INFO: _ACTIVE,
     Reaction.NOT_READY: _ACTIVE,
@@ -44,14 +45,21 @@ _STATE_OF = {
 
 
 def next_state(state: SupervisorState, conditions: Conditions) -> tuple[SupervisorState, frozenset[Dtc]]:
-    """State of this cycle, and the diagnostics that demand the worst: why it is not a better one.
+    """Return the state of this cycle and the diagnostics that cause it.
 
-    - any -> FAULT, LOWER when a diagnostic demands it (LOWER: of a robot that is not OFF or READY)
-    - ACTIVE, FULL_ASSIST, FINISH_STEP -> what the worst diagnostic demands, if that is worse; a robot that moves without
-      dead-man, or against the operator's STOP, has `OPERATOR_STOP`
+    - any state -> FAULT, or LOWER, if a diagnostic demands it (LOWER only from a state other than OFF and READY)
+    - ACTIVE, FULL_ASSIST, FINISH_STEP -> the state that the worst diagnostic demands, if it is worse than the present state; in
+      these states a released dead-man or the operator's STOP raises `OPERATOR_STOP`
     - FINISH_STEP -> HOLD when the step is finished
-    - OFF <-> READY as the nodes are well, and nothing keeps the robot from being ready, or not
-    - by START alone: READY, HOLD, FULL_ASSIST -> ACTIVE; LOWER -> HOLD; FAULT -> LOWER or HOLD; each when its cause is gone
+    - OFF -> READY if all nodes are well and no diagnostic demands a reaction; otherwise READY -> OFF
+    - only by START, after the cause has cleared: READY, HOLD, FULL_ASSIST -> ACTIVE; LOWER -> HOLD; FAULT -> LOWER or HOLD
+
+    Args:
+        state: state of the last cycle.
+        conditions: diagnostics and other conditions of this cycle.
+
+    Returns:
+        The next state, and the diagnostics that demand the most severe reaction; these are empty if that reaction is INFO.
     """
     diagnostics = conditions.diagnostics
     if state in MOVING and (conditions.stop_requested or not conditions.dead_man):
@@ -81,4 +89,4 @@ def _move(state: SupervisorState, reaction: Reaction, facts: Conditions) -> Supe
         return _LOWER if state is not _FAULT or acknowledged else _FAULT
     if state is _HOLD:
         return _ACTIVE if may_start else _HOLD
-    return _HOLD if acknowledged else state  # LOWER and FAULT, whose cause is gone
+    return _HOLD if acknowledged else state  # LOWER or FAULT after its cause has cleared

@@ -1,1 +1,1 @@
-"""CAN FD frames and what is in them: process image, signal codec, E2E protection, CiA 402 drive states."""
+"""CAN FD frames and their contents: process image, signal codec, E2E protection, CiA 402 drive states."""

@@ -1,7 +1,8 @@
-"""CiA 402 power drive state machine, as a pure function shared by the HAL (which commands it) and the emulated drive.
+"""CiA 402 power drive state machine as a pure function, used by the HAL and by the emulated drive.
 
-Names and transitions after IEC 61800-7-201 (CiA 402-2); mode of operation is cyclic synchronous torque. Quick stop option
-code is 6: the drive stays in QUICK STOP ACTIVE and holds position, which is this robot's latched local hold.
+Names and transitions follow IEC 61800-7-201 (CiA 402-2). The mode of operation is cyclic synchronous torque. The quick stop
+option code is 6: after a quick stop the drive stays in QUICK STOP ACTIVE and holds its position. This is the latched local hold
+of the robot.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class Controlword(IntEnum):
 
 _S, _C = DriveState, Controlword
 
-#: (state, controlword) -> next state, for every command that moves; all others stay.
+#: (state, controlword) -> next state. A pair that is not listed leaves the state unchanged.
 TRANSITIONS: dict[tuple[DriveState, Controlword], DriveState] = {
     (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN): _S.READY_TO_SWITCH_ON,
     (_S.READY_TO_SWITCH_ON, _C.SWITCH_ON): _S.SWITCHED_ON,
@@ -54,7 +55,7 @@ TRANSITIONS: dict[tuple[DriveState, Controlword], DriveState] = {
     (_S.FAULT, _C.FAULT_RESET): _S.SWITCH_ON_DISABLED,
 }
 
-#: Transitions a drive makes by itself: 1 when it has started, 14 when its fault reaction is complete.
+#: Automatic transitions of CiA 402: 1 after the start of the drive, 14 after its fault reaction.
 AUTOMATIC: dict[DriveState, DriveState] = {
     _S.NOT_READY_TO_SWITCH_ON: _S.SWITCH_ON_DISABLED,
     _S.FAULT_REACTION_ACTIVE: _S.FAULT,
@@ -62,11 +63,18 @@ AUTOMATIC: dict[DriveState, DriveState] = {
 
 
 def next_state(state: DriveState, controlword: int, *, latched: bool = False) -> DriveState:
-    """State after one controlword; an unknown or not applicable command leaves the state as it is.
+    """Return the state of a drive after one controlword.
+
+    A controlword that is unknown, or has no transition in this state, leaves the state unchanged.
 
     Args:
-        latched: the drive stopped by itself and nobody has acknowledged it with QUICK_STOP yet; ENABLE_OPERATION
-            does not leave QUICK STOP ACTIVE then, so that a HAL which never noticed the stop cannot undo it.
+        state: present state.
+        controlword: received controlword.
+        latched: True if the drive stopped without a command and the HAL has not yet acknowledged the stop with QUICK_STOP.
+            ENABLE_OPERATION then does not leave QUICK STOP ACTIVE, so that a HAL cannot cancel a stop it has not detected.
+
+    Returns:
+        The next state.
     """
     if latched and state is DriveState.QUICK_STOP_ACTIVE and controlword == Controlword.ENABLE_OPERATION:
         return state
@@ -76,7 +84,7 @@ def next_state(state: DriveState, controlword: int, *, latched: bool = False) ->
         return state
 
 
-#: The way up: what to command in a state to come one step nearer to OPERATION ENABLED.
+#: State -> controlword that brings the drive one transition closer to OPERATION ENABLED.
 TOWARDS_OPERATION: dict[int, Controlword] = {
     _S.SWITCH_ON_DISABLED: _C.SHUTDOWN,
     _S.READY_TO_SWITCH_ON: _C.SWITCH_ON,
@@ -88,5 +96,12 @@ TOWARDS_OPERATION: dict[int, Controlword] = {
 
 
 def controlword_towards_operation(state: int) -> Controlword:
-    """Next command on the way to OPERATION ENABLED; a state without one (booting, fault reaction) gets DISABLE_VOLTAGE."""
+    """Return the next controlword on the path to OPERATION ENABLED.
+
+    Args:
+        state: present state of the drive, a value of `DriveState`.
+
+    Returns:
+        The controlword; DISABLE_VOLTAGE in a state without such a command (booting, fault reaction).
+    """
     return TOWARDS_OPERATION.get(state, Controlword.DISABLE_VOLTAGE)

@@ -1,7 +1,7 @@
-"""Array codec: every signal of a set of messages decoded or encoded in one pass of machine code.
+"""Array codec: decodes or encodes all signals of a list of messages in one pass of compiled code.
 
-The plan (word, place, mask, range, factor) is made from the DBC once. It works because no signal crosses a 64-bit word of the
-payload: a signal is one word, a shift and a mask, one add and one multiply.
+The decoding plan (word, shift, mask, range, factor of each signal) is built once from the DBC. No signal crosses a 64-bit word of
+the payload. So a signal is decoded with one word, one shift, one mask, one addition and one multiplication.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, WORDS, Frames, new_frame
 Vector = npt.NDArray[np.float64]
 Words = npt.NDArray[np.int64]
 
-#: Rows of a plan, one column a signal: where it stands and which codes it may have.
+#: Rows of the plan, with one column per signal: payload word, shift, mask, largest code, range of codes, invalid code.
 WORD, PLACE, MASK, LARGEST, LOW, HIGH, INVALID = range(7)
-#: Rows of the scales: what a code means, (code + base) * factor + offset.
+#: Rows of the scales, with one column per signal: value = (code + base) * factor + offset.
 BASE, FACTOR, OFFSET = range(3)
-#: In the place of an invalid code, or of a signal: there is none.
+#: Marker instead of an invalid code or a signal index: there is none.
 NO_CODE = -1
-#: What `read_row` found.
+#: Results of `read_row`: all signals in range, a signal out of range, a signal with its invalid code.
 INSIDE, OUTSIDE, SAYS_INVALID = range(3)
-#: Adding this to a float and taking it away again rounds it to an integer.
+#: Adding this number to a float64 and subtracting it again rounds the float to an integer.
 _ROUND = 1.5 * 2.0**52
-_LONGEST = 51  # bits such an integer can have
+_LONGEST = 51  # largest signal length in bits that this rounding supports
 
 
 def group_of(signal: str) -> str:
-    """Quantity a signal name ends in: `FH_TargetTorque` is TargetTorque, `QuaternionW` is Quaternion."""
+    """Return the quantity in a signal name: TargetTorque for `FH_TargetTorque`, Quaternion for `QuaternionW`."""
     return signal.rsplit("_", 1)[-1].rstrip("WXYZ")
 
 
 class Codec:
-    """Compiled plan for a fixed list of messages; row i of the frames is messages[i].
+    """Compiled codec for a fixed list of messages; row i of the frames is messages[i].
 
-    Decoded values are ordered signed signals first, then by quantity, then by frame id, whatever the rows' order: the
-    positions of twelve joint states are one contiguous slice in joint order.
+    The decoded values are ordered by sign (signed signals first), then by quantity, then by frame id, independent of the order of
+    the rows. So the positions of the twelve joints are one contiguous slice in joint order.
     """
 
     def __init__(self, messages: Sequence[Message]) -> None:
@@ -55,12 +55,12 @@ class Codec:
         groups = dict.fromkeys((not s.signed, group_of(s.name)) for _, _, s in entries)
         order = {key: place for place, key in enumerate(sorted(groups, key=lambda key: key[0]))}
         entries.sort(key=lambda e: (order[not e[2].signed, group_of(e[2].name)], e[1].frame_id, e[2].start))
-        #: (message, signal) in the order of the decoded values.
+        #: (message, signal) pairs in the order of the decoded values.
         self.signals: tuple[tuple[Message, Signal], ...] = tuple((m, s) for _, m, s in entries)
         self.size = len(entries)
         self._index = {(m.name, s.name): i for i, (m, s) in enumerate(self.signals)}
         self._groups = [group_of(s.name) for _, s in self.signals]
-        #: Row of each decoded value.
+        #: Frame row of each decoded value, shape (size,).
         self.row_of = np.array([row for row, _, _ in entries], dtype=np.intp)
         self._compile([s for _, _, s in entries])
 
@@ -71,27 +71,31 @@ class Codec:
             mask, largest = (1 << s.length) - 1, (1 << s.length - s.signed) - 1
             invalid = NO_CODE if s.invalid_raw is None else s.invalid_raw
             plan.append((row * WORDS + 1 + s.start // 64, s.start % 64, mask, largest, low, high, invalid))
-            # An offset that is a whole number of codes is added to the code, which is exact.
+            # If the offset is a whole number of codes, it is added to the code, because integer addition is exact.
             code = s.offset / s.factor
             exact = code == round(code) and round(code) * s.factor == s.offset
             scales.append((code, s.factor, 0.0) if exact else (0.0, s.factor, s.offset))
-        #: For the loops below: shapes (7, size) and (3, size).
+        #: Plan and scales of the compiled loops below, shapes (7, size) and (3, size).
         self.plan: Words = np.array(plan, np.int64).T.copy()
         self.scales: Vector = np.array(scales).T.copy()
-        #: Payload words that carry a signal.
+        #: Indices of the 64-bit words that contain a signal.
         self.words: Words = np.unique(self.plan[WORD])
-        #: Raw code of every signal, of the last `decode` or `encode`.
+        #: Raw code of each signal in the last `decode` or `encode`, shape (size,).
         self.codes = np.zeros(self.size, np.int64)
         self._decode, self._encode = compiled(decode), compiled(encode)
-        #: Signals of row r: signals_by_row[row_begins[r] : row_begins[r + 1]], by their place in the decoded values.
+        #: Signal indices of row r in the decoded values: signals_by_row[row_begins[r] : row_begins[r + 1]].
         self.signals_by_row: Words = np.argsort(self.row_of, kind="stable").astype(np.int64)
         self.row_begins: Words = np.searchsorted(self.row_of[self.signals_by_row], np.arange(len(self.messages) + 1))
 
     def index(self, message: str, signal: str) -> int:
-        """Place of one signal in the decoded values.
+        """Return the index of one signal in the decoded values.
+
+        Args:
+            message: name of the message.
+            signal: name of the signal.
 
         Raises:
-            KeyError: with what there is.
+            KeyError: If there is no such signal; the error lists the messages.
         """
         try:
             return self._index[message, signal]
@@ -99,10 +103,13 @@ class Codec:
             raise KeyError(f"no signal {message}.{signal}; messages are {', '.join(self.rows)}") from None
 
     def slice(self, group: str) -> slice:
-        """Where the values of a quantity are, of all messages by frame id; see `group_of`.
+        """Return the slice of a quantity in the decoded values, with all messages in the order of their frame ids.
+
+        Args:
+            group: name of the quantity, see `group_of`.
 
         Raises:
-            KeyError: no such quantity, or it is signed in one message and unsigned in another.
+            KeyError: If there is no such quantity, or if it is signed in one message and unsigned in another.
         """
         places = [i for i, name in enumerate(self._groups) if name == group]
         if not places or places[-1] - places[0] + 1 != len(places):
@@ -110,7 +117,7 @@ class Codec:
         return slice(places[0], places[-1] + 1)
 
     def template(self) -> Frames:
-        """Frames of these messages with identifier, length and flags set and an empty payload. Shape (rows,)."""
+        """Return new frames with identifier, length and flags of each message and an empty payload, shape (rows,)."""
         frames = new_frames(len(self.messages))
         for row, message in enumerate(self.messages):
             frames[row]["can_id"], frames[row]["len"] = message.frame_id, message.length
@@ -118,43 +125,63 @@ class Codec:
         return frames
 
     def decode(self, frames: Frames, out: Vector) -> bool:
-        """Physical values of all signals of the rows. Shape (size,), DBC units.
+        """Decode the physical values of all signals.
+
+        Args:
+            frames: one frame per message, shape (rows,).
+            out: output for the physical values, shape (size,), in DBC units.
 
         Returns:
-            Whether every signal is inside its DBC range (an invalid code is outside it).
+            Whether every signal is inside its DBC range; an invalid code is outside.
         """
         return self._decode(frames.view(np.int64), self.plan, self.scales, self.codes, out)
 
     def rows_outside(self) -> list[int]:
-        """Rows with a signal outside its range, of the last `decode`."""
+        """Return the rows that had a signal outside its range in the last `decode`."""
         outside = (self.codes < self.plan[LOW]) | (self.codes > self.plan[HIGH])
         return sorted(set(self.row_of[outside].tolist()))
 
     def encode(self, values: Vector, frames: Frames) -> None:
-        """Write physical values into the payloads; reserved bits become 0. Shape (size,), DBC units.
+        """Encode physical values into the payloads; bits without a signal become 0 in each word that contains a signal.
 
-        A value outside its range is sent as the nearest valid one, NaN as the signal's invalid code.
+        A value outside its range is encoded as the nearest valid code, and NaN as the invalid code of its signal.
+
+        Args:
+            values: physical values, shape (size,), in DBC units.
+            frames: frames whose payloads are overwritten, shape (rows,).
 
         Raises:
-            ValueError: NaN for a signal without an invalid code.
+            ValueError: If the value of a signal without an invalid code is NaN.
         """
         words = frames.view(np.int64)
         self.require_code(self._encode(values, self.plan, self.scales, self.words, self.codes, words))
 
     def require_code(self, nameless: int) -> None:
-        """Raise `ValueError` for what `encode` returned, unless every value had a code."""
+        """Raise an error if the function `encode` returned the index of a signal that it could not encode.
+
+        Args:
+            nameless: result of the function `encode`: `NO_CODE`, or the index of a signal.
+
+        Raises:
+            ValueError: If it is the index of a signal.
+        """
         if nameless != NO_CODE:
             message, signal = self.signals[nameless]
             raise ValueError(f"{message.name}.{signal.name} is NaN and has no invalid code in the DBC")
 
 
 def decode(words: Words, plan: Words, scales: Vector, codes: Words, values: Vector) -> bool:
-    """Raw codes and physical values of all signals; returns whether every code is in its range.
+    """Decode raw codes and physical values of all signals.
 
     Args:
-        words: flat view of the frames, shape (rows * 9,).
-        plan, scales: of the codec.
-        codes, values: shape (size,), rewritten.
+        words: frames as a flat array of 64-bit words, shape (rows * 9,).
+        plan: decoding plan of the codec, shape (7, size).
+        scales: scales of the codec, shape (3, size).
+        codes: output for the raw codes, shape (size,).
+        values: output for the physical values, shape (size,), in DBC units.
+
+    Returns:
+        Whether every code is in its range.
     """
     inside = read_codes(words, plan, codes)
     scale(codes, scales, values)
@@ -162,7 +189,16 @@ def decode(words: Words, plan: Words, scales: Vector, codes: Words, values: Vect
 
 
 def read_codes(words: Words, plan: Words, codes: Words) -> bool:
-    """First half of decoding: raw codes; returns whether every one is in its range."""
+    """Read the raw codes of all signals, the first half of `decode`.
+
+    Args:
+        words: frames as a flat array of 64-bit words, shape (rows * 9,).
+        plan: decoding plan of the codec, shape (7, size).
+        codes: output for the raw codes, shape (size,).
+
+    Returns:
+        Whether every code is in its range.
+    """
     word, place, mask, largest = plan[WORD], plan[PLACE], plan[MASK], plan[LARGEST]
     low, high = plan[LOW], plan[HIGH]
     inside = True
@@ -173,23 +209,42 @@ def read_codes(words: Words, plan: Words, codes: Words) -> bool:
 
 
 def signed(raw: int, mask: int, largest: int) -> int:
-    """The code of raw bits: of a signed signal, what is larger than its largest code is negative."""
+    """Return the code of the raw bits of a signal, with the sign of two's complement.
+
+    Args:
+        raw: raw bits, right-aligned.
+        mask: all bits of the signal set, right-aligned.
+        largest: largest code of the signal; larger raw bits are negative codes.
+    """
     return raw - mask - 1 if raw > largest else raw
 
 
 def scale(codes: Words, scales: Vector, values: Vector) -> None:
-    """Second half of decoding: raw codes to physical values."""
+    """Convert the raw codes of all signals to physical values, the second half of `decode`.
+
+    Args:
+        codes: raw codes, shape (size,).
+        scales: scales of the codec, shape (3, size).
+        values: output for the physical values, shape (size,), in DBC units.
+    """
     base, factor, offset = scales[BASE], scales[FACTOR], scales[OFFSET]
     for i in range(len(codes)):
         values[i] = (codes[i] + base[i]) * factor[i] + offset[i]
 
 
 def read_row(words: Words, behind: int, signals: Words, plan: Words, codes: Words) -> int:
-    """`read_codes` of one row alone: `INSIDE`, `OUTSIDE`, or `SAYS_INVALID`: outside, and a signal carries its invalid code.
+    """Read the raw codes of one frame, as `read_codes` does for all frames.
 
     Args:
-        behind: how many words behind its place in the plan the row stands.
-        signals: those of the row, places in the decoded values.
+        words: frames as a flat array of 64-bit words.
+        behind: offset of the frame from its row in the plan [words].
+        signals: indices of the signals of the row in the decoded values.
+        plan: decoding plan of the codec, shape (7, size).
+        codes: output for the raw codes, shape (size,); only those of the row are written.
+
+    Returns:
+        `INSIDE` if all codes are in range, `SAYS_INVALID` if a code is out of range and a signal has its invalid code, otherwise
+        `OUTSIDE`.
     """
     inside, invalid = True, False
     for i in signals:
@@ -203,25 +258,39 @@ def read_row(words: Words, behind: int, signals: Words, plan: Words, codes: Word
 
 
 def scale_row(codes: Words, signals: Words, scales: Vector, values: Vector) -> None:
-    """`scale` of some signals alone."""
+    """Convert the raw codes of selected signals to physical values, as `scale` does for all signals.
+
+    Args:
+        codes: raw codes, shape (size,).
+        signals: indices of the signals in the decoded values.
+        scales: scales of the codec, shape (3, size).
+        values: output for the physical values, shape (size,), in DBC units; only those of `signals` are written.
+    """
     for i in signals:
         values[i] = (codes[i] + scales[BASE, i]) * scales[FACTOR, i] + scales[OFFSET, i]
 
 
 def encode(values: Vector, plan: Words, scales: Vector, targets: Words, codes: Words, words: Words) -> int:
-    """Physical values into the payload words; values outside their range as the nearest valid code, NaN as the invalid one.
+    """Encode physical values into the payload words.
+
+    A value outside its range is encoded as the nearest valid code, and NaN as the invalid code of its signal.
 
     Args:
-        targets: payload words that carry a signal; their other bits become 0.
-        words: flat view of the frames, shape (rows * 9,).
+        values: physical values, shape (size,), in DBC units.
+        plan: decoding plan of the codec, shape (7, size).
+        scales: scales of the codec, shape (3, size).
+        targets: indices of the words that contain a signal; their other bits become 0.
+        codes: output for the raw codes, shape (size,).
+        words: frames as a flat array of 64-bit words, shape (rows * 9,); overwritten.
 
     Returns:
-        `NO_CODE`; or a signal that is NaN and has no invalid code, and then nothing was written.
+        `NO_CODE` if all values were encoded; otherwise the index of a signal that is NaN and has no invalid code. In that case no
+        word is written.
     """
     base, factor, offset = scales[BASE], scales[FACTOR], scales[OFFSET]
     low, high, invalid = plan[LOW], plan[HIGH], plan[INVALID]
     for i in range(len(codes)):
-        # Rounds to even; infinities and NaN stay what they are.
+        # This rounds half to even and keeps infinities and NaN.
         code = ((values[i] - offset[i]) / factor[i] + (_ROUND - base[i])) - _ROUND
         if low[i] <= code <= high[i]:
             codes[i] = int(code)

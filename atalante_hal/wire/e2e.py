@@ -1,8 +1,8 @@
-"""AUTOSAR E2E Profile 5: a CRC over payload and Data ID, and an alive counter, in every frame.
+"""AUTOSAR E2E Profile 5: protects each frame with an alive counter and a CRC over payload and Data ID.
 
-The CRC is CRC-16/CCITT-FALSE (polynomial 0x1021, start 0xFFFF) over the payload behind the CRC field, then the Data ID low byte
-first: a frame that is damaged, cut, or sent under another identifier does not pass. The counter tells lost, repeated and
-replayed frames (AUTOSAR PRS_E2EProtocol, Profile 5).
+The CRC is CRC-16/CCITT-FALSE (polynomial 0x1021, initial value 0xFFFF) over the payload after the CRC field, followed by the Data
+ID, low byte first. It detects frames that are damaged, truncated, or sent with a wrong identifier. The counter detects lost,
+repeated and replayed frames (AUTOSAR PRS_E2EProtocol, Profile 5).
 """
 
 from __future__ import annotations
@@ -22,55 +22,62 @@ Octets = npt.NDArray[np.uint8]
 Words = npt.NDArray[np.int64]
 
 CRC_START = 0xFFFF
-#: Offsets in the payload.
+#: Length of the CRC field at the start of the payload, and offset of the alive counter in the payload [bytes].
 CRC_BYTES = 2
 COUNTER_BYTE = 2
-#: Largest step of the counter that still counts as fresh data: up to four frames in a row may be lost.
+#: Largest counter step that is accepted as new data: up to four frames in a row may be lost.
 MAX_DELTA = 5
 
 
 class Check(IntEnum):
-    """Result of checking one message in one cycle; `fresh` says whether its data may be used as new."""
+    """Result of checking one message in one cycle."""
 
     OK = 0
-    SOME_LOST = 1  # fresh, but 1 to 4 frames before it are missing
-    NO_DATA = 2  # nothing came
-    REPEATED = 3  # counter has not moved, and the frame is the one accepted last
-    CONFLICT = 4  # counter has not moved, and the frame has other bytes than the one accepted last
-    WRONG_SEQUENCE = 5  # counter jumped: replayed, or more than 4 lost
-    CRC = 6  # damaged, or another message's data
-    LENGTH = 7  # length or frame format is not the DBC's
-    RANGE = 8  # a signal is outside its range
-    INVALID = 9  # a signal carries its invalid code: the node says that it has no value
-    IMPLAUSIBLE = 10  # the frame is right and what it says cannot be true
+    SOME_LOST = 1  # new data, but 1 to 4 frames before it are missing
+    NO_DATA = 2  # no frame was received
+    REPEATED = 3  # same counter and same bytes as the last accepted frame
+    CONFLICT = 4  # same counter as the last accepted frame, but other bytes
+    WRONG_SEQUENCE = 5  # the counter jumped: a replayed frame, or more than 4 frames lost
+    CRC = 6  # damaged frame, or data of another message
+    LENGTH = 7  # length or frame format differs from the DBC
+    RANGE = 8  # a signal is outside its DBC range
+    INVALID = 9  # a signal has its invalid code: the node has no value for it
+    IMPLAUSIBLE = 10  # the frame is correct, but its values are physically impossible
 
     @property
     def fresh(self) -> bool:
-        """The data is new and may be used."""
+        """Return whether the data is new and may be used."""
         return self <= Check.SOME_LOST
 
 
 def data_id_bytes(data_id: int) -> bytes:
-    """Data ID as it enters the CRC: low byte first."""
+    """Return the Data ID as the two bytes that enter the CRC, low byte first."""
     return data_id.to_bytes(2, "little")
 
 
 def crc(protected: bytes | memoryview, data_id: bytes) -> int:
-    """CRC of a frame.
+    """Return the CRC of a frame.
 
     Args:
-        protected: the payload from behind the CRC field to its end.
-        data_id: of `data_id_bytes`.
+        protected: payload after the CRC field, to its end.
+        data_id: result of `data_id_bytes`.
     """
     return crc_hqx(data_id, crc_hqx(protected, CRC_START))
 
 
-#: What a byte at the head of the CRC makes of it.
+#: CRC remainder of each byte value, for the table-driven CRC.
 _TABLE = np.array([crc_hqx(bytes([octet]), 0) for octet in range(256)], np.int64)
 
 
 def protected_spans(messages: Sequence[Message]) -> Words:
-    """Where the payload of each row of frames begins and ends, and its Data ID. Shape (rows, 3)."""
+    """Return begin and end of the payload of each row in bytes, and its Data ID.
+
+    Args:
+        messages: message of each row of frames.
+
+    Returns:
+        Byte offsets in the flat view of the frames and Data ID, shape (rows, 3).
+    """
     spans = []
     for row, message in enumerate(messages):
         begin = row * FRAME_BYTES + HEADER_BYTES
@@ -79,7 +86,14 @@ def protected_spans(messages: Sequence[Message]) -> Words:
 
 
 def checksum(octets: Octets, begin: int, end: int, data_id: int) -> int:
-    """CRC of the payload `octets[begin:end]`, as `crc`: for loops that are compiled."""
+    """Return the CRC of a payload, as `crc` does, in a form that can be compiled.
+
+    Args:
+        octets: frames as a flat array of bytes.
+        begin: offset of the first byte of the payload.
+        end: offset after the last byte of the payload.
+        data_id: Data ID of the message, 16 bits.
+    """
     remainder = CRC_START
     for i in range(begin + CRC_BYTES, end):
         remainder = (remainder << 8 & 0xFFFF) ^ _TABLE[remainder >> 8 ^ octets[i]]
@@ -88,12 +102,12 @@ def checksum(octets: Octets, begin: int, end: int, data_id: int) -> int:
 
 
 def intact(octets: Octets, spans: Words, counters: Words) -> bool:
-    """Whether every row of frames carries its counter and the CRC of what it says.
+    """Return whether every row of frames has the expected counter and a correct CRC.
 
     Args:
-        octets: flat view of the frames, shape (rows * 72,).
-        spans: of `protected_spans`.
-        counters: shape (rows,).
+        octets: frames as a flat array of bytes, shape (rows * 72,).
+        spans: result of `protected_spans`, shape (rows, 3).
+        counters: expected counter of each row, shape (rows,).
     """
     for row in range(len(spans)):
         begin, end, data_id = spans[row]
@@ -108,7 +122,13 @@ def intact(octets: Octets, spans: Words, counters: Words) -> bool:
 
 
 def protect(octets: Octets, spans: Words, counters: Words) -> None:
-    """Write counter and CRC into every row of frames. Arguments as for `intact`."""
+    """Write counter and CRC into every row of frames.
+
+    Args:
+        octets: frames as a flat array of bytes, shape (rows * 72,); overwritten.
+        spans: result of `protected_spans`, shape (rows, 3).
+        counters: counter of each row, shape (rows,).
+    """
     for row in range(len(spans)):
         begin, end, data_id = spans[row]
         octets[begin + COUNTER_BYTE] = counters[row]
@@ -116,7 +136,7 @@ def protect(octets: Octets, spans: Words, counters: Words) -> None:
         octets[begin], octets[begin + 1] = crc & 0xFF, crc >> 8
 
 
-#: In the place of the counter that is expected: nothing was ever received.
+#: Marker instead of an expected counter: no frame has been received yet.
 NOTHING = -1
 _OK, _SOME_LOST, _REPEATED, _WRONG_SEQUENCE = map(
     int, (Check.OK, Check.SOME_LOST, Check.REPEATED, Check.WRONG_SEQUENCE)
@@ -124,10 +144,14 @@ _OK, _SOME_LOST, _REPEATED, _WRONG_SEQUENCE = map(
 
 
 def judge_counter(expected: int, received: int) -> int:
-    """As `check_counter`, the result as a plain integer: for loops that are compiled.
+    """Check an alive counter, as `check_counter` does, in a form that can be compiled.
 
     Args:
-        expected: one more than the last counter accepted, or `NOTHING`.
+        expected: last accepted counter plus 1, modulo 256, or `NOTHING`.
+        received: counter of the received frame, 0 to 255.
+
+    Returns:
+        Value of `Check` as a plain integer.
     """
     skipped = received - expected & 0xFF
     if expected == NOTHING or skipped == 0:
@@ -138,37 +162,46 @@ def judge_counter(expected: int, received: int) -> int:
 
 
 def check_counter(last: int | None, received: int) -> Check:
-    """Judge an alive counter against the last one accepted; None: nothing was received before."""
+    """Check an alive counter against the last accepted counter.
+
+    Args:
+        last: last accepted counter, 0 to 255; None if no frame was accepted before.
+        received: counter of the received frame, 0 to 255.
+    """
     return Check(judge_counter(NOTHING if last is None else last + 1 & 0xFF, received))
 
 
-#: The leaky bucket of a message: a bad cycle fills it, a good one empties it, and full it trips. Steady loss above a fifth trips.
+#: Leaky bucket of a message: units that a bad cycle adds, units that a good cycle removes, and level at which the message loses
+#: its trust. A steady loss of more than a fifth of the frames fills the bucket.
 BAD_CYCLE, GOOD_CYCLE, FULL = 4, 1, 64
-#: Good cycles in a row after which a message is trusted (again): no flapping. A pendant presses nothing before.
+#: Good cycles in a row after which a message is trusted, or trusted again. The delay prevents frequent changes. No input of a
+#: pendant counts before.
 REQUALIFY = 16
-#: What a cycle with a frame of a second sender adds to the evidence of one; a cycle without takes `GOOD_CYCLE` away. Confirmed
-#: at `FULL`: four cycles in a row. A takeover between two pendants overlaps by two.
+#: Evidence that a cycle with a frame of a second sender adds; any other cycle removes `GOOD_CYCLE`. Two senders are confirmed at
+#: `FULL`, after four such cycles in a row. The takeover from one pendant to another has an overlap of two cycles.
 RIVAL_CYCLE = 16
 
 
 class Qualification(NamedTuple):
-    """How far the sender of a message is trusted."""
+    """Trust in the sender of one message, with its leaky bucket."""
 
-    bucket: int = 0
-    good: int = 0  # cycles in a row, counted up to `REQUALIFY`
+    bucket: int = 0  # level of the leaky bucket, 0 to `FULL`
+    good: int = 0  # good cycles in a row, counted up to `REQUALIFY`
     trusted: bool = False
 
 
-#: Further good cycles change nothing.
+#: Qualification that further good cycles do not change.
 SETTLED = Qualification(0, REQUALIFY, True)
 
 
 def qualify(before: Qualification, *, good: bool, timed_out: bool = False) -> Qualification:
-    """Qualification after one more cycle.
+    """Return the qualification of a message after one more cycle.
 
     Args:
-        good: new and intact data came.
-        timed_out: the data is as old as its timeout, or its sender is not the only one: trust is lost at once.
+        before: qualification after the previous cycle.
+        good: True if new and intact data was received.
+        timed_out: True if the data is as old as its timeout, or if two senders are confirmed. The message loses its trust in this
+            cycle.
     """
     if timed_out:
         return Qualification(before.bucket, 0, False)
@@ -184,7 +217,7 @@ def suspect(evidence: int, *, rival: bool) -> int:
     """Return the evidence of two senders of one message after one more cycle, 0 to `FULL`.
 
     Args:
-        evidence: of the cycle before.
-        rival: a frame came in this cycle that the sender of the accepted frame cannot have sent.
+        evidence: evidence after the previous cycle, 0 to `FULL`.
+        rival: True if this cycle has a frame that the sender of the accepted frame cannot have sent.
     """
     return min(evidence + RIVAL_CYCLE, FULL) if rival else max(evidence - GOOD_CYCLE, 0)

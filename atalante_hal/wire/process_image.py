@@ -1,8 +1,8 @@
-"""Process image: the last good copy of every message, and whether it may be trusted.
+"""Process image: the last good values of every message, with check result and age.
 
-`ReceiveImage` takes the frames of a cycle as the bus delivered them and commits a message only if identifier, length,
-CRC, counter and range hold; otherwise its values stay, its age grows and its check says why. `TransmitImage` is the
-mirror: values in, protected frames out.
+`ReceiveImage` takes the frames of a cycle in the order of the bus. It commits a message only if identifier, length, CRC, counter
+and signal ranges are correct. Otherwise the message keeps its values, its age grows, and its check result gives the reason.
+`TransmitImage` encodes values into protected frames to be sent.
 """
 
 from __future__ import annotations
@@ -40,76 +40,82 @@ from atalante_hal.wire.e2e import (
 )
 from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES, WORDS, Frames, as_words, new_frames
 
-#: In the place of a cycle tag: the senders count for themselves.
+#: Marker instead of a cycle tag: each sender uses its own counter.
 _NO_TAG = -1
-#: `Check`s as plain integers; up to the first, data is new.
+#: Values of `Check` as plain integers. Up to `_FRESH` the data is new.
 _FRESH = _SOME_LOST = int(Check.SOME_LOST)
 _REPEATED, _CONFLICT, _WRONG_SEQUENCE = int(Check.REPEATED), int(Check.CONFLICT), int(Check.WRONG_SEQUENCE)
 _CRC, _LENGTH, _RANGE, _INVALID = int(Check.CRC), int(Check.LENGTH), int(Check.RANGE), int(Check.INVALID)
-#: Checks of frames that say nothing, or nothing that the accepted frame has not said.
+#: Check results of frames that are damaged, or that repeat the accepted frame: they contain no new values.
 _SAYS_NOTHING_NEW = frozenset({Check.CRC, Check.LENGTH, Check.REPEATED})
-#: In the place of a row: the frame is no message of the image.
+#: Marker instead of a row: the frame is not a message of this process image.
 _FOREIGN = -1
-#: Age of a message that never came.
+#: Age of a message that has never been received [cycles].
 NEVER = 1 << 30
-#: Oldest answer [cycles] that is taken for a late one; what is older was replayed.
+#: Age from which an answer to a SYNC counts as replayed; a younger answer counts as late [cycles].
 LATEST = 16
-#: Half a turn of the counter: what seems further ahead is behind, unless the row was silent for as long.
+#: Half the counter period. A larger step forward counts as a step back, unless the row was silent for as many cycles.
 _HALF_TURN = 128
 
 
 class ReceiveImage:
-    """The messages of one rate, received: values, and per row check and age.
+    """Process image of received messages, with the values of all signals, and check result and age of each row.
 
-    `values` is shape (codec.size,) in DBC units and keeps the last good values; `check` and `age` are per row.
+    `values` holds the last good values, shape (codec.size,), in DBC units. `check` and `age` have one element per row.
 
-    A node answers a SYNC under the counter that is the low byte of the SYNC's Cycle, the cycle tag. An image that is told the
-    cycle it is in counts age from the SYNC a frame answers, however late it came.
+    A node answers each SYNC with a frame whose counter is the cycle tag: the low byte of the Cycle signal in the SYNC. If the
+    caller passes the tag of the current cycle, age is counted from the SYNC that a frame answers, even if the frame is late.
 
     Args:
-        restarts: the senders may begin anew at any counter (status, emergencies): only the last frame again is refused. A
-            frame with the last counter and other bytes is committed, and listed in `refused` as a CONFLICT all the same.
+        messages: messages of this process image, one per row.
+        values: array for the decoded values, shape (codec.size,); default: a new array of NaN.
+        restarts: True if a sender may restart at any counter (status, emergencies). Then only a repetition of the last frame is
+            rejected. A frame with the last counter and other bytes is committed, and also listed in `refused` as CONFLICT.
     """
 
     def __init__(self, messages: Sequence[Message], values: Vector | None = None, *, restarts: bool = False) -> None:
         self.codec = Codec(messages)
         count = len(self.codec.messages)
         self.values = np.full(self.codec.size, np.nan) if values is None else values
-        #: `Check` of the cycle, shape (rows,).
+        #: `Check` of each row in this cycle, shape (rows,).
         self.check: npt.NDArray[np.uint8] = np.full(count, Check.NO_DATA, np.uint8)
-        #: Cycles since the row was committed, shape (rows,).
+        #: Age of the values of each row [cycles], shape (rows,).
         self.age: npt.NDArray[np.int64] = np.full(count, NEVER)
         self.crc_errors = 0
-        #: What was not committed in this cycle: row and why, one entry a frame.
+        #: Row and check result of each frame rejected in this cycle.
         self.refused: list[tuple[int, Check]] = []
         self._restarts = restarts
-        #: The last frame of each row with the right format, CRC and sequence, shape (rows,).
+        #: Last frame of each row with correct format, CRC and sequence, shape (rows,).
         self.frames = self.codec.template()
         self._kept: Octets = self.frames.view(np.uint8)
         self._headers: Words = as_words(self.frames)[:, 0].astype(np.int64)
         self._expected_headers = self._headers.tobytes()
         self.frame_ids = {message.frame_id: row for row, message in enumerate(self.codec.messages)}
         self._spans = protected_spans(self.codec.messages)
-        #: Counter the next frame of each row should carry.
+        #: Expected counter of the next frame of each row, shape (rows,).
         self._expected: Words = np.full(count, NOTHING)
-        #: Cycles since that counter moved, shape (rows,).
+        #: Cycles since the expected counter of each row last changed, shape (rows,).
         self._silent: Words = np.zeros(count, np.int64)
-        #: The values before the last `accept`.
+        #: Values before the last `accept`, shape (codec.size,).
         self.values_before = self.values.copy()
         self._age_before: npt.NDArray[np.int64] = self.age.copy()
-        #: The last cycle was perfect: every row was committed exactly as expected.
+        #: True if the last cycle was perfect: every row was committed with the expected frame.
         self.all_fresh = self._was_fresh = False
-        #: The frames of the last `accept_each`, and of each its row and `Check`.
+        #: Frames of the last `accept_each`, with the row and `Check` of each frame.
         self._offered: tuple[Frames, Words] | None = None
         self._ordered = _Received(new_frames(count), count)
         self._received = self._ordered
         self._accept_exact, self._accept_frames = compiled(accept_exact), compiled(accept_frames)
-        # Nothing; from now on it is machine code.
+        # Call the functions once without data, so that they are compiled here and not in the first cycle.
         self._accept(self._ordered, None)
         self.accept_each(self._ordered.frames, 0)
 
     def new_cycle(self, elapsed: int = 1) -> None:
-        """`elapsed` cycles have begun: until something arrives, every row is that much older and has no data."""
+        """Begin a new cycle: increase the age of every row, and mark it as without data until a frame arrives.
+
+        Args:
+            elapsed: number of cycles since the last call.
+        """
         self.all_fresh = False
         self.age += elapsed
         self._silent += elapsed
@@ -117,14 +123,15 @@ class ReceiveImage:
         self.refused = []
 
     def accept(self, frames: Frames, count: int, tag: int | None = None) -> Sequence[int]:
-        """One whole cycle: judge and commit `frames[:count]`, in whatever order they came.
+        """Check and commit all frames of one cycle, in any order.
 
         Args:
-            frames: receive buffer, the same array every cycle.
-            tag: low byte of this cycle's number, when the senders answer a SYNC; None: they count for themselves.
+            frames: receive buffer, the same array in every cycle.
+            count: number of received frames at the start of the buffer.
+            tag: low byte of the cycle number if the senders answer a SYNC; None if each sender uses its own counter.
 
         Returns:
-            Places in `frames` of the frames that are no message of this image.
+            Indices in `frames` of the frames that are not messages of this process image.
         """
         rows = len(self._headers)
         row_of = self.frame_ids
@@ -139,7 +146,7 @@ class ReceiveImage:
             found = [row_of.get(can_id, -1) for can_id in frames["can_id"][:count].tolist()]
             foreign = [place for place, row in enumerate(found) if row < 0]
             if len(foreign) == count - rows and len(set(found) - {-1}) == rows:
-                # Everything is there once, among others or in another order: several buses, or arbitration.
+                # Every message arrived once, but with other frames or in another order, due to several buses or arbitration.
                 self._ordered.words[:] = as_words(frames)[np.argsort(found)[count - rows :]].view(np.int64).ravel()
                 if self._accept(self._ordered, tag):
                     return foreign
@@ -147,7 +154,11 @@ class ReceiveImage:
         return self.accept_each(frames, count, tag)
 
     def refuse(self, row: int) -> None:
-        """What `accept` just committed cannot be true: the row keeps the values it had before, and is a cycle older."""
+        """Reject a row that `accept` just committed, because its values are implausible: restore its previous values and age.
+
+        Args:
+            row: row of the message; its age is one cycle more than before `accept`.
+        """
         mine = self.codec.row_of == row
         self.values[mine] = self.values_before[mine]
         self.age[row] = 1 if self._was_fresh else self._age_before[row] + 1
@@ -155,11 +166,16 @@ class ReceiveImage:
         self.all_fresh = False
 
     def begins(self, frames: Frames, count: int) -> bool:
-        """Whether `frames[:count]` begin with every message of this image, in order: then a cycle is complete."""
+        """Return whether the buffer begins with all messages of this process image in order, so that the cycle is complete.
+
+        Args:
+            frames: receive buffer.
+            count: number of received frames at the start of the buffer.
+        """
         return count >= len(self._headers) and self._received_in(frames).headers.tobytes() == self._expected_headers
 
     def expected_ids(self) -> set[int]:
-        """Identifiers of the messages whose senders are alive: heard within the DBC's timeout."""
+        """Return the identifiers of the messages that have not timed out, by the timeout in the DBC."""
         ages = self.age.tolist()
         return {m.frame_id for row, m in enumerate(self.codec.messages) if ages[row] <= m.timeout_ms}
 
@@ -169,7 +185,15 @@ class ReceiveImage:
         return self._received
 
     def _accept(self, received: _Received, tag: int | None) -> bool:
-        """Fast path: replaces `new_cycle` and `accept_each` for a perfect cycle; otherwise False, and nothing is changed."""
+        """Commit a perfect cycle in one pass, as a fast path instead of `new_cycle` and `accept_each`.
+
+        Args:
+            received: frames of the cycle.
+            tag: low byte of the cycle number, or None.
+
+        Returns:
+            Whether the cycle was perfect; if not, nothing is changed.
+        """
         if not self._accept_exact(
             received.words,
             received.octets,
@@ -195,10 +219,15 @@ class ReceiveImage:
         return True
 
     def accept_each(self, frames: Frames, count: int, tag: int | None = None) -> list[int]:
-        """Slow path: judge frames one by one in order of arrival, decode and commit the good ones. Call `new_cycle` before.
+        """Check the frames one by one in order of arrival, and decode and commit the good ones; call `new_cycle` before.
+
+        Args:
+            frames: receive buffer.
+            count: number of received frames at the start of the buffer.
+            tag: low byte of the cycle number if the senders answer a SYNC; None if each sender uses its own counter.
 
         Returns:
-            Places in `frames[:count]` of the frames that are no message of this image.
+            Indices in `frames` of the frames that are not messages of this process image.
         """
         self.values_before[:] = self.values
         found: Words = np.full((count, 2), _FOREIGN)
@@ -234,13 +263,16 @@ class ReceiveImage:
         return foreign
 
     def beside(self, row: int) -> list[Vector]:
-        """Decode the other intact frames of a row that came in this cycle beside the one committed last.
+        """Decode the other intact frames of a row in this cycle, except the frame committed last.
 
-        Repetitions of an accepted frame are left out. Call it before the receive buffer is used again.
+        Repetitions of an accepted frame are left out. Call this method before the receive buffer is used again.
+
+        Args:
+            row: row of the message.
 
         Returns:
-            `values` with the row's signals as each of the frames has them, in order of arrival. Shape (codec.size,) each, DBC
-            units; the signals may be outside their range.
+            A copy of `values` for each of these frames, in order of arrival, with the signals of the row taken from the frame.
+            Shape (codec.size,) each, in DBC units; the signals may be outside their range.
         """
         if self._offered is None:
             return []
@@ -262,7 +294,12 @@ class ReceiveImage:
 
 
 class _Received:
-    """Views of the first rows of a receive buffer, made once: what the fast path reads every cycle."""
+    """Views of the first rows of a receive buffer, created once and read by the fast path in every cycle.
+
+    Args:
+        frames: receive buffer.
+        rows: number of rows to view.
+    """
 
     def __init__(self, frames: Frames, rows: int) -> None:
         self.frames = frames
@@ -286,20 +323,24 @@ def accept_exact(
     values_before: Vector,
     kept: Octets,
 ) -> bool:
-    """Commit rows that are exactly the expected messages, in order, intact, in sequence, in range and of this cycle.
+    """Commit all rows if the frames are exactly the expected messages: in order, intact, in sequence, in range and of this cycle.
 
     Args:
-        words, octets: views of the frames received, shapes (rows * 9,) and (rows * 72,).
-        headers: first word of each message, shape (rows,).
-        spans: of `e2e.protected_spans`.
-        expected: counter of each row, shape (rows,); moved on.
-        tag: counter all have to carry, or `_NO_TAG`.
-        plan, scales, codes: of the codec.
-        values, values_before: shape (size,); the new ones, and what they were.
-        kept: the last accepted frames, shape (rows * 72,); rewritten.
+        words: received frames as a flat array of 64-bit words, shape (rows * 9,).
+        octets: received frames as a flat array of bytes, shape (rows * 72,).
+        headers: header word of each message, shape (rows,).
+        spans: result of `e2e.protected_spans`, shape (rows, 3).
+        expected: expected counter of each row, shape (rows,); advanced by 1.
+        tag: counter that all frames must have, or `_NO_TAG`.
+        plan: decoding plan of the codec, shape (7, size).
+        scales: scales of the codec, shape (3, size).
+        codes: output for the raw codes, shape (size,).
+        values: decoded values, shape (size,), in DBC units; overwritten with the new values.
+        values_before: output for the previous values, shape (size,).
+        kept: last accepted frames as bytes, shape (rows * 72,); overwritten.
 
     Returns:
-        Whether they were; if not, nothing was changed.
+        Whether the frames were committed; if not, nothing is changed except `codes`.
     """
     for row in range(len(headers)):
         if words[row * WORDS] != headers[row] or (tag != _NO_TAG and expected[row] != tag):
@@ -334,13 +375,27 @@ def accept_frames(
     check: Octets,
     kept: Octets,
 ) -> None:
-    """Judge frames one by one in order of arrival and commit the good ones.
+    """Check frames one by one in order of arrival, and commit the good ones.
 
     Args:
-        words, octets: flat views of the frames received.
-        found: row of each frame, or `_FOREIGN`, and its `Check`; rewritten, shape (count, 2).
-        silent: cycles since `expected` of each row moved, shape (rows,).
-        tag: counter all should carry, or `_NO_TAG`; the other arguments as for `accept_exact`, and of `ReceiveImage`.
+        words: received frames as a flat array of 64-bit words, shape (at least count * 9,).
+        octets: received frames as a flat array of bytes, shape (at least count * 72,).
+        found: output for the row of each frame, or `_FOREIGN`, and its `Check`, shape (count, 2).
+        headers: header word of each message, shape (rows,).
+        spans: result of `e2e.protected_spans`, shape (rows, 3).
+        expected: expected counter of each row, or `NOTHING`, shape (rows,); updated.
+        silent: cycles since the expected counter of each row last changed, shape (rows,); updated.
+        tag: expected counter of all frames in this cycle, or `_NO_TAG`.
+        restarts: True if a sender may restart at any counter.
+        plan: decoding plan of the codec, shape (7, size).
+        scales: scales of the codec, shape (3, size).
+        signals_by_row: signal indices sorted by row, shape (size,).
+        row_begins: begin of each row in `signals_by_row`, shape (rows + 1,).
+        codes: raw codes, shape (size,); updated.
+        values: decoded values, shape (size,), in DBC units; updated.
+        age: age of each row [cycles], shape (rows,); updated.
+        check: `Check` of each row, shape (rows,); updated.
+        kept: last accepted frames as bytes, shape (rows * 72,); updated.
     """
     for place in range(len(found)):
         first = place * WORDS
@@ -367,7 +422,12 @@ def accept_frames(
 
 
 def row_of(header: int, headers: Words) -> int:
-    """Row of the message with the identifier of a frame, or `_FOREIGN`."""
+    """Return the row of the message with the identifier of a frame, or `_FOREIGN`.
+
+    Args:
+        header: header word of the frame.
+        headers: header word of each message, shape (rows,).
+    """
     for row in range(len(headers)):
         if headers[row] & 0xFFFFFFFF == header & 0xFFFFFFFF:
             return row
@@ -387,11 +447,25 @@ def judge_frame(
     restarts: bool,
     kept: Octets,
 ) -> int:
-    """`Check` of a frame's format, CRC and counter; moves `expected` on and keeps the frame when its counter moved.
+    """Check format, CRC and counter of a frame.
+
+    If the counter is accepted, the expected counter is updated and the frame is copied to `kept`.
 
     Args:
-        behind: bytes it stands behind its row's place.
-        kept: the last accepted frames, shape (rows * 72,); the other arguments as for `accept_frames`.
+        words: received frames as a flat array of 64-bit words.
+        octets: received frames as a flat array of bytes.
+        row: row of the message of the frame.
+        behind: offset of the frame from its row in the frame array [bytes].
+        headers: header word of each message, shape (rows,).
+        spans: result of `e2e.protected_spans`, shape (rows, 3).
+        expected: expected counter of each row, or `NOTHING`, shape (rows,); updated.
+        silent: cycles since the expected counter of each row last changed, shape (rows,); updated.
+        tag: expected counter of all frames in this cycle, or `_NO_TAG`.
+        restarts: True if a sender may restart at any counter.
+        kept: last accepted frames as bytes, shape (rows * 72,); updated.
+
+    Returns:
+        Value of `Check` as a plain integer.
     """
     begin, end, data_id = spans[row, 0] + behind, spans[row, 1] + behind, spans[row, 2]
     if words[(begin - HEADER_BYTES) // 8] != headers[row]:
@@ -401,7 +475,8 @@ def judge_frame(
         return _CRC
     counter = int(octets[begin + COUNTER_BYTE])
     in_time = tag == _NO_TAG or tag - counter & 0xFF < LATEST
-    # After half a turn of silence a counter says nothing about the order; an answer to a SYNC of the last cycles is a new one.
+    # After a silence of half the counter period, the counter no longer gives the order of frames. Then a frame is new if it
+    # answers a SYNC of the last cycles.
     back = tag != _NO_TAG and in_time and expected[row] != NOTHING and silent[row] >= _HALF_TURN
     result = judge_counter(expected[row], counter)
     if back and result == _REPEATED:
@@ -413,7 +488,8 @@ def judge_frame(
             return _CONFLICT
         result = _CONFLICT
     elif tag != _NO_TAG and not back:
-        # An answer to no SYNC of the last cycles, or older than what is known already, says nothing about what comes next.
+        # A frame that answers no recent SYNC, or an earlier SYNC than the last accepted frame, must not change the expected
+        # counter.
         backwards = expected[row] != NOTHING and counter - expected[row] + 1 & 0xFF >= _HALF_TURN
         if not in_time or backwards:
             return _WRONG_SEQUENCE
@@ -424,7 +500,11 @@ def judge_frame(
 
 
 class TransmitImage:
-    """Messages to send: write `values`, call `seal`, send `frames`."""
+    """Process image of messages to send: write `values`, call `seal`, send `frames`.
+
+    Args:
+        messages: messages of this process image, one per row.
+    """
 
     def __init__(self, messages: Sequence[Message]) -> None:
         self.codec = Codec(messages)
@@ -437,18 +517,21 @@ class TransmitImage:
         self._counters: Words = np.zeros(rows, np.int64)
         self._singles = [self.frames[row : row + 1] for row in range(rows)]
         self._seal, self._protect = compiled(seal), compiled(protect)
-        # Nothing; from now on it is machine code.
+        # Call the functions once here, so that they are compiled before the first cycle.
         self._protect(self._octets, self._spans, self._counters)
         self.seal(0xFF)
 
     def seal(self, counter: int | None = None) -> Frames:
-        """Encode the values and protect every row with counter and CRC. Returns the frames to send, shape (rows,).
+        """Encode the values and protect every row with counter and CRC.
 
         Args:
-            counter: alive counter of every row; None: one more than the last.
+            counter: alive counter of every row, 0 to 255; None: the last counter of each row plus 1.
+
+        Returns:
+            The frames to send, shape (rows,).
 
         Raises:
-            ValueError: NaN for a signal without an invalid code.
+            ValueError: If the value of a signal without an invalid code is NaN.
         """
         codec = self.codec
         nameless = self._seal(
@@ -469,30 +552,49 @@ class TransmitImage:
 
     @property
     def counter(self) -> int:
-        """Alive counter of the last `seal`."""
+        """Return the alive counter of the first row, as of the last `seal`."""
         return int(self._counters[0])
 
     def prepare(self) -> bytes:
-        """Payloads of the values as they are now, for `seal_prepared`."""
+        """Return the frames with the present values as bytes, for a later `seal_prepared`."""
         self.codec.encode(self.values, self.frames)
         return self._octets.tobytes()
 
     def seal_prepared(self, prepared: bytes) -> Frames:
-        """As `seal`, of payloads encoded beforehand: nothing that went wrong since can spoil them."""
+        """Protect and return frames that were encoded beforehand, so that a later fault in the values cannot affect them.
+
+        Args:
+            prepared: result of `prepare`.
+
+        Returns:
+            The frames to send, shape (rows,), each with its last counter plus 1.
+        """
         self._octets[:] = np.frombuffer(prepared, np.uint8)
         self._counters[:] = self._counters + 1 & 0xFF
         self._protect(self._octets, self._spans, self._counters)
         return self.frames
 
     def seal_row(self, row: int) -> Frames:
-        """As `seal` for one row alone, the counters of the others stay. Shape (1,)."""
+        """Encode and protect one row; the counters of the other rows do not change.
+
+        Args:
+            row: row of the message.
+
+        Returns:
+            The frame to send, shape (1,).
+        """
         self.codec.encode(self.values, self.frames)
         self.resume(row, int(self._counters[row]) + 1 & 0xFF)
         self._protect(self._octets, self._spans, self._counters)
         return self._singles[row]
 
     def resume(self, row: int, counter: int) -> None:
-        """Go on after the frame with this alive counter, which another sender of the row sent."""
+        """Set the counter of a row to that of a frame from another sender, so that the next frame continues its sequence.
+
+        Args:
+            row: row of the message.
+            counter: alive counter of that frame, 0 to 255.
+        """
         self._counters[row] = counter
 
 
@@ -508,10 +610,22 @@ def seal(
     counters: Words,
     counter: int,
 ) -> int:
-    """Encode the values and protect every row: `codec.encode`, then `e2e.protect`; arguments and result are theirs.
+    """Encode the values and protect every row with counter and CRC.
 
     Args:
-        counter: of every row, or `_NO_TAG`: one more than its last.
+        values: physical values, shape (size,), in DBC units.
+        plan: decoding plan of the codec, shape (7, size).
+        scales: scales of the codec, shape (3, size).
+        targets: indices of the words that contain a signal.
+        codes: output for the raw codes, shape (size,).
+        words: frames as a flat array of 64-bit words, shape (rows * 9,); overwritten.
+        octets: the same frames as a flat array of bytes, shape (rows * 72,); overwritten.
+        spans: result of `e2e.protected_spans`, shape (rows, 3).
+        counters: last counter of each row, shape (rows,); updated.
+        counter: new counter of every row, or `_NO_TAG` for the last counter of each row plus 1.
+
+    Returns:
+        `NO_CODE`, or the index of a signal that could not be encoded, as from `codec.encode`. In that case no frame is changed.
     """
     nameless = encode(values, plan, scales, targets, codes, words)
     if nameless == NO_CODE:

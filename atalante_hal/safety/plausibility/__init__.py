@@ -1,4 +1,4 @@
-"""Plausibility: what frames that are intact say, judged against physics, history and each other."""
+"""Plausibility checks: compare the values in intact frames with physical limits, earlier values and other sensors."""
 
 from atalante_hal.safety.plausibility.finding import Finding
 from atalante_hal.safety.plausibility.plausibility import Plausibility

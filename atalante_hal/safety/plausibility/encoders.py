@@ -1,14 +1,15 @@
-"""Encoders against physics: a joint moves no further than it can, and turns as fast as it says.
+"""Encoder checks: compare each joint position with the previous one, the position limits and the reported velocity.
 
-*Jump.* Between two good values, n cycles apart, a joint moves at most n * velocity_max * period, give or take 3 sigma of the
-encoder. What moved further is not used. After `JUMPS_TO_CONFIRM` of these on end the encoder has lost its reference: it is used
-again when it jumps back by as much, the joint's motion meanwhile counted, or when its drive has restarted, see `reference`.
+*Jump.* Between two good values, n cycles apart, a joint moves at most n * velocity_max * period, plus 3 sigma of the noise. A
+value that changed by more is not used. After `JUMPS_TO_CONFIRM` such values in a row the encoder counts as having lost its
+reference. It is used again when it jumps back to the expected position, which includes the motion since the jump, or when its
+drive has restarted, see `reference`.
 
-*Range.* A joint is within its position limits, give or take `position_tolerance`.
+*Range.* A joint must be within its position limits, extended by `position_tolerance`.
 
-*Velocity.* The mean of the reported velocity between two samples, by the trapezoidal rule, is the way the encoder made; the
-drive's low-pass puts them apart for a few cycles, not for fifty. A sample of a joint counts from the cycle it was measured in,
-so that a late or lost frame changes the interval and not the verdict.
+*Velocity.* The mean reported velocity between two samples, by the trapezoidal rule, must match the change of the encoder
+position. The low-pass filter of the drive lets them differ for a few cycles, but not for fifty. The time of a sample is the cycle
+in which it was measured. So a late or lost frame changes only the interval between two samples, and not the result.
 """
 
 from __future__ import annotations
@@ -23,29 +24,30 @@ from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Cycles, Finding, Signals
 from atalante_hal.wire.process_image import NEVER
 
-#: Jumps on end, without a good value between them, that are no stray any more.
+#: Number of jumps in a row, without a good value between them, after which the diagnostic is confirmed.
 JUMPS_TO_CONFIRM = 5
-#: Comparisons on end in which the velocity has to be wrong.
+#: Number of wrong velocity comparisons in a row after which the diagnostic is raised.
 VELOCITY_SAMPLES = 3
 _ALL = b"\1" * len(JOINTS)
 
 
 class Lost(NamedTuple):
-    """An encoder that jumped, motor side."""
+    """Record of an encoder that jumped; positions on the motor side."""
 
-    last: float  # rad, position received last
-    cycles: int  # from the last good position to that
-    expected: float  # rad, where the joint would be without the jump
+    last: float  # last received position [rad]
+    cycles: int  # time from the last good position to `last` [cycles]
+    expected: float  # expected position without the jump [rad]
 
 
 class Encoders:
-    """The twelve encoders.
+    """Checks of the twelve encoders.
 
     Args:
-        now: what was decoded in this cycle.
-        before: the last good values.
-        period: of the cycle [s].
-        every: cycles between two calls of `judge_velocity`.
+        robot: limits and sensor properties of the robot.
+        now: signals decoded in this cycle.
+        before: last good signals before this cycle.
+        period: cycle time [s].
+        every: interval between two calls of `judge_velocity` [cycles].
     """
 
     def __init__(self, robot: Robot, now: Signals, before: Signals, period: float, every: int) -> None:
@@ -54,9 +56,9 @@ class Encoders:
         self._noise = 3.0 * robot.encoder_noise * robot.gear
         self._reach = self._way + self._noise
         self.jumps = [0] * len(JOINTS)
-        self._jump_of: dict[int, float] = {}  # size of the last one
+        self._jump_of: dict[int, float] = {}  # size of the last jump of a joint [rad]
         self._lost: dict[int, Lost] = {}
-        #: Joints out of their range: number -> position [rad].
+        #: Joint index -> position [rad], for each joint outside its range.
         self.outside: dict[int, float] = {}
         self._range = np.array([robot.position_min, robot.position_max])
         tolerance = robot.thresholds.position_tolerance
@@ -66,35 +68,37 @@ class Encoders:
         )
         self._polarity = robot.polarity.tolist()
         self._period, self._every = period, every
-        # Twice the mean velocity of two samples less twice the way between them: the share of the later and of the earlier one.
+        # `judge_velocity` computes 2 * (mean reported velocity - mean encoder velocity). These are its coefficients for position
+        # and velocity of the later and of the earlier sample.
         time = every * period
         self._of_later, self._of_earlier = np.array([[-2.0 / time, 1.0], [2.0 / time, 1.0]])
-        self._earlier = np.zeros((2, len(JOINTS)))  # position and velocity of the last sample
+        self._earlier = np.zeros((2, len(JOINTS)))  # position [rad] and velocity [rad/s] of the last sample
         self._no_age = np.zeros(len(JOINTS), np.int64)
-        self._earlier_age: Cycles = np.full(len(JOINTS), NEVER)  # of the last sample when it was taken
+        self._earlier_age: Cycles = np.full(len(JOINTS), NEVER)  # age at the last sample
         self._twice_allowed = 2.0 * robot.sensors.velocity_error * robot.gear
         self._wrong = [0] * len(JOINTS)
         self._wrong_findings: tuple[Finding, ...] = ()
         self._gear = robot.gear.tolist()
         self._within_reach = compiled(within_reach)
-        self.within_reach()  # is compiled now, not in a cycle
+        self.within_reach()  # compile the function here and not in the first cycle
 
     def within_reach(self) -> bool:
-        """Whether every joint is where it can have moved to in one cycle, and in its range."""
+        """Return whether each joint moved no further than possible in one cycle, and is in its range."""
         ranges = self._low, self._high
         return not self.outside and self._within_reach(self._now.position, self._before.position, self._reach, *ranges)
 
     def accept(self, joint: int, cycles: int) -> bool:
-        """Whether the new value of one joint may be used.
+        """Check the new position of one joint for a jump, and return whether it may be used.
 
         Args:
-            cycles: from the last good one to this.
+            joint: index of the joint in JOINTS.
+            cycles: time from its last good position to the new one [cycles].
         """
         now, before = float(self._now.position[joint]), float(self._before.position[joint])
         way, noise = float(self._way[joint]), float(self._noise[joint])
         confirmed = self.jumps[joint] >= JUMPS_TO_CONFIRM
         moved = abs(now - before)
-        good = not confirmed and not moved > cycles * way + noise  # NaN: there was no value before
+        good = not confirmed and not moved > cycles * way + noise  # NaN (no previous value) passes
         if not good:
             lost = self._lost[joint] = followed(self._lost.get(joint, Lost(before, 0, before)), now, cycles, way, noise)
             if confirmed:
@@ -109,7 +113,11 @@ class Encoders:
         return False
 
     def reference(self, joint: int) -> None:
-        """Trust the encoder of a joint again: its values count from the next one on."""
+        """Clear the jumps of a joint, so that its encoder is used again from the next value on.
+
+        Args:
+            joint: index of the joint in JOINTS.
+        """
         self.jumps[joint] = 0
         self._lost.pop(joint, None)
 
@@ -120,14 +128,14 @@ class Encoders:
             self.outside[joint] = position * self._polarity[joint] / self._gear[joint]
 
     def judge_velocity(self, age: Cycles | None) -> bool:
-        """Compare velocity and encoder over the last `every` cycles.
+        """Compare the reported velocity with the encoder motion since the last call.
 
         Args:
-            age: of each joint's values [cycles], shape (12,); from `NEVER` on: too old, and this joint is not compared. None:
-                all are of this cycle.
+            age: age of the values of each joint [cycles], shape (12,). A joint with an age of `NEVER` or more is not compared.
+                None if all values are of this cycle.
 
         Returns:
-            Whether a velocity is wrong.
+            Whether a wrong velocity is confirmed for any joint.
         """
         motion, earlier, earlier_age = self._now.motion, self._earlier, self._earlier_age
         if age is None and earlier_age is self._no_age:
@@ -143,7 +151,15 @@ class Encoders:
         return bool(self._wrong_findings)
 
     def _error_between(self, age: Cycles) -> tuple[Vector, list[bool]]:
-        """Return twice the error of each velocity, 0 of joints not compared, and which joints are compared. Shape (12,)."""
+        """Return twice the velocity error of each joint, and which joints are compared.
+
+        Args:
+            age: age of the values of each joint [cycles], shape (12,).
+
+        Returns:
+            Twice the velocity error [rad/s, motor side], 0 for a joint that is not compared, shape (12,); and whether each joint
+            is compared, length 12.
+        """
         motion, earlier = self._now.motion, self._earlier
         cycles = self._every + self._earlier_age - age
         compared = (age < NEVER) & (self._earlier_age < NEVER) & (cycles > 0)
@@ -152,7 +168,13 @@ class Encoders:
         return np.where(compared, error, 0.0), compared.tolist()
 
     def _count_wrong(self, error: list[float], right: list[bool], compared: list[bool] | None) -> None:
-        """Count the comparisons on end in which a velocity was wrong; a joint that was not `compared` keeps its count."""
+        """Count the wrong comparisons of each joint in a row, and update the findings.
+
+        Args:
+            error: twice the velocity error of each joint [rad/s, motor side].
+            right: whether the error of each joint is within its limit.
+            compared: whether each joint was compared; a joint that was not compared keeps its count. None: all were compared.
+        """
         self._wrong = [
             wrong if compared is not None and not compared[joint] else 0 if right[joint] else wrong + 1
             for joint, wrong in enumerate(self._wrong)
@@ -167,7 +189,7 @@ class Encoders:
         )
 
     def findings(self) -> tuple[Finding, ...]:
-        """What stands."""
+        """Return the present findings."""
         if not (self.outside or any(self.jumps)):
             return self._wrong_findings
         jumps = (self._jump(joint) for joint, jumps in enumerate(self.jumps) if jumps)
@@ -196,14 +218,16 @@ class Encoders:
 
 
 def followed(lost: Lost, now: float, cycles: int, way: float, noise: float) -> Lost:
-    """Return where a joint is expected whose encoder jumped: what its encoder moves by without a jump is motion.
+    """Return the updated record of an encoder that jumped.
+
+    A change of the encoder position that is not a jump counts as motion of the joint, and is added to its expected position.
 
     Args:
-        lost: what was known before.
-        now: position received.
-        cycles: from the last good position to this one.
-        way: most a joint moves in a cycle.
-        noise: of the encoder; in the unit of the positions, as all but `cycles`.
+        lost: record before this position.
+        now: received position [rad].
+        cycles: time from the last good position to the received one [cycles].
+        way: largest motion of the joint in one cycle [rad].
+        noise: noise bound of the encoder [rad].
     """
     step = now - lost.last
     jumped = abs(step) > (cycles - lost.cycles) * way + noise
@@ -211,7 +235,15 @@ def followed(lost: Lost, now: float, cycles: int, way: float, noise: float) -> L
 
 
 def within_reach(position: Vector, before: Vector, reach: Vector, low: Vector, high: Vector) -> bool:
-    """Whether no joint has moved by more than its reach, and none is below `low` or above `high`. Shapes (12,), motor side."""
+    """Return whether no joint moved by more than its reach, and all joints are within their limits.
+
+    Args:
+        position: new positions, shape (12,) [rad, motor side].
+        before: previous positions, shape (12,) [rad, motor side].
+        reach: largest possible motion, shape (12,) [rad, motor side].
+        low: lower position limits, shape (12,) [rad, motor side].
+        high: upper position limits, shape (12,) [rad, motor side].
+    """
     for joint in range(len(reach)):
         moved = abs(position[joint] - before[joint])
         if moved > reach[joint] or position[joint] < low[joint] or position[joint] > high[joint]:

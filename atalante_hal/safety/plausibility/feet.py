@@ -1,9 +1,11 @@
-"""Force cells against each other, and the two feet against the ground.
+"""Foot checks: compare the force cells of a foot with each other, and the ground contact of both feet.
 
-*Cell.* A foot is a rigid plate on four cells. One that carries while the other three are free, or that is free while the other
-three carry a load, for longer than any rocking of the foot, is stuck or dead. (One without its noise is found sooner, see
-`stillness`.) *Contact.* Who has stood on the ground does not have both feet off it: walking has no flight. Who hangs from the
-start may swing both, and who is lifted off may do so after `LIFTED_CYCLES`, when the operator starts again.
+*Cell.* A foot is a rigid plate on four cells. A cell is stuck or dead if it carries load while the other three are free, or if it
+is free while the other three carry load, for longer than the foot can rock. A cell without noise is detected sooner by
+`stillness`.
+
+*Contact.* Walking has no flight phase. So a robot that stood on the ground cannot swing both feet. Both feet may swing if the
+robot is suspended from the start, or after it has been lifted for `LIFTED_CYCLES`, which requires a new START.
 """
 
 from __future__ import annotations
@@ -12,41 +14,43 @@ from atalante_hal.robot import CELLS, FEET, Robot
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility.finding import FOOT_NODES, Finding, Signals
 
-#: Cycles in which a cell has to contradict the others, both feet have to swing, and after which they swing on purpose.
+#: Times after which a cell counts as faulty, the swing of both feet as implausible, and the robot as lifted on purpose [cycles].
 CELL_CYCLES = 256
 SWING_CYCLES = 20
 LIFTED_CYCLES = 100
 
 
 class Feet:
-    """The two feet.
+    """Checks of the two feet.
 
     Args:
-        now: what was decoded in this cycle.
-        every: cycles between two calls of `judge`.
+        robot: sensor thresholds of the robot.
+        now: signals decoded in this cycle.
+        every: interval between two calls of `judge` [cycles].
     """
 
     def __init__(self, robot: Robot, now: Signals, every: int) -> None:
         self._force, self._forces = now.force, now.forces
         self._free, self._loaded = robot.sensors.cell_free, robot.sensors.cell_loaded
         self._every = every
-        # Less than the square of all that a free cell may say: no cell carries.
+        # If the sum of the squares of all forces is at most this value, no cell carries load [N^2].
         self._surely_free = self._free**2
-        #: Leg that swings while the other one stands, by its place in FEET; None: none does.
+        #: Index in FEET of the swing leg while the other leg stands; None if there is no swing leg.
         self.swing: int | None = None
-        self._swinging = LIFTED_CYCLES  # cycles since a foot stood last
-        self._contradicts = [[0] * len(CELLS) for _ in FEET]  # cycles in which a cell has contradicted the others
-        #: Cells that contradict the others: (foot, cell) -> N.
+        self._swinging = LIFTED_CYCLES  # time since a foot last stood on the ground [cycles]
+        self._contradicts = [[0] * len(CELLS) for _ in FEET]  # cycles in which a cell contradicted the others
+        #: (foot, cell) -> vertical force [N], for each cell that contradicts the others.
         self.cells: dict[tuple[int, int], float] = {}
 
     def judge(self, heard: tuple[bool, bool]) -> bool:
-        """Look at the vertical forces.
+        """Check the vertical forces of both feet.
 
         Args:
-            heard: since the last call, left and right foot; one that was not is as it was.
+            heard: whether the left and the right foot have new values since the last call. The cells of a foot without new values
+                are not checked again.
 
         Returns:
-            Whether something is implausible.
+            Whether a cell or the ground contact is implausible.
         """
         lifted = self._swinging >= LIFTED_CYCLES
         if lifted and self._forces.dot(self._forces) <= self._surely_free and not any(map(any, self._contradicts)):
@@ -77,7 +81,7 @@ class Feet:
                 self.cells.pop((foot, cell), None)
 
     def findings(self) -> tuple[Finding, ...]:
-        """What stands."""
+        """Return the present findings."""
         cells = tuple(_contradicting(foot, cell, force) for (foot, cell), force in self.cells.items())
         return (*cells, _BOTH_SWING) if self._both_swing() else cells
 

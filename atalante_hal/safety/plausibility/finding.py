@@ -1,4 +1,4 @@
-"""What a plausibility check found, and where in the process image the signals it looks at are."""
+"""Result of a plausibility check, and the location of the checked signals in the process image."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from atalante_hal.wire.process_image import NEVER
 
 Cycles = npt.NDArray[np.int64]
 
-#: Messages of the sensors, in the order of JOINTS, IMUS and FEET.
+#: Names of the sensor messages, in the order of JOINTS, IMUS and FEET.
 JOINT_MESSAGES = tuple(f"{joint.upper()}_STATE" for joint in JOINTS)
 IMU_MESSAGES = tuple(f"IMU_{imu.upper()}_STATE" for imu in IMUS)
 FOOT_MESSAGES = tuple(f"FOOT_{foot.upper()}_STATE" for foot in FEET)
-#: Nodes that send them.
+#: DBC names of the nodes that send these messages.
 JOINT_NODES, IMU_NODES, FOOT_NODES = (
     tuple(message.removesuffix("_STATE") for message in messages)
     for messages in (JOINT_MESSAGES, IMU_MESSAGES, FOOT_MESSAGES)
@@ -28,17 +28,17 @@ JOINT_NODES, IMU_NODES, FOOT_NODES = (
 
 @dataclass(frozen=True)
 class Finding:
-    """One implausibility that stands."""
+    """Present implausibility of one node."""
 
     dtc: Dtc
     node: str  # DBC name
-    value: float  # what was measured; its meaning depends on the code
-    confirmed: bool  # False: noticed and not used, but short enough to ride through
-    text: str  # one sentence for people
+    value: float  # measured value; quantity and unit depend on the code
+    confirmed: bool  # False: pending; the value is not used, but the fault is still short
+    text: str  # one sentence for the operator
 
 
 class Signals(NamedTuple):
-    """Views of the measured signals in a vector of decoded values; motor side where there is a motor."""
+    """Views of the measured signals in a vector of decoded values; joint positions and velocities are on the motor side."""
 
     position: Vector  # (12,) rad
     velocity: Vector  # (12,) rad/s
@@ -47,12 +47,12 @@ class Signals(NamedTuple):
     gyro: Vector  # (4, 3) rad/s
     accel: Vector  # (4, 3) m/s2
     force: Vector  # (2, 4, 3) N
-    motion: Vector  # (2, 12) position and velocity
-    forces: Vector  # (24,) force
+    motion: Vector  # (2, 12) position and velocity in one view
+    forces: Vector  # (24,) all components of `force` in one view
 
 
 class Ages(NamedTuple):
-    """Ages of the sensors' values in cycles; from `NEVER` on: too old to be compared with anything."""
+    """Ages of the sensor values [cycles]; values with an age of `NEVER` or more are too old for any comparison."""
 
     joint: Cycles  # (12,)
     imu: Cycles  # (4,)
@@ -60,37 +60,46 @@ class Ages(NamedTuple):
 
 
 class Rows:
-    """Rows of the sensors' messages in the image.
+    """Rows of the sensor messages in the process image.
 
     Args:
-        codec: of the image; the timeouts of its messages bound the age at which values are still compared.
+        codec: codec of the process image. Values are compared only if they are younger than the timeout of their message.
     """
 
     def __init__(self, codec: Codec) -> None:
-        #: Shapes (12,), (4,), (2,).
+        #: Rows of the joint, IMU and foot messages, shapes (12,), (4,) and (2,).
         self.joint, self.imu, self.foot = (
             np.array(rows_of(codec, messages)) for messages in (JOINT_MESSAGES, IMU_MESSAGES, FOOT_MESSAGES)
         )
-        #: Timeout of each row of the image [cycles].
+        #: Timeout of each row of the process image [cycles], shape (rows,).
         self.timeout = np.array([message.timeout_ms for message in codec.messages])
 
     def ages(self, age: Cycles) -> Ages:
-        """Return the ages of the sensors' values.
+        """Return the ages of the sensor values.
 
         Args:
-            age: of each row of the image [cycles], shape (rows,).
+            age: age of each row of the process image [cycles], shape (rows,).
         """
         usable = np.where(age < self.timeout, age, np.maximum(age, NEVER))
         return Ages(usable[self.joint], usable[self.imu], usable[self.foot])
 
 
 def measured(codec: Codec) -> slice:
-    """Where the measured signals are in the decoded values: signed quantities come first, one after the other."""
+    """Return the slice of the measured signals in the decoded values; they are contiguous because signed signals come first.
+
+    Args:
+        codec: codec of the process image.
+    """
     return slice(codec.slice("Position").start, codec.slice("Force").stop)
 
 
 def signals_of(codec: Codec, values: Vector) -> Signals:
-    """Views of `values`, shape (codec.size,) or cut to `measured`."""
+    """Return views of the measured signals.
+
+    Args:
+        codec: codec of the process image.
+        values: decoded values, shape (codec.size,), or the slice `measured` of them.
+    """
     position, velocity, torque, quaternion, gyro, accel, force = (
         codec.slice(quantity) for quantity in ("Position", "Velocity", "Torque", "Quaternion", "Gyro", "Accel", "Force")
     )
@@ -108,5 +117,5 @@ def signals_of(codec: Codec, values: Vector) -> Signals:
 
 
 def rows_of(codec: Codec, messages: tuple[str, ...]) -> list[int]:
-    """Rows of messages in the image."""
+    """Return the rows of messages in the process image."""
     return [codec.rows[message] for message in messages]

@@ -1,4 +1,7 @@
-"""IMUs against themselves: a quaternion is a unit, and no axis is at the end of its range. Against the encoders: see `legs`."""
+"""IMU checks: each quaternion must have unit norm, and no axis may be at the end of its measuring range.
+
+The module `legs` compares the IMUs with the encoders.
+"""
 
 from __future__ import annotations
 
@@ -10,39 +13,43 @@ from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility.finding import IMU_NODES, Finding, Signals
 from atalante_hal.wire.codec import Codec
 
-#: Cycles without a good value after which an IMU is given up.
+#: Time without a good value after which the diagnostic of an IMU is confirmed [cycles].
 IMU_CYCLES = 10
 
 
 class Imus:
-    """The four IMUs.
+    """Checks of the four IMUs.
 
     Args:
-        now: what was decoded in this cycle.
+        robot: sensor thresholds of the robot.
+        codec: codec of the process image, source of the measuring ranges.
+        now: signals decoded in this cycle.
     """
 
     def __init__(self, robot: Robot, codec: Codec, now: Signals) -> None:
         self._now = now
         self._gyro_end, self._accel_end = (_end_of_range(codec, signal) for signal in ("GyroX", "AccelX"))
         self._norm_error = robot.sensors.quaternion_error
-        #: IMUs whose quaternion is none, and of those at the end of their range; both by number with the value.
+        #: IMU index -> norm of the quaternion, for each IMU without unit norm.
         self.no_attitude: dict[int, float] = {}
+        #: IMU index -> largest reading [rad/s or m/s2], for each IMU at the end of its range.
         self.saturated: dict[int, float] = {}
         self._given_up: dict[int, bool] = {}
         self._usable = compiled(usable)
-        self.usable()  # is compiled now, not in a cycle
+        self.usable()  # compile the function here and not in the first cycle
 
     def usable(self) -> bool:
-        """Whether every quaternion is a unit, and no axis at the end of its range."""
+        """Return whether every quaternion has unit norm and no axis is at the end of its range."""
         now = self._now
         return self._usable(now.quaternion, now.gyro, now.accel, self._norm_error, self._gyro_end, self._accel_end)
 
     def accept(self, imu: int, cycles: int, *, frozen: bool) -> bool:
-        """Whether the new values of one IMU may be used.
+        """Check the new values of one IMU, and return whether they may be used.
 
         Args:
-            cycles: from the last good ones to these.
-            frozen: it repeats itself.
+            imu: index of the IMU in IMUS.
+            cycles: time from its last good values to the new ones [cycles].
+            frozen: True if the readings of the IMU do not change.
         """
         saturation, norm = self._saturation(imu), self._wrong_norm(imu)
         for value, standing in ((saturation, self.saturated), (norm, self.no_attitude)):
@@ -55,19 +62,19 @@ class Imus:
         return usable
 
     def _saturation(self, imu: int) -> float | None:
-        """The largest reading of an IMU that is at the end of its range [rad/s or m/s2], None if none is."""
+        """Return the largest reading of an IMU at the end of its range [rad/s or m/s2], or None if no axis is there."""
         for readings, end in ((self._now.gyro, self._gyro_end), (self._now.accel, self._accel_end)):
             if (most := largest(readings[imu])) >= end:
                 return most
         return None
 
     def _wrong_norm(self, imu: int) -> float | None:
-        """The norm of the quaternion of an IMU, None if it is a unit."""
+        """Return the norm of the quaternion of an IMU, or None if the norm is 1 within the tolerance."""
         squared = squared_norm(self._now.quaternion[imu])
         return None if abs(squared - 1.0) <= self._norm_error else math.sqrt(squared)
 
     def findings(self) -> tuple[Finding, ...]:
-        """What stands."""
+        """Return the present findings."""
         return (
             *(_no_attitude(imu, norm, self._given_up[imu]) for imu, norm in self.no_attitude.items()),
             *(_saturated(imu, value, self._given_up[imu]) for imu, value in self.saturated.items()),
@@ -77,12 +84,15 @@ class Imus:
 def usable(
     quaternion: Vector, gyro: Vector, accel: Vector, norm_error: float, gyro_end: float, accel_end: float
 ) -> bool:
-    """Whether every IMU is.
+    """Return whether the values of every IMU may be used.
 
     Args:
-        quaternion, gyro, accel: shapes (4, 4), (4, 3) [rad/s], (4, 3) [m/s2].
-        norm_error: what the square of a quaternion's norm may be off 1.
-        gyro_end, accel_end: readings from here on are the end of the range.
+        quaternion: attitude of each IMU, shape (4, 4), wxyz.
+        gyro: angular velocity of each IMU, shape (4, 3) [rad/s].
+        accel: specific force at each IMU, shape (4, 3) [m/s2].
+        norm_error: tolerance of the squared norm of a quaternion around 1.
+        gyro_end: angular velocity from which a gyro counts as saturated [rad/s].
+        accel_end: specific force from which an accelerometer counts as saturated [m/s2].
     """
     for imu in range(len(quaternion)):
         if not abs(squared_norm(quaternion[imu]) - 1.0) <= norm_error:
@@ -93,18 +103,18 @@ def usable(
 
 
 def squared_norm(quaternion: Vector) -> float:
-    """Shape (4,)."""
+    """Return the squared norm of a quaternion, shape (4,)."""
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     return float(w * w + x * x + y * y + z * z)
 
 
 def largest(readings: Vector) -> float:
-    """The largest magnitude of three axes, shape (3,)."""
+    """Return the largest magnitude of the readings of three axes, shape (3,)."""
     return float(max(abs(readings[0]), abs(readings[1]), abs(readings[2])))
 
 
 def _end_of_range(codec: Codec, name: str) -> float:
-    """Readings from here on are the last step of the range, which is the same of all IMUs."""
+    """Return the reading from which a signal is in the last step of its range; the range is the same for all IMUs."""
     signal = next(signal for _, signal in codec.signals if signal.name == name)
     return signal.maximum - 0.5 * signal.factor
 

@@ -1,20 +1,23 @@
-"""The legs' IMUs against their encoders: an encoder that drifts away, and one that stands still while its leg turns.
+"""Leg checks: compare the encoders of each leg with its IMUs, to detect encoders that drift or are stuck.
 
-Pelvis and tibia IMU enclose the joints FH, TH, SH and SK of a leg, whose axes are x, z, y, y of parallel frames. So the tibia's
-attitude in the pelvis is Rx(FH) Rz(TH) Ry(SH + SK), three angles that two attitudes tell and four encoders contradict or not.
+The joints FH, TH, SH and SK of a leg lie between the pelvis IMU and the tibia IMU. Their axes are x, z, y, y of parallel frames.
+So the attitude of the tibia relative to the pelvis is Rx(FH) Rz(TH) Ry(SH + SK). The two IMUs give these three angles, and the
+four encoders must agree with them.
 
-*Drift.* An encoder that drifts at rate d is found attitude_error / d later, plus `DRIFT_SAMPLES` samples: within 1000 cycles
-above 0.035 rad/s, later below. What it cannot see: SA and HA, which have no IMU behind them (all their drifts are missed here),
-SH and SK drifting opposite ways, and which of the two drifts. An IMU that drifts looks the same; of a healthy one only the turn
-about the vertical does, and that is TH.
+*Drift.* An encoder that drifts at rate d is detected after the time attitude_error / d plus `DRIFT_SAMPLES` samples: within 1000
+cycles above 0.035 rad/s, later below. Some drifts cannot be detected or separated. SA and HA have no IMU beyond them, so their
+drift is not detected. SH and SK that drift in opposite directions are not detected, and a drift of SH cannot be separated from
+a drift of SK. An IMU that drifts has the same effect as an encoder that drifts. The heading of a healthy IMU drifts as well,
+which affects only TH.
 
-*Standstill.* While an encoder repeats itself, the contradiction of its axis stays what it was if the joint stands, and becomes
-the joint's motion if it does not. A change counts, so that it is found long before `attitude_error`; what a turn of the leg about
-another axis makes of an IMU that is not mounted straight (`misalignment`) is allowed for. If SH and SK both stand still, both are
-suspected. It needs no torque, which `stillness` looks at: a joint that is moved by its neighbours is found, too.
+*Standstill.* While the reading of an encoder is constant, the difference between encoders and IMUs about its axis is also
+constant if the joint is at rest. If the joint moves, the difference changes by its motion. The check uses this change, so that a
+stuck encoder is detected long before the difference reaches `attitude_error`. The threshold includes the effect of an IMU that is
+not mounted straight (`misalignment`) when the leg turns about another axis. If the readings of SH and SK are both constant, both
+are reported. Unlike `stillness`, this check needs no torque, so it also covers a joint that is moved by its neighbours.
 
-*Age.* Values that are some cycles old are carried to this cycle at the velocity reported with them, and `velocity_error` for
-that time is allowed for.
+*Age.* Values from earlier cycles are extrapolated to this cycle with the velocity reported with them. The thresholds are extended
+by `velocity_error` for that time.
 """
 
 from __future__ import annotations
@@ -30,34 +33,35 @@ from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Finding, Signals
 from atalante_hal.wire.process_image import NEVER
 
-#: Samples of a leg on end whose attitude contradicts its encoders, or one that stands still.
+#: Number of samples in a row after which a drift and a stuck encoder are reported.
 DRIFT_SAMPLES, STANDSTILL_SAMPLES = 4, 2
-#: What the contradiction of a joint that stands still changes by without being noticed [rad each sample]: over ten times what
-#: the heading of a healthy IMU does.
+#: Change of the difference between encoder and IMUs that is ignored while the encoder reading is constant [rad per sample]. It is
+#: more than ten times the heading drift of a healthy IMU.
 _FORGOTTEN = 2e-5
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 _AXES = (("FH",), ("TH",), ("SH", "SK"))
-#: Axis of each of a leg's first four joints.
+#: Index in `_AXES` of the axis of each of the first four joints of a leg.
 _AXIS_OF = (0, 1, 2, 2)
 _HIPS = tuple(JOINTS.index(f"{side}_FH") for side in SIDES)
 
 
 class _Contradiction(NamedTuple):
-    """What a leg's IMUs and encoders said together: angles of the tibia in the pelvis, and encoders less these. rad."""
+    """Comparison of the IMUs and encoders of a leg in one sample."""
 
-    angles: tuple[float, float, float]
-    errors: tuple[float, float, float]
-    doubt: float = 0.0  # rad, by which the errors may be off because values were not of one cycle
+    angles: tuple[float, float, float]  # angles FH, TH, SH + SK from the IMUs [rad]
+    errors: tuple[float, float, float]  # encoder angles minus `angles` [rad]
+    doubt: float = 0.0  # uncertainty of the errors because the values are of different cycles [rad]
 
 
 class Legs:
-    """Both legs.
+    """Checks of both legs.
 
     Args:
-        now: what was decoded in this cycle.
-        standing: samples on end in which each encoder stood still, shape (12,), as `Stillness` counts them.
-        period: of the cycle [s].
+        robot: sensor thresholds of the robot.
+        now: signals decoded in this cycle.
+        standing: number of samples in a row in which the reading of each encoder was constant, shape (12,), from `Stillness`.
+        period: cycle time [s].
     """
 
     def __init__(self, robot: Robot, now: Signals, standing: npt.NDArray[np.int64], period: float) -> None:
@@ -68,26 +72,35 @@ class Legs:
         self._attitude_change, self._misalignment = robot.sensors.attitude_change, robot.sensors.misalignment
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
         self._standing = [standing[hip : hip + len(_AXIS_OF)] for hip in _HIPS]
-        #: Of each joint, what was said when it moved last.
+        #: Comparison at the last sample in which the encoder reading of each joint changed.
         self._moved: list[_Contradiction | None] = [None] * len(JOINTS)
-        #: Samples on end in which the leg of a joint that stands still has turned.
+        #: Joint index -> number of samples in a row in which the leg turned while the encoder reading was constant.
         self._turned: dict[int, int] = {}
         self._drifts: list[tuple[Finding, ...]] = [() for _ in SIDES]
         self._stuck: list[tuple[Finding, ...]] = [() for _ in SIDES]
 
     def judge_left(self, ages: Ages | None) -> bool:
-        """Look at the left leg, and at the right one if an encoder of it stands still.
+        """Check the left leg, and also the right leg if the reading of one of its encoders is constant.
 
         Args:
-            ages: of the values; a leg with values that are too old is not compared. None: all are of this cycle.
+            ages: ages of the sensor values; a leg with values that are too old is not compared. None if all values are of this
+                cycle.
 
         Returns:
-            Whether something stands.
+            Whether there is a finding for any leg.
         """
         return self._judge(0, ages)
 
     def judge_right(self, ages: Ages | None) -> bool:
-        """As `judge_left`, the other way round."""
+        """Check the right leg, and also the left leg if the reading of one of its encoders is constant.
+
+        Args:
+            ages: ages of the sensor values; a leg with values that are too old is not compared. None if all values are of this
+                cycle.
+
+        Returns:
+            Whether there is a finding for any leg.
+        """
         return self._judge(1, ages)
 
     def _judge(self, leg: int, ages: Ages | None) -> bool:
@@ -103,7 +116,7 @@ class Legs:
         return any(self._drifts) or any(self._stuck)
 
     def _compare(self, leg: int, ages: Ages | None) -> _Contradiction | None:
-        """Return what IMUs and encoders of a leg say of this cycle, None if a value is too old."""
+        """Compare the IMUs and encoders of a leg in this cycle; return None if a value is too old."""
         now, four, doubt = self._now, slice(_HIPS[leg], _HIPS[leg] + len(_AXIS_OF)), 0.0
         angles = now.position[four] * self._to_joint[four]
         pelvis, tibia = now.quaternion[_PELVIS].tolist(), now.quaternion[_TIBIAE[leg]].tolist()
@@ -140,7 +153,7 @@ class Legs:
                 continue
             change = said.errors[axis] - moved.errors[axis]
             turned = max(abs(angle - moved.angles[i]) for i, angle in enumerate(said.angles))
-            # Who changed while the leg did not turn is no encoder that stands still, but one that jumped or drifted before.
+            # A change of the error without a turn of the leg comes from an earlier jump or drift, and not from a stuck encoder.
             allowed = self._attitude_change + self._misalignment * turned + said.doubt + moved.doubt
             if min(abs(change), turned) <= allowed:
                 self._turned[joint] = 0
@@ -152,24 +165,25 @@ class Legs:
         self._stuck[leg] = tuple(stuck)
 
     def findings(self) -> tuple[Finding, ...]:
-        """What stands."""
+        """Return the present findings."""
         return (*self._drifts[0], *self._drifts[1], *self._stuck[0], *self._stuck[1])
 
 
 def hip_angles(pelvis: list[float], tibia: list[float]) -> tuple[float, float, float]:
-    """Angles FH, TH, SH + SK [rad] of the rotation Rx Rz Ry that takes the tibia's axes into the pelvis'.
+    """Return the angles FH, TH and SH + SK of the rotation Rx Rz Ry from the tibia frame to the pelvis frame [rad].
 
     Args:
-        pelvis, tibia: quaternions wxyz, sensor to world, unit to the precision of the wire.
+        pelvis: attitude of the pelvis IMU, quaternion wxyz, sensor to world, of unit norm within the resolution of the wire.
+        tibia: attitude of the tibia IMU, as for `pelvis`.
     """
-    # conj(pelvis) * tibia
+    # Relative attitude: conj(pelvis) * tibia.
     a, b, c, d = pelvis
     e, f, g, h = tibia
     w = a * e + b * f + c * g + d * h
     x = a * f - b * e - c * h + d * g
     y = a * g + b * h - c * e - d * f
     z = a * h - b * g + c * f - d * e
-    sine = 2.0 * (w * z - x * y)  # of TH, less the sign of the matrix entry (0, 1)
+    sine = 2.0 * (w * z - x * y)  # sine of TH, the negative of the matrix entry (0, 1)
     th = math.asin(max(-1.0, min(1.0, sine)))
     sagittal = math.atan2(2.0 * (x * z + w * y), 1.0 - 2.0 * (y * y + z * z))
     fh = math.atan2(2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + z * z))
@@ -177,12 +191,15 @@ def hip_angles(pelvis: list[float], tibia: list[float]) -> tuple[float, float, f
 
 
 def turned_on(quaternion: list[float], gyro: list[float], time: float) -> list[float]:
-    """Return an attitude some time later, to the first order in the turn.
+    """Extrapolate an attitude with a constant angular velocity, to first order.
 
     Args:
-        quaternion: wxyz, sensor to world.
-        gyro: in the sensor's frame [rad/s].
-        time: [s].
+        quaternion: present attitude, wxyz, sensor to world.
+        gyro: angular velocity in the sensor frame [rad/s], three axes.
+        time: extrapolation time [s].
+
+    Returns:
+        The attitude after that time, wxyz; its norm is 1 only to first order.
     """
     w, x, y, z = quaternion
     p, q, r = (0.5 * time * rate for rate in gyro)
@@ -195,7 +212,7 @@ def turned_on(quaternion: list[float], gyro: list[float], time: float) -> list[f
 
 
 def _forgotten(moved: _Contradiction, axis: int, change: float) -> _Contradiction:
-    """The same, a little nearer to what is said now."""
+    """Return the comparison with the error of one axis moved towards its present value, by `_FORGOTTEN` at most."""
     errors = list(moved.errors)
     errors[axis] += max(-_FORGOTTEN, min(_FORGOTTEN, change))
     return moved._replace(errors=(errors[0], errors[1], errors[2]))

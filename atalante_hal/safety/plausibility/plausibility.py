@@ -1,10 +1,11 @@
-"""The plausibility checks of one cycle, in the right order and as cheap as they can be.
+"""Schedule of the plausibility checks in each cycle.
 
-    process image -> [what stands still | velocity, norms | feet | legs, in turn] -> jump and range -> state
+    process image -> one slow check in turn (standstill, velocity, feet, legs, checks that cannot run) -> jump, range, IMUs ->
+    state
 
-A cycle in which everything is plausible costs one look at the encoders and one at the IMUs; the slow checks take turns. What
-fails is refused: its message keeps the values it had, and ages. Each check runs on the messages it needs, with the ages of
-their values: what is wrong with one message switches off no check of another.
+In a plausible cycle only the encoders and the IMUs are checked, and the slow checks take turns. The new values of a message that
+fails a check are rejected: the message keeps its previous values, and their age grows. Each check uses only the messages it
+needs, with the ages of their values. So a fault of one message does not disable a check of another message.
 """
 
 from __future__ import annotations
@@ -22,24 +23,23 @@ from atalante_hal.safety.plausibility.unchecked import Unchecked
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Cycles between two turns of what looks for standstill, wrong velocities and checks that cannot run, and of the look at the
-#: feet.
+#: Intervals of the slow checks [cycles]: `SLOW` for standstill, velocity and checks that cannot run, `FEET` for the feet.
 SLOW, FEET = 16, 4
-#: Cycles after which the turns repeat; each leg gets one.
+#: Period of the schedule [cycles]; each leg is checked once in it.
 _ROUND = 32
 _FRESH = int(Check.SOME_LOST)
 
 
 class Plausibility:
-    """Judges the decoded values of the HAL's receive image once a cycle.
+    """Plausibility checks of the decoded values in the process image of the HAL.
 
     Args:
-        robot: limits and sensors.
-        image: of the sensors' cyclic messages; what cannot be true is refused there.
-        period: of the cycle [s].
+        robot: limits and sensor thresholds of the robot.
+        image: process image of the cyclic sensor messages; implausible values are rejected there.
+        period: cycle time [s].
 
     Attributes:
-        findings: what stands; the same object while nothing changes.
+        findings: present findings; the tuple is replaced only when they change.
     """
 
     def __init__(self, robot: Robot, image: ReceiveImage, period: float) -> None:
@@ -55,23 +55,25 @@ class Plausibility:
         self._rows = Rows(codec)
         self._unchecked = Unchecked(self._rows, image.check, SLOW)
         self._joint_rows, self._imu_rows = self._rows.joint.tolist(), self._rows.imu.tolist()
-        self._foot_ages = [NEVER] * len(self._rows.foot)  # of the values the feet were judged by, when they were
-        #: Row -> cycle in which its last good values were measured; up to date while not settled.
+        self._foot_ages = [NEVER] * len(self._rows.foot)  # age of each foot's values at its last check [cycles]
+        #: Row -> cycle in which its last good values were measured; updated only while `_settled` is False.
         self._measured = dict.fromkeys((*self._joint_rows, *self._imu_rows), -NEVER)
-        #: Silenced cells, (foot, cell) -> what was measured [N], shape (3,).
+        #: (foot, cell) -> measured force [N], shape (3,), for each faulty cell whose force was replaced by zero.
         self._silenced: dict[tuple[int, int], Vector] = {}
         self._settled = False  # the last values of all rows were good, and of the cycle they came in
         self._turns = self._build_turns()
         self._cycle = 0
         self.findings: tuple[Finding, ...]
-        #: What stood when the rows were judged last: where that changes, an IMU is of no use from now on, or of use again.
+        #: Findings at the last check of all rows. If the findings change, the rows are checked again, because an IMU may have
+        #: become unusable or usable.
         self._judged: tuple[Finding, ...]
         self.findings = self._judged = ()
 
     def _build_turns(self) -> list[Callable[[Ages | None], bool] | None]:
-        """Return which slow check is made in which cycle.
+        """Return the schedule: the slow check of each cycle in a round, or None.
 
-        Each is called with the ages of the values, None if all are of this cycle, and returns whether something stands.
+        Each check is called with the ages of the sensor values, or with None if all values are of this cycle. It returns whether
+        it has findings.
         """
         turns: list[Callable[[Ages | None], bool] | None] = [None] * _ROUND
         turns[0::SLOW] = [self._sample] * (_ROUND // SLOW)
@@ -82,10 +84,10 @@ class Plausibility:
         return turns
 
     def check(self) -> tuple[Finding, ...]:
-        """Judge this cycle; call once, after the image took its frames.
+        """Run the checks of this cycle; call it once per cycle, after the process image has accepted the frames.
 
         Returns:
-            `findings`.
+            The present findings.
         """
         fresh = self._image.all_fresh
         if self._silenced:
@@ -104,10 +106,10 @@ class Plausibility:
         return self.findings
 
     def reference(self, node: str) -> None:
-        """Take the next position of a joint as its first one: its drive has restarted and referenced its encoder.
+        """Accept the next position of a joint without a jump check, because its drive has restarted and referenced its encoder.
 
         Args:
-            node: DBC name; of a node that is no drive nothing changes.
+            node: DBC name of the drive; the name of any other node has no effect.
         """
         if node not in JOINT_NODES:
             return
@@ -120,7 +122,7 @@ class Plausibility:
 
     @property
     def swing(self) -> int | None:
-        """Leg that swings while the other one stands, by its place in FEET; None: none does."""
+        """Return the index in FEET of the swing leg while the other leg stands; None if there is no swing leg."""
         return self._feet.swing
 
     def _sample(self, ages: Ages | None) -> bool:
@@ -134,13 +136,13 @@ class Plausibility:
 
     def _judge_feet(self, ages: Ages | None) -> bool:
         now = [0] * len(self._foot_ages) if ages is None else ages.foot.tolist()
-        # A foot whose values are those it was judged by before is not judged by them again.
+        # A foot without new values since its last check is not checked again.
         left, right = (age < before + FEET for age, before in zip(now, self._foot_ages, strict=True))
         self._foot_ages = now
         return self._feet.judge((left, right))
 
     def _judge_rows(self) -> None:
-        """Row by row: was it heard, and may it be used."""
+        """Check the new values of each joint and IMU row, and reject the values that may not be used."""
         measured, cycle, image = self._measured, self._cycle, self._image
         if self._settled:
             measured.update(dict.fromkeys(measured, cycle - 1))
@@ -156,7 +158,12 @@ class Plausibility:
         self._settled = all(at == cycle for at in measured.values())
 
     def _accept(self, sensor: int, cycles: int) -> bool:
-        """Whether the new values of a joint, or after the joints of an IMU, may be used."""
+        """Return whether the new values of a sensor may be used.
+
+        Args:
+            sensor: index of a joint, or number of joints plus index of an IMU.
+            cycles: time from its last good values to the new ones [cycles].
+        """
         imu = sensor - len(self._joint_rows)
         if imu < 0:
             return self._encoders.accept(sensor, cycles)
@@ -175,13 +182,13 @@ class Plausibility:
             self.findings = findings
 
     def _silence_cells(self) -> None:
-        """A cell that is stuck carries nothing: what is left of its foot are the others."""
+        """Set the force of each faulty cell to zero in the process image, so that only the other cells of its foot are used."""
         for cell in {*self._stillness.cells, *self._feet.cells}:
             self._silenced[cell] = self._force[cell].copy()
             self._force[cell] = 0.0
 
     def _restore_cells(self) -> None:
-        """Undo `_silence_cells` where no new values came: the checks judge what was measured."""
+        """Undo `_silence_cells` for a foot without new values, so that the checks use the measured forces."""
         for (foot, cell), force in self._silenced.items():
             if self._image.check[self._rows.foot[foot]] > _FRESH:
                 self._force[foot, cell] = force

@@ -1,11 +1,12 @@
-"""What stands still although it cannot: an encoder whose joint is pushed, a gyro or a force cell without its noise.
+"""Standstill checks: detect encoders that stay constant under a changing torque, and gyros or force cells without noise.
 
-Every signal is sampled every few cycles; one that repeats itself exactly is counted. A sample measured no later than the last
-one does not count, neither way.
+All signals are sampled every few cycles, and samples in a row with exactly the same value are counted. A sample that was not
+measured after the last one is ignored.
 
-An encoder may stand still: it is stuck only if the drive's torque has swung by `breakaway` since it moved last, which is over
-twice the dry friction of its joint, and if the joint is not at its end stop, which holds it against any torque. A stuck encoder
-of a joint that nobody drives is not found here until somebody does; see `legs` for those that the IMUs see.
+The reading of an encoder may be constant because the joint is at rest. An encoder is stuck only under two conditions. First, the
+torque of the drive has varied by at least `breakaway` since the reading last changed; this is more than twice the dry friction of
+the joint. Second, the joint is not at its end stop, which holds it against any torque. A stuck encoder of a joint without torque
+is not detected here until the joint is driven. The module `legs` also detects some of these with the IMUs.
 """
 
 from __future__ import annotations
@@ -26,21 +27,22 @@ from atalante_hal.safety.plausibility.finding import (
 )
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Cycles after which a standstill is found at the latest, counted from the first repeated sample.
+#: Maximum detection times for an encoder and for a gyro or force cell, from the first repeated sample [cycles].
 STUCK_CYCLES = 50
 FROZEN_CYCLES = 100
-#: A joint this near its limit is at its end stop [rad].
+#: Distance from a position limit within which a joint counts as being at its end stop [rad].
 _AT_STOP = 0.005
 _NEVER = 1 << 30
 
 
 class Stillness:
-    """Encoders, gyros and force cells that repeat themselves.
+    """Standstill checks of encoders, gyros and force cells.
 
     Args:
-        image: whose decoded values are sampled.
-        now: views of them.
-        every: cycles between two calls of `sample`.
+        robot: limits and friction of the robot.
+        image: process image whose decoded values are sampled.
+        now: views of the measured signals in these values.
+        every: interval between two calls of `sample` [cycles].
     """
 
     def __init__(self, robot: Robot, image: ReceiveImage, now: Signals, every: int) -> None:
@@ -48,21 +50,21 @@ class Stillness:
         where = measured(codec)
         self._values, self._now, self._age = image.values[where], now, image.age
         self._every = every
-        #: Age of each row's last sample when it was taken, plus the cycles since [cycles].
+        #: Time since the measurement of each row's last sample [cycles], shape (rows,).
         self._sampled_age: Cycles = np.full(len(image.age), 2 * NEVER)
         self._row_of = codec.row_of[where]
         size = len(self._values)
         self._sampled = np.full(size, np.nan)
         self._same = np.empty(size, np.bool_)
         self._repeats = np.full(size, 0)
-        # So many repetitions fit behind the first sample of a standstill, which comes up to `every` - 1 cycles late.
+        # The limits are rounded down, because the first sample of a standstill may be up to `every` - 1 cycles late.
         limit = np.full(size, _NEVER)
         limit[codec.slice("Position")] = self._to_stuck = (STUCK_CYCLES - every + 1) // every
         limit[codec.slice("Gyro")] = limit[codec.slice("Force")] = to_freeze = (FROZEN_CYCLES - every + 1) // every
         self._to_freeze = to_freeze
         self._limit = limit
         self._none_over = bytes(size)
-        #: Samples on end in which each encoder stood still, shape (12,).
+        #: Number of samples in a row in which the reading of each encoder was constant, shape (12,).
         self.standing: npt.NDArray[np.int64]
         self.standing, self._gyros, self._cells = (
             self._repeats[codec.slice(quantity)] for quantity in ("Position", "Gyro", "Force")
@@ -73,19 +75,19 @@ class Stillness:
         self._breakaway = robot.breakaway
         self._to_joint: Vector = robot.polarity / robot.gear
         self._low_stop, self._high_stop = robot.position_min + _AT_STOP, robot.position_max - _AT_STOP
-        #: Numbers of what stands still: joints, IMUs, cells (foot, cell).
+        #: Indices of the joints with a stuck encoder, of the IMUs with a frozen gyro, and of the frozen cells as (foot, cell).
         self.encoders: list[int] = []
         self.imus: list[int] = []
         self.cells: list[tuple[int, int]] = []
 
     def sample(self, whole: bool) -> bool:
-        """Compare with the last sample.
+        """Take a sample and compare it with the last one.
 
         Args:
-            whole: the values of all rows are of this cycle; otherwise the image's ages are looked up.
+            whole: True if the values of all rows are of this cycle. If False, the ages in the process image are used.
 
         Returns:
-            Whether anything stands still that cannot.
+            Whether any signal has repeated its value for too long; an encoder must pass further checks to be a finding.
         """
         same, repeats = self._same, self._repeats
         np.equal(self._values, self._sampled, same)
@@ -108,14 +110,14 @@ class Stillness:
         return over
 
     def _newer(self) -> npt.NDArray[np.bool_]:
-        """Return which values were measured after their last sample."""
+        """Return which values were measured after their last sample, shape (measured values,)."""
         self._sampled_age += self._every
         newer = self._age < self._sampled_age
         np.copyto(self._sampled_age, self._age, where=newer)
         return newer[self._row_of]
 
     def _follow_torque(self) -> None:
-        """Range of the torque since an encoder moved last."""
+        """Update the range of the torque of each joint since its encoder reading last changed."""
         first = self.standing == 1
         torque = self._now.torque
         low = np.where(first, self._sampled_torque, self._torque_low)
@@ -134,7 +136,7 @@ class Stillness:
         self.cells = [(foot, cell) for foot, cell in np.argwhere(dead).tolist()]
 
     def findings(self) -> tuple[Finding, ...]:
-        """What stands."""
+        """Return the present findings."""
         return (
             *map(self._stuck, self.encoders),
             *map(_frozen_imu, self.imus),

@@ -1,8 +1,9 @@
-"""Checks that cannot run: their messages come and carry no values, so that a fault they look for would not be found.
+"""Monitor of the checks that cannot run because their messages arrive without usable values.
 
-A check uses values up to the timeout of their message, see `finding.Rows`. A node that is silent for longer is the message
-monitor's: it ends in HOLD within 10 cycles. A node that goes on sending messages without values does not: an IMU that says that
-it has none for good leaves the robot in FULL_ASSIST, where the encoders of its leg are compared with nothing.
+A check uses values that are younger than the timeout of their message, see `finding.Rows`. If a node sends nothing for longer,
+the message monitor brings the robot to HOLD within 10 cycles. If a node keeps sending messages without values, the robot may keep
+moving. For example, an IMU that permanently sends its invalid code leaves the robot in FULL_ASSIST. Then the encoders of its leg
+are not checked against the IMUs, and this module reports it.
 """
 
 from __future__ import annotations
@@ -19,25 +20,26 @@ from atalante_hal.safety.plausibility.finding import FOOT_NODES, JOINT_NODES, Cy
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER
 
-#: Cycles on end in which a check could not run, after which it counts as failed: the slowest finds its fault in as many.
+#: Time after which a check that cannot run counts as failed [cycles]. The slowest check needs as long to detect a fault.
 UNCHECKED_CYCLES = 128
-#: Joints of a leg whose encoders are compared with the IMUs.
+#: Number of joints of a leg whose encoders are compared with the IMUs.
 _COMPARED = 4
 
 
 class _Check(NamedTuple):
     dtc: Dtc
     node: str
-    rows: list[int]  # it needs
-    what: str  # it checks
+    rows: list[int]  # rows of the process image that the check needs
+    what: str  # checked quantity, for the text of the finding
 
 
 class Unchecked:
-    """Counts for how long each check could not run.
+    """Monitor of the time for which each check could not run.
 
     Args:
-        check: `Check` of each row of the image, shape (rows,); read in each `judge`.
-        every: cycles between two calls of `judge`.
+        rows: rows and timeouts of the sensor messages.
+        check: `Check` of each row of the process image, shape (rows,); read in each `judge`.
+        every: interval between two calls of `judge` [cycles].
     """
 
     def __init__(self, rows: Rows, check: npt.NDArray[np.uint8], every: int) -> None:
@@ -47,15 +49,17 @@ class Unchecked:
         self._findings: tuple[Finding, ...] = ()
 
     def judge(self, age: Cycles | None) -> bool:
-        """Count the checks that could not run now.
+        """Update the time for which each check could not run.
+
+        The time of a check grows if one of its rows has data without usable values. It is kept if one of its rows timed out
+        without such data. Otherwise it is reset.
 
         Args:
-            age: of each row of the image [cycles], shape (rows,); from `NEVER` on it never had values, and what needs it is not
-                counted: the robot is not READY without it. None: all values are of this cycle. A check that needs a silent row
-                keeps its count.
+            age: age of each row of the process image [cycles], shape (rows,). A row with an age of `NEVER` or more never had
+                values and is not counted, because the robot cannot be READY without it. None if all values are of this cycle.
 
         Returns:
-            Whether a check could not run.
+            Whether any check could not run.
         """
         if age is None:
             self._cycles = [0] * len(self._checks)
@@ -77,12 +81,12 @@ class Unchecked:
         return bool(self._findings)
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return what stands."""
+        """Return the present findings."""
         return self._findings
 
 
 def _checks(rows: Rows) -> Iterator[_Check]:
-    """Yield the checks that compare several values; those of one value run whenever it comes."""
+    """Yield the checks that need several values; a check of a single value runs whenever the value arrives."""
     joints, imus, feet = rows.joint.tolist(), rows.imu.tolist(), rows.foot.tolist()
     for joint, row in enumerate(joints):
         yield _Check(Dtc.ENC_VELOCITY, JOINT_NODES[joint], [row], f"the velocity of {JOINTS[joint]}")
