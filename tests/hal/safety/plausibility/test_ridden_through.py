@@ -225,6 +225,7 @@ def cycles_until_found(line: Line, fault: Fault) -> int:
     raise AssertionError(f"no {fault.dtc} in {fault.bound} cycles, but {line.checks.findings}")
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", DISTURBANCES)
 def test_a_disturbance_alone_raises_nothing(name: str):
     line = Line(DISTURBANCES[name])
@@ -232,6 +233,7 @@ def test_a_disturbance_alone_raises_nothing(name: str):
         assert line.cycle(lambda said, cycle: None) == ()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", DISTURBANCES)
 def test_a_disturbance_hides_no_fault(name: str):
     for what, fault in FAULTS.items():
