@@ -151,7 +151,7 @@ def test_run_prints_a_table_or_one_object() -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("run", "F99"), "there is no fault 'F99'"),
+        (("run", "F99"), "got 'F99'"),
         (("run", "F52"), "type `pytest tests/faults/test_refusals.py"),
         (("run", "F44", "--case", "nothing like it"), "there are 2 cycles, 3 cycles"),
         (("campaign", "F52"), "F52 has no scenario"),

@@ -108,7 +108,7 @@ def test_a_robot_that_cannot_be_made_says_why(network: Network, robot: Robot) ->
 def test_an_operator_of_this_process_is_refused(network: Network, robot: Robot) -> None:
     robot_process = EmbeddedRobot()
     with (
-        pytest.raises(ValueError, match="the operator of a robot in a process of its own is there, too"),
+        pytest.raises(ValueError, match="operator must be None for a robot in a subprocess"),
         open_hal(EMBEDDED, network=network, robot=robot, operator=Operator(), robot_process=robot_process),
     ):
         raise AssertionError("made")

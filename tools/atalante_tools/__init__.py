@@ -1,1 +1,1 @@
-"""The `atalante` command line and everything it shows."""
+"""The `atalante` command line: commands, console output, and the assembly of a run."""

@@ -1,4 +1,7 @@
-"""The console entry point `atalante`: signals are handled before anything else is imported, and the exit code is decided here."""
+"""Console entry point `atalante`: installs the signal handlers, runs the command line and returns the exit code.
+
+The signal handlers are installed before any other module is imported, so that Ctrl-C during the imports ends cleanly.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import sys
 
 from atalante_tools.console.stop_request import Stopped, interruptible
 
-TYPE_CHECKING = False  # as `typing.TYPE_CHECKING`, without importing `typing`
+TYPE_CHECKING = False  # same as `typing.TYPE_CHECKING`; importing `typing` would delay the signal handlers
 if TYPE_CHECKING:
     from typing import NoReturn
 
@@ -15,7 +18,7 @@ def main() -> NoReturn:
     """Run the command line.
 
     Raises:
-        SystemExit: with the exit code of the signal that asked to stop, else with that of the command.
+        SystemExit: Always, with the exit code of the signal that stopped the command, or of the command itself.
     """
     code: object = 0
     with interruptible() as stop:
@@ -36,7 +39,7 @@ def main() -> NoReturn:
 
 
 def _made_from_stop(error: BaseException) -> bool:
-    """Whether a library turned `Stopped` into an exception of its own."""
+    """Return whether `Stopped` is the cause of this exception, which a library raised in its place."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, Stopped):

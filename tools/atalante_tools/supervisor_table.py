@@ -1,6 +1,6 @@
-"""SUPERVISOR.md: the state machine as a table, generated from `next_state` itself.
+"""Generator of SUPERVISOR.md: the state machine as tables, computed with `next_state`.
 
-`make supervisor-table` writes the page. A test fails when the page is stale.
+`make supervisor-table` writes the page. A test fails when the page is out of date.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from atalante_hal.safety.diagnostics import Dtc, Reaction
 from atalante_hal.safety.state_machine import Conditions, next_state
 from atalante_hal.types import SupervisorState
 
-#: A robot without any fault, whose operator holds the dead-man and presses nothing else.
+#: Conditions of a robot without faults, while the operator holds the dead-man switch and presses no button.
 WELL: Final = Conditions(nodes_well=True, drives_enabled=True, dead_man=True)
-#: Conditions other than diagnostics.
+#: Rows of the first table: description, and conditions without a diagnostic.
 FACTS: Final = (
     ("nothing", WELL),
     ("a node is missing or not trusted", replace(WELL, nodes_well=False)),
@@ -41,7 +41,7 @@ the worst counts. A diagnostic acts once it is confirmed. While it is pending it
 
 
 def page() -> str:
-    """Return the whole page as Markdown."""
+    """Return the text of SUPERVISOR.md."""
     started = replace(WELL, start_wanted=True)
     diagnostics = [(f"`{d}`", d.reaction.name, d.severity.value, d.meaning) for d in Dtc]
     return "\n".join(
@@ -60,7 +60,13 @@ def page() -> str:
 
 
 def a_diagnostic(reaction: Reaction) -> Dtc:
-    """Return the first diagnostic with this reaction. All diagnostics of one reaction lead to the same states."""
+    """Return the first diagnostic that has this reaction.
+
+    One is enough for the table, because all diagnostics of one reaction lead to the same states.
+
+    Args:
+        reaction: Reaction to look up.
+    """
     return next(dtc for dtc in Dtc if dtc.reaction is reaction)
 
 

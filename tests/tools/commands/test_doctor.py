@@ -224,4 +224,4 @@ def test_json_is_one_check_a_line(bare: AnyMachine) -> None:
 def test_the_embedded_robot_has_no_channel() -> None:
     result = CliRunner().invoke(cli, ["doctor", "-c", "vcan0"])
     assert result.exit_code == 2
-    assert "the embedded robot has no channel; to ask about vcan0 say -i socketcan" in result.stderr
+    assert "the embedded robot has no channel; to check vcan0, type -i socketcan -c vcan0" in result.stderr

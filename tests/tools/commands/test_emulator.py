@@ -65,7 +65,7 @@ def test_a_hal_at_the_other_end_finds_every_node_and_an_operator(
     assert result.exit_code == 130, result.stderr
     assert result.stdout == ""
     assert result.stderr.startswith(
-        "the robot is on pcan test; now, in another terminal: atalante airwalk -i pcan -c test\n"
+        "the emulated robot is on pcan test; now type in another terminal: atalante airwalk -i pcan -c test\n"
     )
     assert other.active_at is not None
     assert other.hal.missing() == []
@@ -79,7 +79,7 @@ def test_without_an_operator_the_pendant_is_somebody_elses(
 ) -> None:
     other = OtherProcess(network, robot, 500, monkeypatch)
     result = other.run("--no-operator")
-    assert "its operator is you: atalante pendant start -i pcan -c test" in result.stderr
+    assert "to operate it, type: atalante pendant start -i pcan -c test" in result.stderr
     assert other.active_at is None
     assert other.hal.state.supervisor is SupervisorState.READY
 
@@ -126,10 +126,10 @@ def test_the_status_line_counts_cycles_frames_and_drives(
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["-i", "pcan", "-c", "x", "--no-operator", "--xi", "0.5"], "--xi is what the operator sets"),
+        (["-i", "pcan", "-c", "x", "--no-operator", "--xi", "0.5"], "--xi needs the emulated operator"),
         (["-i", "pcan", "-c", "x", "--xi", "2"], "2.0 is not in the range"),
         (["-i", "pcan", "-c", "x", "--mass", "75"], "a patient needs --mass and --height"),
-        (["-i", "embedded"], "this needs a bus that other processes are on"),
+        (["-i", "embedded"], "this command needs a CAN bus, got -i embedded"),
         ([], "socketcan needs a channel: -c vcan0"),
     ],
 )

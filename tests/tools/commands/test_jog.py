@@ -69,20 +69,20 @@ def test_a_target_outside_the_limits_names_them_in_degrees(robot: Robot, index: 
     for target in (low - 0.1, high + 0.1):
         result = jog(name, "--to", repr(target))
         assert result.exit_code == 2
-        assert f"{name} goes from {low:.1f} to {high:.1f} degrees, not to {target:g}" in result.stderr
+        assert f"{name} must be from {low:.1f} to {high:.1f} degrees, got {target:g}" in result.stderr
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["left_KS", "--to", "1"], r"there is no joint 'left_KS'. Did you mean left_SK"),
-        (["elbow", "--to", "1"], "there is no joint 'elbow'. There are left_FH, left_TH,"),
-        (["left_SK", "--to", "nan"], "left_SK goes from 0.0 to 110.0 degrees, not to nan"),
-        (["left_SK", "--to", "5", "--speed", "0"], "more than 0 and at most 229 degrees a second, not at 0"),
-        (["left_SK", "--to", "5", "--speed", "500"], "at most 229 degrees a second, not at 500"),
-        (["left_SK", "--to", "5", "--speed", "nan"], "at most 229 degrees a second, not at nan"),
+        (["left_KS", "--to", "1"], "got 'left_KS'. Did you mean left_SK"),
+        (["elbow", "--to", "1"], "joint must be one of left_FH, left_TH,"),
+        (["left_SK", "--to", "nan"], "left_SK must be from 0.0 to 110.0 degrees, got nan"),
+        (["left_SK", "--to", "5", "--speed", "0"], "the speed of left_SK must be above 0 and at most 229 deg/s, got 0"),
+        (["left_SK", "--to", "5", "--speed", "500"], "at most 229 deg/s, got 500"),
+        (["left_SK", "--to", "5", "--speed", "nan"], "at most 229 deg/s, got nan"),
         (["left_SK"], "Missing option '--to'"),
-        (["left_SK", "--to", "5", "-c", "vcan0"], "to use vcan0 say -i socketcan -c vcan0"),
+        (["left_SK", "--to", "5", "-c", "vcan0"], "to use vcan0, type -i socketcan -c vcan0"),
     ],
 )
 def test_misuse_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
@@ -135,7 +135,7 @@ def test_a_joint_that_does_not_get_there_fails(prepared: Callable[[Callable[[Rig
     prepared(stand_in_its_way)
     result = jog("left_SK", "--to", "20", "--speed", "60", "--json")
     assert result.exit_code == 1
-    assert "left_SK did not reach 20 degrees: something is in its way" in result.stderr
+    assert "left_SK did not reach 20 degrees: check that the joint can move freely" in result.stderr
     assert 10.0 < json.loads(result.stdout)["reached_deg"] < 19.0
 
 

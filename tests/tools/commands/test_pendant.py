@@ -255,7 +255,7 @@ def test_a_press_of_the_new_pendant_counts_once(world: World) -> None:
 
 def test_a_pendant_that_does_not_give_way_keeps_the_pendant(world: World) -> None:
     hardware = world.active()
-    hardware._hear_another = lambda check: None  # type: ignore[method-assign]
+    hardware._other_received = lambda check: None  # type: ignore[method-assign]
     new = world.node()
     world.run(50)
     new.speak()
@@ -292,7 +292,7 @@ def test_start_presses_once_the_hal_is_ready_and_says_so(world: World, capsys: p
     operator.stay(0.6)
     said = capsys.readouterr().err
     assert said.splitlines() == [
-        "pendant in hand",
+        "the pendant is active",
         "the HAL is OFF",
         "the HAL is READY",
         "START pressed",
@@ -398,7 +398,7 @@ def test_one_start_in_fault_is_one_move_and_the_operator_is_told(
         "the HAL is FAULT",
         "START pressed",
         "the HAL is HOLD",
-        "one START is one change of state; type start to press START again",
+        "each START changes the state once; type start to press START again",
         "START pressed",
         "the HAL is ACTIVE",
         "STOP: the HAL is HOLD",
@@ -418,7 +418,7 @@ def test_a_start_that_is_refused_is_said_and_the_hal_has_the_reason(
     operator.start_wanted = True
     operator.stay(0.6)
     said = capsys.readouterr().err
-    assert "the HAL did not become ACTIVE, its events say why; type start to press START again" in said
+    assert "the HAL did not become ACTIVE, see its event log; type start to press START again" in said
     assert [event.text for event in world.hal.events if event.code == "START_REFUSED"] == [world.hal.reason]
     assert world.hal.reason.startswith("START refused: LEFT_FH: its torque limit is")
 
@@ -440,7 +440,7 @@ def test_typed_lines_are_obeyed(world: World, capsys: pytest.CaptureFixture[str]
     operator.speak_for(20)
     assert operator.node.hal is HOLD
     assert world.hal.state.assistance_factor == pytest.approx(0.25, abs=1e-4)
-    assert capsys.readouterr().err.count("is none of: start, stop, hold, xi X") == 5
+    assert capsys.readouterr().err.count("a command must be start, stop, hold or xi X") == 5
 
 
 def test_ctrl_c_is_a_stop_with_the_dead_man_released_last(world: World) -> None:
@@ -488,8 +488,8 @@ def test_no_hal_is_said_once_and_waited_for(world: World, capsys: pytest.Capture
     operator.take()
     operator.stay(3.0)
     assert capsys.readouterr().err.splitlines() == [
-        "pendant in hand",
-        "no SYNC on pcan test: no HAL is running there; waiting for one",
+        "the pendant is active",
+        "no SYNC received on pcan test: waiting for a HAL",
     ]
 
 
@@ -503,7 +503,7 @@ def test_a_start_that_leads_nowhere_is_said(world: World, capsys: pytest.Capture
     operator.start_wanted = True
     operator.stay(1.0)
     assert (
-        "the HAL did not become ACTIVE, its events say why; type start to press START again" in capsys.readouterr().err
+        "the HAL did not become ACTIVE, see its event log; type start to press START again" in capsys.readouterr().err
     )
 
 
@@ -541,7 +541,7 @@ def test_stop_without_a_hal_fails_with_a_sentence(world: World, monkeypatch: pyt
     world.running = False
     result = invoke(world, monkeypatch, "stop")
     assert result.exit_code == 1
-    assert "no SYNC on pcan test: no HAL is running there, so there is nothing to stop" in result.stderr
+    assert "no SYNC received on pcan test: start a HAL first, STOP has no effect without one" in result.stderr
 
 
 def test_start_runs_for_a_time_and_ends_in_hold(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -564,7 +564,10 @@ def test_xi_takes_over_and_sets_the_factor(world: World, monkeypatch: pytest.Mon
     [
         (["xi", "1.2", "-i", "pcan", "-c", "x"], "1.2 is not in the range 0.0<=x<=1.0"),
         (["start"], "socketcan needs a channel: -c vcan0"),
-        (["stop", "-i", "embedded"], "this needs a bus that other processes are on: -i socketcan -c vcan0"),
+        (
+            ["stop", "-i", "embedded"],
+            "this command needs a CAN bus, got -i embedded: use for example -i socketcan -c vcan0",
+        ),
         (["stop", "-c", "left_leg=a,b"], "'b' in the channel map is not BUS=CHANNEL"),
     ],
 )

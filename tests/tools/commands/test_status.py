@@ -147,7 +147,7 @@ def test_a_node_that_falls_silent_grows_old(network: Network, robot: Robot, traf
 def test_a_hal_that_is_gone_is_said_to_be(network: Network, robot: Robot, traffic: list[Frames]) -> None:
     observer, now = observe(network, robot, [*traffic, *[new_frames(0)] * 600])
     assert render(observer.report(now), TARGET).startswith(
-        "pcan test: the HAL has been silent for 600 ms; it was ACTIVE in cycle 5"
+        "pcan test: no SYNC of the HAL for 600 ms; it was ACTIVE in cycle 5"
     )
 
 
@@ -156,7 +156,7 @@ def test_what_was_never_heard_is_none_and_not_zero(network: Network, robot: Robo
     assert report.supervisor is None
     assert all(n.age_ms is None and n.late and n.state is None and n.dbc_ok is None for n in report.nodes)
     assert all(j.position_deg is None for j in report.joints)
-    assert "no HAL (no SYNC was heard)" in render(report, TARGET)
+    assert "no HAL (no SYNC received)" in render(report, TARGET)
 
 
 def test_another_dbc_and_damaged_frames_are_told(network: Network, robot: Robot, traffic: list[Frames]) -> None:
@@ -196,7 +196,7 @@ def test_foreign_frames_are_counted(network: Network, robot: Robot) -> None:
     observer.take(frames, 3, 0.001)
     report = observer.report(0.01)
     assert (report.frames, report.foreign) == (3, 3)
-    assert "3 of no message of this network" in render(report, TARGET)
+    assert "3 with an identifier unknown to this network" in render(report, TARGET)
 
 
 def test_an_emergency_is_told(network: Network, robot: Robot) -> None:
@@ -285,7 +285,7 @@ def test_silence_fails_with_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     result = invoke(monkeypatch, [], "--for", "0.1", "--json")
     assert result.exit_code == 1
     assert (
-        "nothing was heard on pcan test for 0.1 s: start a robot (atalante emulator -i pcan -c test)" in result.stderr
+        "no frame received on pcan test for 0.1 s: start a robot (atalante emulator -i pcan -c test)" in result.stderr
     )
     assert json.loads(result.stdout)["frames"] == 0
 

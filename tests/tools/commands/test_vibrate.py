@@ -51,15 +51,15 @@ def test_the_motor_runs_alone_and_is_still_afterwards(monkeypatch: pytest.Monkey
 def test_the_sentence_says_what_was_measured() -> None:
     result = vibrate("left_thigh_front", "0.5", "--for", "0.4")
     assert result.exit_code == 0
-    assert result.stdout == "left_thigh_front: asked for 0.50, measured 0.50 at most, 0.4 s\n"
+    assert result.stdout == "left_thigh_front: commanded 0.50, measured at most 0.50, for 0.4 s\n"
     assert result.stderr.endswith("the robot is in HOLD\n")
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["left_thigh_fron", "0.5"], "there is no motor 'left_thigh_fron'. Did you mean left_thigh_front"),
-        (["nose", "0.5"], f"There are {', '.join(MOTORS)}"),
+        (["left_thigh_fron", "0.5"], "got 'left_thigh_fron'. Did you mean left_thigh_front"),
+        (["nose", "0.5"], f"motor must be one of {', '.join(MOTORS)}, got 'nose'"),
         (["left_thigh_front", "50"], "50.0 is not in the range 0.0<=x<=1.0"),
         (["left_thigh_front", "0.5", "--for", "0"], "0.0 is not in the range"),
         (["left_thigh_front"], "Missing argument 'LEVEL'"),

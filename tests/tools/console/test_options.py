@@ -15,16 +15,16 @@ PATIENT = ("--mass", "75", "--height", "175")
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["demo", "--xi", "nan"], "'--xi': nan is not a number"),
-        (["airwalk", "--xi", "nan"], "'--xi': nan is not a number"),
-        (["emulator", "-i", "pcan", "-c", "x", "--xi", "nan"], "'--xi': nan is not a number"),
-        (["vibrate", "left_thigh_front", "nan"], "'LEVEL': nan is not a number"),
-        (["vibrate", "left_thigh_front", "0.3", "--for", "nan"], "'--for': nan is not a number"),
-        (["pendant", "xi", "nan", "-i", "pcan", "-c", "x"], "'X': nan is not a number"),
-        (["status", "-i", "pcan", "-c", "x", "--for", "nan"], "'--for': nan is not a number"),
-        (["validate", "-i", "pcan", "-c", "x", "--for", "nan"], "'--for': nan is not a number"),
-        (["conform", "LEFT_SK", "--torque", "nan"], "'--torque': nan is not a number"),
-        (["dbc", "busload", "--limit", "nan"], "'--limit': nan is not a number"),
+        (["demo", "--xi", "nan"], "'--xi': must be a number, got nan"),
+        (["airwalk", "--xi", "nan"], "'--xi': must be a number, got nan"),
+        (["emulator", "-i", "pcan", "-c", "x", "--xi", "nan"], "'--xi': must be a number, got nan"),
+        (["vibrate", "left_thigh_front", "nan"], "'LEVEL': must be a number, got nan"),
+        (["vibrate", "left_thigh_front", "0.3", "--for", "nan"], "'--for': must be a number, got nan"),
+        (["pendant", "xi", "nan", "-i", "pcan", "-c", "x"], "'X': must be a number, got nan"),
+        (["status", "-i", "pcan", "-c", "x", "--for", "nan"], "'--for': must be a number, got nan"),
+        (["validate", "-i", "pcan", "-c", "x", "--for", "nan"], "'--for': must be a number, got nan"),
+        (["conform", "LEFT_SK", "--torque", "nan"], "'--torque': must be a number, got nan"),
+        (["dbc", "busload", "--limit", "nan"], "'--limit': must be a number, got nan"),
         (["demo", "--seed", "-1"], "-1 is not in the range x>=0"),
         (["airwalk", "--seed", "-1"], "-1 is not in the range x>=0"),
         (["jog", "left_SK", "--to", "5", "--seed", "-1"], "-1 is not in the range x>=0"),
@@ -33,18 +33,24 @@ PATIENT = ("--mass", "75", "--height", "175")
         (["dbc", "c-code", "-o", "never", "--seed", "-1"], "-1 is not in the range x>=0"),
         (["demo", *PATIENT, "--step-length", "0"], "a step length is from 0.05 to 0.4 m, not 0 m"),
         (["demo", *PATIENT, "--step-duration", "0"], "a step duration is from"),
-        (["emulator", "-i", "virtual", "-c", "x"], "virtual stays inside one process: use an adapter, or a vcan"),
-        (["airwalk", "-i", "udp_multicast", "-c", "239.74.163.2"], "udp_multicast hands every sender its own frames"),
-        (["model", "--show", "model.xyz"], "model.xyz must end in .png or .svg or .pdf"),
-        (["gait", "solve", *PATIENT, "--plot", "gait.xyz"], "gait.xyz must end in .png or .svg or .pdf"),
-        (["gait", "solve", *PATIENT, "--animate", "gait.png"], "gait.png must end in .gif"),
-        (["gait", "solve", *PATIENT, "--out", "no/gait.json"], "there is no folder no for gait.json"),
-        (["gait", "fit", "--library", ".", "--out", "no/network.npz"], "there is no folder no for network.npz"),
-        (["model", "--urdf", "no/model.urdf"], "there is no folder no for model.urdf"),
-        (["validate", "some.log", "--html", "no/some.html"], "there is no folder no for some.html"),
+        (
+            ["emulator", "-i", "virtual", "-c", "x"],
+            "virtual works inside one process only: use a CAN adapter, or Linux vcan",
+        ),
+        (
+            ["airwalk", "-i", "udp_multicast", "-c", "239.74.163.2"],
+            "udp_multicast returns every sent frame to its sender",
+        ),
+        (["model", "--show", "model.xyz"], "must end in .png or .svg or .pdf, got model.xyz"),
+        (["gait", "solve", *PATIENT, "--plot", "gait.xyz"], "must end in .png or .svg or .pdf, got gait.xyz"),
+        (["gait", "solve", *PATIENT, "--animate", "gait.png"], "must end in .gif, got gait.png"),
+        (["gait", "solve", *PATIENT, "--out", "no/gait.json"], "the folder no of gait.json does not exist"),
+        (["gait", "fit", "--library", ".", "--out", "no/network.npz"], "the folder no of network.npz does not exist"),
+        (["model", "--urdf", "no/model.urdf"], "the folder no of model.urdf does not exist"),
+        (["validate", "some.log", "--html", "no/some.html"], "the folder no of some.html does not exist"),
     ],
 )
-def test_what_no_command_can_use_is_told_before_any_work(arguments: list[str], sentence: str) -> None:
+def test_an_invalid_option_value_is_rejected_before_any_work(arguments: list[str], sentence: str) -> None:
     result = CliRunner().invoke(cli, arguments)
     assert (result.exit_code, result.stdout) == (2, "")
     assert sentence in result.stderr

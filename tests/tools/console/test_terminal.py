@@ -76,6 +76,4 @@ def test_compiling_is_announced_once(capsys: pytest.CaptureFixture[str]) -> None
             logger.info("%s is compiled", name)
     finally:
         logger.handlers, logger.level = before
-    assert capsys.readouterr().err == (
-        "preparing machine code: some seconds, once after an installation or an update\n"
-    )
+    assert capsys.readouterr().err == ("compiling: takes some seconds, only once after an installation or an update\n")

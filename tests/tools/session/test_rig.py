@@ -213,7 +213,7 @@ def test_what_a_run_waits_for_is_said_with_what_to_type(network: Network, robot:
     with open_hal(target, network=network, robot=robot) as rig:
         rig.hal.read()
         assert waiting_for(rig) == (
-            "no node answers on virtual rig-alone; an emulated robot is `atalante emulator -i virtual -c rig-alone`"
+            "no node answers on virtual rig-alone; to start an emulated robot, type `atalante emulator -i virtual -c rig-alone`"
         )
     with embedded(network, robot, operator=Operator(starts=False)) as rig:
         rig.hal.read()
@@ -221,11 +221,9 @@ def test_what_a_run_waits_for_is_said_with_what_to_type(network: Network, robot:
         for _ in range(150):
             rig.hal.hold()
             rig.hal.read()
-        assert waiting_for(rig) == "READY: waiting for the operator of the embedded robot"
+        assert waiting_for(rig) == "READY: waiting for START of the emulated operator"
         rig.target = target
-        assert waiting_for(rig) == (
-            "READY: waiting for the operator, who is `atalante pendant start -i virtual -c rig-alone`"
-        )
+        assert waiting_for(rig) == ("READY: waiting for START; type `atalante pendant start -i virtual -c rig-alone`")
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,7 @@ def test_of_half_a_recording_there_is_a_summary_and_no_figure(
     (tmp_path / "recording.mcap").write_bytes(recording)
     leave(tmp_path, {"steps": 2}, [WALKED], Recording(("recording.mcap", "recording-1.mcap"), False, 7))
     said = capsys.readouterr().err.splitlines()
-    assert said[0].startswith("no figure: recording.mcap is not whole")
+    assert said[0].startswith("no figure: recording.mcap is incomplete")
     assert said[1] == f"in {tmp_path}: recording.mcap, recording-1.mcap, summary.json"
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert (summary["steps"], summary["shapes"][0]["shape"]) == (2, "pinched")

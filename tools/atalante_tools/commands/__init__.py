@@ -1,1 +1,1 @@
-"""The verbs of the command line, one module each."""
+"""Subcommands of `atalante` that run, emulate or observe the robot, one module per command."""

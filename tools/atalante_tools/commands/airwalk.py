@@ -1,4 +1,4 @@
-"""`atalante airwalk`: the controller side of the demo on any bus."""
+"""`atalante airwalk`: the walking controller with one guide shape, on any bus."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from atalante_tools.session.airwalk import SHAPE_NAMES, Options, run_trial, tria
     default="constant",
     show_default=True,
     metavar="NAME",
-    help=f"The guide's: {SHAPE_NAMES}.",
+    help=f"Shape of the guide: {SHAPE_NAMES}.",
 )
 @target_options(embedded=True)
 @trial_options(steps=30, out="runs/airwalk")
 def command(shape: str, target: Target, options: Options, as_json: bool) -> None:
-    """Walk in the air inside one virtual guide, on the robot or emulator of a bus.
+    """Walk in the air inside one virtual guide, on a robot or an emulator on a bus.
 
-    The operator presses START (`atalante pendant start`) and may change the assistance factor at any time. Ends in HOLD:
-    after the steps, on Ctrl-C, and when anything goes wrong.
+    The robot starts when the operator presses START (`atalante pendant start`). The operator may change the assistance
+    factor at any time. The robot ends in HOLD: after the steps, on Ctrl-C, or on an error.
 
     \b
     Example: atalante emulator -i socketcan -c vcan0     (in another terminal)

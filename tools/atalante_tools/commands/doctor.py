@@ -1,4 +1,7 @@
-"""`atalante doctor`: is this machine ready for the chosen bus, and what to type if not."""
+"""`atalante doctor`: checks whether this machine is ready for a bus, and prints the commands that make it ready.
+
+Machine (commands/machine.py) -> examine -> Check -> one line each, exit code
+"""
 
 from __future__ import annotations
 
@@ -15,36 +18,38 @@ from atalante_tools.console.terminal import show_json
 if TYPE_CHECKING:
     from atalante_tools.commands.machine import Interface, Machine
 
-#: Frames a transmit queue should hold: a cycle of all four buses is 22.
+#: Recommended length of a transmit queue, in frames. One cycle of all four buses sends 22 frames.
 QUEUE: Final = 1000
+#: MTU of a CAN FD interface, in bytes.
 FD_MTU: Final = 72
-#: Priority and memory the loop asks for.
+#: SCHED_FIFO priority of the 1 kHz loop.
 PRIORITY: Final = 50
+#: File with the real-time limits of a user.
 LIMITS: Final = "/etc/security/limits.conf"
-#: Package -> what it is for, and the extra that brings it.
+#: Python package -> its purpose, and the extra of `atalante-hal` that installs it.
 PACKAGES: Final = {
-    "pinocchio": ("the controller's model", ""),
+    "pinocchio": ("the model of the controller", ""),
     "pybullet": ("the emulated robot", "[emulator]"),
     "zenoh": ("telemetry", "[telemetry]"),
     "mcap": ("recordings", "[telemetry]"),
     "matplotlib": ("figures", "[plot]"),
 }
-#: Program -> what it is for, and the Debian package.
+#: Program -> its purpose, and the Debian package that contains it.
 PROGRAMS: Final = {
-    "candump": ("a second opinion on what is on a bus", "can-utils"),
+    "candump": ("an independent log of a bus", "can-utils"),
     "gcc": ("the C baseline of `atalante bench`", "gcc"),
 }
 
 
 @dataclass(frozen=True)
 class Check:
-    """One answer."""
+    """Result of one check. `--json` prints these fields."""
 
     name: str
     ok: bool
-    needed: bool  # for the chosen interface
-    text: str  # what is the case
-    fix: str = ""  # what to type
+    needed: bool  # whether the chosen interface requires it
+    text: str  # finding
+    fix: str = ""  # shell command that repairs it
 
 
 @click.command()
@@ -54,14 +59,16 @@ class Check:
     default=EMBEDDED,
     show_default=True,
     metavar="NAME",
-    help="What the machine is to be ready for: embedded, socketcan, or another of python-can.",
+    help="Interface to check: embedded, socketcan, or any other interface of python-can.",
 )
-@click.option("-c", "--channel", default="", metavar="CHANNEL", help="Channel, or a channel map of the four buses.")
+@click.option(
+    "-c", "--channel", default="", metavar="CHANNEL", help="Channel to check, or a channel map of the four buses."
+)
 @json_option
 def command(interface: str, channel: str, as_json: bool) -> None:
-    """Say what this machine can do, and what to type for what it cannot.
+    """Check whether this machine is ready, and print what to type if it is not.
 
-    Ends with code 1 when something is missing that the chosen interface needs. Changes nothing.
+    The exit code is 1 when something is missing that the chosen interface requires. The command changes nothing.
 
     \b
     Example: atalante doctor
@@ -80,16 +87,20 @@ def command(interface: str, channel: str, as_json: bool) -> None:
 
 
 def channels_of(interface: str, channel: str) -> list[str]:
-    """The channels of a channel map, each once.
+    """Return the channels of a channel map, without repetitions.
+
+    Args:
+        interface: Interface of the channels.
+        channel: One channel or a channel map; may be empty.
 
     Raises:
-        click.UsageError: the embedded robot has none.
-        ChannelMapError: it is not a channel map.
+        click.UsageError: If the interface is the embedded robot, which has no channel.
+        ChannelMapError: If the channel map is invalid.
     """
     if not channel:
         return []
     if interface == EMBEDDED:
-        raise click.UsageError(f"the embedded robot has no channel; to ask about {channel} say -i socketcan")
+        raise click.UsageError(f"the embedded robot has no channel; to check {channel}, type -i socketcan -c {channel}")
     import atalante_dbc
     from atalante_hal.bus.channel_map import parse_channel_map
 
@@ -97,52 +108,63 @@ def channels_of(interface: str, channel: str) -> list[str]:
 
 
 def line(check: Check) -> str:
-    """One answer for a person."""
+    """Return the text of a check for the terminal, with the fix on a second line.
+
+    Args:
+        check: Result to print.
+    """
     mark = "ok  " if check.ok else "MISS" if check.needed else "no  "
     fix = f"\n       type: {check.fix}" if check.fix and not check.ok else ""
     return f"{mark}  {check.name}: {check.text}{fix}"
 
 
 def examine(machine: Machine, interface: str, channels: Sequence[str]) -> Iterator[Check]:
-    """All answers, those about the chosen interface first."""
+    """Yield the results of all checks.
+
+    Args:
+        machine: Machine to examine.
+        interface: Interface that the user chose.
+        channels: Channels that must be ready.
+    """
     yield from _packages(machine, interface)
     yield from _socketcan(machine, interface == "socketcan", channels)
     if interface not in (EMBEDDED, "socketcan"):
         yield _python_can(interface)
     yield from _realtime(machine)
     for name, (purpose, package) in PROGRAMS.items():
-        there = machine.program(name)
-        text = f"{'there' if there else 'not there'}, for {purpose}"
-        yield Check(name, there, False, text, f"apt install {package}")
+        found = machine.program(name)
+        text = f"{'installed' if found else 'not installed'}, for {purpose}"
+        yield Check(name, found, False, text, f"apt install {package}")
 
 
 def _packages(machine: Machine, interface: str) -> Iterator[Check]:
     for name, (purpose, extra) in PACKAGES.items():
-        there = machine.package(name)
+        found = machine.package(name)
         needed = not extra or (name == "pybullet" and interface == EMBEDDED)
-        text = f"{'installed' if there else 'not installed'}, for {purpose}"
-        yield Check(name, there, needed, text, f"pip install 'atalante-hal{extra}'")
+        text = f"{'installed' if found else 'not installed'}, for {purpose}"
+        yield Check(name, found, needed, text, f"pip install 'atalante-hal{extra}'")
 
 
 def _socketcan(machine: Machine, needed: bool, channels: Sequence[str]) -> Iterator[Check]:
-    refusal = machine.can_socket()
-    here = refusal is None
-    boot = "modprobe can-raw; where there is no such module, `make test-vcan` boots a kernel that has it"
-    yield Check("AF_CAN", here, needed, "the kernel has SocketCAN" if here else f"no SocketCAN ({refusal})", boot)
-    loaded = here and machine.vcan()
+    error = machine.can_socket()
+    supported = error is None
+    boot = "modprobe can-raw; without that module, use `make test-vcan`, which boots a kernel that has it"
+    text = "the kernel has SocketCAN" if supported else f"no SocketCAN ({error})"
+    yield Check("AF_CAN", supported, needed, text, boot)
+    loaded = supported and machine.vcan()
     wants_virtual = any(channel.startswith("vcan") for channel in channels)
-    text = "virtual CAN interfaces can be made" if loaded else "the vcan module is not loaded"
+    text = "virtual CAN interfaces can be created" if loaded else "the vcan module is not loaded"
     yield Check("vcan", loaded, needed and wants_virtual, text, "modprobe vcan")
-    there = {interface.name: interface for interface in machine.interfaces()} if here else {}
-    for name in dict.fromkeys([*channels, *there]) if needed or not channels else there:
-        yield _interface(name, there.get(name), needed and name in channels)
-    if not there and not channels:
+    present = {interface.name: interface for interface in machine.interfaces()} if supported else {}
+    for name in dict.fromkeys([*channels, *present]) if needed or not channels else present:
+        yield _interface(name, present.get(name), needed and name in channels)
+    if not present and not channels:
         yield Check("interfaces", False, needed, "there is no CAN interface", _create("vcan0"))
 
 
 def _interface(name: str, interface: Interface | None, needed: bool) -> Check:
     if interface is None:
-        return Check(name, False, needed, "there is no such interface", _create(name))
+        return Check(name, False, needed, "this interface does not exist", _create(name))
     size = f"mtu {FD_MTU}" if interface.virtual else "type can bitrate 1000000 dbitrate 5000000 fd on"
     if interface.mtu < FD_MTU:
         text, fix = f"classic CAN only (mtu {interface.mtu})", f"ip link set {name} down; ip link set {name} up {size}"
@@ -150,10 +172,10 @@ def _interface(name: str, interface: Interface | None, needed: bool) -> Check:
             fix = f"ip link set {name} down; ip link set {name} {size} up"
         return Check(name, False, needed, text, fix)
     if not interface.up:
-        return Check(name, False, needed, "it is down", f"ip link set {name} up")
+        return Check(name, False, needed, "the interface is down", f"ip link set {name} up")
     if interface.queue < QUEUE:
-        # Works, until the other side is slow for some cycles.
-        text = f"CAN FD, up, but only {interface.queue} frames fit its transmit queue"
+        # A short queue overflows only when the receiver is slow for some cycles, so this is no error.
+        text = f"CAN FD, up, but its transmit queue holds only {interface.queue} frames"
         return Check(name, False, False, text, f"ip link set {name} txqueuelen {QUEUE}")
     return Check(name, True, needed, f"CAN FD, up, txqueuelen {interface.queue}")
 
@@ -166,7 +188,7 @@ def _python_can(interface: str) -> Check:
     import can
 
     known = interface in can.VALID_INTERFACES
-    text = f"python-can {'knows' if known else 'does not know'} {interface}"
+    text = f"python-can {'supports' if known else 'does not support'} {interface}"
     return Check("python-can", known, True, text, f"choose one of {', '.join(sorted(can.VALID_INTERFACES))}")
 
 
@@ -176,13 +198,13 @@ def _realtime(machine: Machine) -> Iterator[Check]:
         "real-time priority",
         priority >= PRIORITY,
         False,
-        f"SCHED_FIFO up to {priority}" if priority else "no SCHED_FIFO: the loop may be late on the wall clock",
+        f"SCHED_FIFO up to {priority}" if priority else "no SCHED_FIFO: cycles may be late on the wall clock",
         f"echo '@realtime - rtprio {PRIORITY}' >> {LIMITS}; usermod -aG realtime $USER; log in again",
     )
     yield Check(
         "locked memory",
         memory is None,
         False,
-        "without limit" if memory is None else f"at most {memory // 1024} KiB: a page fault may make a cycle late",
+        "unlimited" if memory is None else f"at most {memory // 1024} KiB: a page fault may delay a cycle",
         f"echo '@realtime - memlock unlimited' >> {LIMITS}; usermod -aG realtime $USER; log in again",
     )

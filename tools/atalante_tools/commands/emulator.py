@@ -1,4 +1,7 @@
-"""`atalante emulator`: be the robot on a bus, until Ctrl-C."""
+"""`atalante emulator`: emulates the robot on a bus until Ctrl-C.
+
+HAL in another process <- bus -> Line -> Emulator -> PyBullet body
+"""
 
 from __future__ import annotations
 
@@ -17,43 +20,43 @@ if TYPE_CHECKING:
     from atalante_emulator.emulator import Emulator
     from atalante_tools.commands.emulator_line import Line
 
-#: Seconds between two status lines.
+#: Time between two status lines [s].
 STATUS_PERIOD: Final = 1.0
-#: Longest wait for a SYNC in lock-step before looking whether to stop [s].
+#: Longest wait for a SYNC in lock-step before the stop request is checked [s].
 LOOK_UP: Final = 0.1
 
 
 @click.command()
 @target_options(embedded=False)
-@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Of the sensors' noise.")
+@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the sensor noise.")
 @click.option(
     "--operator/--no-operator",
     default=True,
     show_default=True,
-    help="Hold the pendant too and press START when the HAL is ready; otherwise that is `atalante pendant`.",
+    help="Emulate the pendant too, and press START when the HAL is ready. Without it, run `atalante pendant`.",
 )
 @click.option(
     "--xi",
     type=Between(0.0, 1.0),
     metavar="X",
-    help="Assistance factor the operator sets.  [default: none, the HAL's own stays]",
+    help="Assistance factor set by the emulated operator, 0 to 1.  [default: the factor of the HAL]",
 )
 @patient_options(legs=False)
 def command(target: Target, seed: int, operator: bool, xi: float | None, patient: Patient | None) -> None:
-    """Be the robot on a bus: drives, IMUs, feet, motors and, unless told otherwise, the operator's pendant.
+    """Emulate the robot on a bus: drives, IMUs, feet, vibration motors and the operator's pendant.
 
-    With --wall a millisecond is a millisecond, HAL or not; with --lockstep time goes on with each SYNC alone. An interface that
-    goes down is waited for.
+    With --wall the emulator runs in real time. With --lockstep it advances by one cycle at each SYNC of the HAL. If the
+    interface goes down, the emulator waits until it is up again.
 
-    With --mass and --height its legs are as long as that patient needs them, as `atalante airwalk` with the same two expects.
-    Nobody is in it: it hangs in the air and weighs what it weighs empty.
+    --mass and --height adjust the leg lengths to a patient; give `atalante airwalk` the same values. The emulated
+    exoskeleton is empty and suspended in the air.
 
     \b
     Example: atalante emulator -i socketcan -c vcan0
              atalante emulator -i socketcan -c vcan0 --mass 75 --height 175
     """
     if xi is not None and not operator:
-        raise click.UsageError("--xi is what the operator sets: leave --no-operator out, or use `atalante pendant xi`")
+        raise click.UsageError("--xi needs the emulated operator: remove --no-operator, or use `atalante pendant xi`")
     import atalante_dbc
     from atalante_control.model import ExoskeletonParameters
     from atalante_hal.robot import load_robot
@@ -74,9 +77,9 @@ def command(target: Target, seed: int, operator: bool, xi: float | None, patient
         try:
             pendant = Operator(xi) if operator else None
             emulator = Emulator(network, robot, body, bus, seed=seed, operator=pendant)
-            say(f"the robot is on {target}; now, in another terminal: {other_side}")
+            say(f"the emulated robot is on {target}; now type in another terminal: {other_side}")
             if not operator:
-                say(f"its operator is you: atalante pendant start {target.arguments}")
+                say(f"to operate it, type: atalante pendant start {target.arguments}")
             answer(emulator, target, over(stop, emulator, bus))
         finally:
             bus.close()
@@ -84,7 +87,13 @@ def command(target: Target, seed: int, operator: bool, xi: float | None, patient
 
 
 def answer(emulator: Emulator, target: Target, is_over: Callable[[], bool]) -> None:
-    """Be the robot until `is_over()`."""
+    """Emulate the robot until `is_over()` returns True.
+
+    Args:
+        emulator: Emulator on its bus.
+        target: Bus and clock.
+        is_over: Called once per cycle, or at the latest every `LOOK_UP` seconds.
+    """
     if target.lockstep:
         while not is_over():
             emulator.poll(LOOK_UP)
@@ -93,7 +102,13 @@ def answer(emulator: Emulator, target: Target, is_over: Callable[[], bool]) -> N
 
 
 def over(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[[], bool]:
-    """Whether to stop; prints the status line on the way."""
+    """Return the end condition of the emulator: a function that prints the status line and returns whether to stop.
+
+    Args:
+        stop: Stop request of the process.
+        emulator: Emulator whose status is printed.
+        bus: Bus of the emulator.
+    """
     progress = Progress(period=STATUS_PERIOD)
     has_pendant = emulator.operator is not None
 
@@ -102,7 +117,7 @@ def over(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[[], bool]
         if has_pendant and bus.pendant_given_away:
             has_pendant = False
             progress.clear()
-            say("another pendant speaks: the emulated operator has put his down")
+            say("another pendant sends: the emulated pendant has stopped")
         if stop.wanted:
             progress.clear()
         elif progress.due():
@@ -113,7 +128,12 @@ def over(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[[], bool]
 
 
 def status_line(emulator: Emulator, bus: Line) -> str:
-    """Cycles, frames, drive states, and what is wrong with the interface."""
+    """Return the status line: cycles, frames, drive states, and the error of an interface that is down.
+
+    Args:
+        emulator: Emulator to report.
+        bus: Bus of the emulator.
+    """
     states = Counter(state.name for state in emulator.drives.state)
     drives = ", ".join(f"{count} {name}" for name, count in states.items())
     lost = f", {emulator.frames_lost} lost" if emulator.frames_lost else ""

@@ -1,4 +1,4 @@
-"""The bus of `atalante emulator`: HAL -> bus -> Line -> nodes, and back."""
+"""Bus of `atalante emulator`: HAL <-> bus <-> Line <-> emulated nodes."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from atalante_hal.wire.frame import Frames
 
 
 class Line(WrappedBus):
-    """The emulated robot's bus: counts frames, and gives the pendant away.
+    """Bus of the emulated robot: counts frames, and yields to another pendant.
 
-    When somebody else speaks as the pendant, the emulated operator's own frames are kept back from then on, as a pendant
-    process falls silent for a newer one.
+    After a frame of another pendant the frames of the emulated pendant are dropped, as a pendant process stops sending when a
+    newer one starts.
 
-    An interface that goes down is silence, as a pulled plug is to a robot: what the nodes say reaches nobody until it is up.
+    While the interface is down, sent frames are dropped and no frames are received, as with a disconnected cable.
 
     Attributes:
-        sent, received: frames so far.
-        down: what the interface says while it is down; empty: nothing is wrong.
-        pendant_given_away: somebody else speaks as the pendant.
+        sent: Number of frames sent so far.
+        received: Number of frames received so far.
+        down: Error message of the interface while it is down; empty while it is up.
+        pendant_given_away: Whether another pendant has sent a frame.
     """
 
     def __init__(self, bus: Bus, pendant_id: int) -> None:
@@ -32,7 +33,11 @@ class Line(WrappedBus):
         self.pendant_given_away = False
 
     def send(self, frames: Frames) -> None:
-        """As `Bus.send`, without `BusDown`."""
+        """Send frames as `Bus.send`, but drop them while the interface is down.
+
+        Args:
+            frames: Frames to send.
+        """
         if self.pendant_given_away:
             frames = self._without_pendant(frames)
         try:
@@ -44,7 +49,12 @@ class Line(WrappedBus):
             self.sent += len(frames)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """As `Bus.receive`, without `BusDown`: after `timeout` [s] nothing has come."""
+        """Receive frames as `Bus.receive`, but return 0 after the timeout while the interface is down.
+
+        Args:
+            frames: Buffer that takes the received frames.
+            timeout: Longest wait for the first frame [s].
+        """
         try:
             count = super().receive(frames, timeout)
         except BusDown as error:
@@ -57,6 +67,6 @@ class Line(WrappedBus):
         return count
 
     def _without_pendant(self, frames: Frames) -> Frames:
-        """The batch less the pendant's frame; a batch without it is itself."""
+        """Return the frames without those of the pendant; the same array if there are none."""
         kept = frames["can_id"] != self._pendant_id
         return frames if kept.all() else frames[kept]

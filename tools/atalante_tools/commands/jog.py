@@ -1,4 +1,4 @@
-"""`atalante jog`: one joint to an angle, all others stay where they are."""
+"""`atalante jog`: moves one joint to an angle and holds all others."""
 
 from __future__ import annotations
 
@@ -17,29 +17,31 @@ if TYPE_CHECKING:
     from atalante_hal.robot import Robot
     from atalante_hal.types import State
 
-#: Longest time after the move for the joint to come to rest [s], and the error and speed that count as that.
+#: Longest time after the move for the joint to come to rest [s].
 SETTLE: Final = 1.0
+#: Largest error [rad] and speed [rad/s] of a joint at rest.
 RESTED: Final = (math.radians(0.05), math.radians(0.5))
-#: A joint that ends further off did not get there [rad].
+#: Largest error at the end of the move; with a larger one the command fails [rad].
 TOLERANCE: Final = math.radians(1.0)
 
 
 @click.command()
 @click.argument("joint")
-@click.option("--to", "degrees", type=float, required=True, metavar="DEG", help="Angle to go to [degrees].")
+@click.option("--to", "degrees", type=float, required=True, metavar="DEG", help="Target angle of the joint [degrees].")
 @click.option(
-    "--speed", type=float, default=20.0, show_default=True, metavar="DEG_S", help="Fastest on the way [deg/s]."
+    "--speed", type=float, default=20.0, show_default=True, metavar="DEG_S", help="Peak speed of the move [deg/s]."
 )
-@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Of the embedded robot's noise.")
+@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the sensor noise.")
 @target_options(embedded=True)
 @json_option
 def command(joint: str, degrees: float, speed: float, seed: int, target: Target, as_json: bool) -> None:
-    """Move one joint to an angle in degrees; the others hold the pose they are in.
+    """Move one joint to an angle in degrees. All other joints hold their pose.
 
     JOINT is left_ or right_ and FH, TH, SH (hip: frontal, transverse, sagittal), SK (knee), SA or HA (ankle: sagittal, henke).
-    An angle the joint does not reach is answered with its range.
+    For an angle out of range, the error message shows the range of the joint.
 
-    The operator has to press START (`atalante pendant start`); the embedded robot has one who does. Ends in HOLD.
+    The robot moves when the operator presses START (`atalante pendant start`). The embedded robot has an
+    emulated operator that presses START. The robot ends in HOLD.
 
     \b
     Example: atalante jog left_SK --to 30
@@ -54,11 +56,11 @@ def command(joint: str, degrees: float, speed: float, seed: int, target: Target,
     robot = load_robot()
     move = Move(index, _angle(robot, index, name, degrees), _speed(robot, index, name, speed))
     controller = PoseHold(robot, move=move)
-    came_from: list[float] = []
+    start_angle: list[float] = []
 
     def done(state: State) -> bool:
-        if not came_from:
-            came_from.append(float(state.position[index]))
+        if not start_angle:
+            start_angle.append(float(state.position[index]))
         left = controller.elapsed - controller.duration
         rested = abs(state.position[index] - move.target) < RESTED[0] and abs(state.velocity[index]) < RESTED[1]
         return left >= SETTLE or (left >= 0.0 and bool(rested))
@@ -74,7 +76,7 @@ def command(joint: str, degrees: float, speed: float, seed: int, target: Target,
         reached = float(rig.hal.state.position[index])
     result = {
         "joint": name,
-        "from_deg": round(math.degrees(came_from[0]), 3),
+        "from_deg": round(math.degrees(start_angle[0]), 3),
         "to_deg": degrees,
         "reached_deg": round(math.degrees(reached), 3),
         "error_deg": round(math.degrees(reached - move.target), 3),
@@ -88,21 +90,19 @@ def command(joint: str, degrees: float, speed: float, seed: int, target: Target,
             f"{result['error_deg']:+.2f} deg off {degrees:g} deg"
         )
     if abs(reached - move.target) > TOLERANCE:
-        raise Failed(f"{name} did not reach {degrees:g} degrees: something is in its way")
+        raise Failed(f"{name} did not reach {degrees:g} degrees: check that the joint can move freely")
     say("the robot is in HOLD")
 
 
 def _angle(robot: Robot, index: int, name: str, degrees: float) -> float:
     low, high = math.degrees(robot.position_min[index]), math.degrees(robot.position_max[index])
     if not low <= degrees <= high:
-        raise click.UsageError(f"{name} goes from {low:.1f} to {high:.1f} degrees, not to {degrees:g}")
+        raise click.UsageError(f"{name} must be from {low:.1f} to {high:.1f} degrees, got {degrees:g}")
     return math.radians(degrees)
 
 
 def _speed(robot: Robot, index: int, name: str, speed: float) -> float:
     limit = math.degrees(robot.velocity_max[index])
     if not 0.0 < speed <= limit:
-        raise click.UsageError(
-            f"{name} moves at more than 0 and at most {limit:.0f} degrees a second, not at {speed:g}"
-        )
+        raise click.UsageError(f"the speed of {name} must be above 0 and at most {limit:.0f} deg/s, got {speed:g}")
     return math.radians(speed)

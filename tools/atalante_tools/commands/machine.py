@@ -1,4 +1,4 @@
-"""What `atalante doctor` asks the machine it runs on; nothing here judges."""
+"""Facts about this machine for `atalante doctor`: CAN interfaces, limits, packages, programs."""
 
 from __future__ import annotations
 
@@ -10,58 +10,67 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
 
-#: ARPHRD_CAN of linux/if_arp.h, IFF_UP of linux/if.h.
+#: Type of a CAN interface: ARPHRD_CAN of linux/if_arp.h.
 _CAN: Final = 280
+#: Flag of an interface that is up: IFF_UP of linux/if.h.
 _UP: Final = 1
-#: Bits of linux/capability.h.
+#: Bit numbers of capabilities in linux/capability.h.
 _CAP_IPC_LOCK: Final = 14
 _CAP_SYS_NICE: Final = 23
 
 
 @dataclass(frozen=True)
 class Interface:
-    """One CAN interface of the kernel."""
+    """CAN interface of the Linux kernel."""
 
     name: str
     virtual: bool
     up: bool
-    mtu: int  # 72 carries CAN FD
-    queue: int  # txqueuelen
+    mtu: int  # bytes; 72 for CAN FD, 16 for classic CAN
+    queue: int  # length of the transmit queue (txqueuelen), in frames
 
 
 class Machine(Protocol):
-    """The questions."""
+    """Interface of a machine that `atalante doctor` examines; the tests replace it."""
 
     def can_socket(self) -> str | None:
-        """Why no AF_CAN socket can be made; None: it can."""
+        """Return the error of opening an AF_CAN socket, or None on success."""
 
     def vcan(self) -> bool:
-        """Whether the kernel can make virtual CAN interfaces, with its module loaded."""
+        """Return whether the kernel module for virtual CAN interfaces is loaded."""
 
     def interfaces(self) -> list[Interface]:
-        """CAN interfaces there are."""
+        """Return all CAN interfaces of the kernel."""
 
     def realtime_priority(self) -> int:
-        """Highest SCHED_FIFO priority this user may ask for; 0: none."""
+        """Return the highest SCHED_FIFO priority that this user may request, 0 for none."""
 
     def locked_memory(self) -> int | None:
-        """Bytes this user may lock; None: without limit."""
+        """Return the memory that this user may lock in bytes, or None for unlimited."""
 
     def package(self, name: str) -> bool:
-        """Whether a Python package is installed."""
+        """Return whether a Python package is installed.
+
+        Args:
+            name: Import name of the package.
+        """
 
     def program(self, name: str) -> bool:
-        """Whether a program is on the path."""
+        """Return whether a program is on the search path.
+
+        Args:
+            name: Name of the program.
+        """
 
 
 class ThisMachine:
-    """Linux, as /sys, setrlimit(2) and the import system tell."""
+    """This Linux machine, read from /sys, /proc, getrlimit(2) and the import system."""
 
     def __init__(self, sys: Path = Path("/sys")) -> None:
         self._sys = sys
 
     def can_socket(self) -> str | None:
-        """See `Machine`."""
+        """Return the error of opening an AF_CAN socket, or None on success."""
         try:
             socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
         except OSError as error:
@@ -69,11 +78,11 @@ class ThisMachine:
         return None
 
     def vcan(self) -> bool:
-        """See `Machine`."""
+        """Return whether /sys lists the vcan module or a virtual CAN interface."""
         return (self._sys / "module/vcan").exists() or any(interface.virtual for interface in self.interfaces())
 
     def interfaces(self) -> list[Interface]:
-        """See `Machine`."""
+        """Return all CAN interfaces in /sys/class/net, sorted by name."""
         found = []
         for entry in sorted((self._sys / "class/net").glob("*")):
             if not (entry / "type").is_file() or int((entry / "type").read_text()) != _CAN:
@@ -84,20 +93,28 @@ class ThisMachine:
         return found
 
     def realtime_priority(self) -> int:
-        """See `Machine`."""
+        """Return 99 with CAP_SYS_NICE, otherwise the limit RLIMIT_RTPRIO."""
         return 99 if _capable(_CAP_SYS_NICE) else resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
 
     def locked_memory(self) -> int | None:
-        """See `Machine`."""
+        """Return the limit RLIMIT_MEMLOCK in bytes, or None if it is unlimited or CAP_IPC_LOCK is set."""
         limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
         return None if _capable(_CAP_IPC_LOCK) or limit == resource.RLIM_INFINITY else limit
 
     def package(self, name: str) -> bool:
-        """See `Machine`."""
+        """Return whether the import system finds the package.
+
+        Args:
+            name: Import name of the package.
+        """
         return importlib.util.find_spec(name) is not None
 
     def program(self, name: str) -> bool:
-        """See `Machine`."""
+        """Return whether the program is on the search path.
+
+        Args:
+            name: Name of the program.
+        """
         return shutil.which(name) is not None
 
 

@@ -1,4 +1,4 @@
-"""What somebody who only listens knows of the robot: `frames -> process image of the whole network -> Report`."""
+"""Passive observer of a bus: `frames -> process image of all messages -> Report`."""
 
 from __future__ import annotations
 
@@ -12,32 +12,33 @@ from atalante_hal.safety.diagnostics import by_number
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Signals that hold a node's own state, in the order in which they tell more.
+#: Signals that hold the state of a node. The first one that a node sends is shown.
 _STATES: Final = ("HalState", "DriveState", "ImuState", "FootState", "NodeState")
+#: Milliseconds per second.
 MS: Final = 1000.0
-#: A node older than this does not speak any more, however slow the cycle is [ms].
+#: Age from which a node counts as lost, also when cycles are slower than real time [ms].
 GONE: Final = 500
 
 
 @dataclass(frozen=True)
 class NodeReport:
-    """One node as its frames describe it; None: it did not say."""
+    """State of one node, read from its frames. A field is None while the node has not sent it."""
 
     node: str
     kind: str
-    age_ms: int | None  # since its fastest message; None: never heard
-    late: bool  # older than the DBC's timeout
+    age_ms: int | None  # since the last frame of its fastest message; None: no frame received
+    late: bool  # whether the age exceeds the timeout of the DBC
     state: str | None
     dbc_ok: bool | None
     supply_v: float | None
     temperature_degc: float | None
     error_flags: int | None
-    emergency: str | None  # the last one
+    emergency: str | None  # code and register of the last emergency
 
 
 @dataclass(frozen=True)
 class JointReport:
-    """One joint, on the joint's side of the gear, in the units of the terminal; None: not heard."""
+    """State of one joint on the output side of its gear. A field is None while no frame was received."""
 
     joint: str
     position_deg: float | None
@@ -48,29 +49,35 @@ class JointReport:
 
 @dataclass(frozen=True)
 class Report:
-    """Everything heard so far; load and frame count are of the time since the last report."""
+    """State of all nodes and joints. Bus load and frame counts cover the time since the previous report."""
 
     seconds: float
     supervisor: str | None
     cycle: int | None
     assistance_factor: float | None
     overruns: int | None
-    diagnostic: str | None  # the worst that is active; None: none is
+    diagnostic: str | None  # most severe active diagnostic; None: none is active
     dead_man: bool | None
     nodes: tuple[NodeReport, ...]
     joints: tuple[JointReport, ...]
-    load: dict[str, tuple[float, float]]  # bus: measured, the DBC's worst case; shares of its time
+    load: dict[str, tuple[float, float]]  # bus -> measured load and worst case of the DBC, as shares of time (0 to 1)
     frames: int
-    foreign: int  # frames that are no message of the network
+    foreign: int  # frames with an identifier that the network does not have
     crc_errors: int
     dropped: int
 
 
 class Observer:
-    """Collects the frames of all nodes."""
+    """Collector of the frames of all nodes, from which it makes reports."""
 
     def __init__(self, network: Network, robot: Robot, now: float) -> None:
-        """Begin at `now` [s]."""
+        """Start to observe.
+
+        Args:
+            network: Network of the bus.
+            robot: Robot whose gears and polarities convert motor values to joint values.
+            now: Current time [s].
+        """
         self._network, self._robot = network, robot
         self._image = ReceiveImage(network.messages)
         self._wire_time = {
@@ -87,7 +94,13 @@ class Observer:
         self._frames = self._foreign = 0
 
     def take(self, frames: Frames, count: int, now: float) -> None:
-        """`frames[:count]` have arrived by `now` [s]."""
+        """Accept received frames.
+
+        Args:
+            frames: Buffer whose first `count` elements are new frames.
+            count: Number of new frames.
+            now: Current time [s].
+        """
         elapsed = int((now - self._aged_to) * MS)
         self._aged_to += elapsed / MS
         self._image.new_cycle(elapsed)
@@ -102,7 +115,12 @@ class Observer:
                 self._busy[known[0]] += known[1]
 
     def report(self, now: float, dropped: int = 0) -> Report:
-        """What is known; measuring of load and frames begins anew."""
+        """Return the current report, and restart the measurement of load and frame counts.
+
+        Args:
+            now: Current time [s].
+            dropped: Number of frames that the bus dropped.
+        """
         hal = next(node for node in self._network.nodes if node.kind == "master")
         sync = max(self._fast(hal), key=lambda m: -self._age(m))
         pendant = self._network.message("PENDANT_STATE")
@@ -132,7 +150,7 @@ class Observer:
     def _fast(self, node: Node) -> list[Message]:
         cyclic = [m for m in self._network.sent_by(node.name) if m.cycle_ms]
         fastest = min(m.cycle_ms for m in cyclic)
-        if node.kind == "master":  # its commands may fail to come for reasons of their own
+        if node.kind == "master":  # commands are sent only while ACTIVE, SYNC always
             return [m for m in cyclic if m.name.startswith("SYNC_")]
         return [m for m in cyclic if m.cycle_ms == fastest]
 
@@ -147,7 +165,7 @@ class Observer:
         age = self._age(message)
         status = f"{node.name}_STATUS"
         states = [self._choice(m, s) for s in _STATES for m in (message.name, status)]
-        their_hash = self._value(status, "DbcHash")
+        received_hash = self._value(status, "DbcHash")
         flags = self._value(status, "ErrorFlags")
         return NodeReport(
             node=node.name,
@@ -155,7 +173,7 @@ class Observer:
             age_ms=None if age >= NEVER else age,
             late=self._late(message),
             state=next((state for state in states if state is not None), None),
-            dbc_ok=None if their_hash is None else their_hash == self._network.hash32,
+            dbc_ok=None if received_hash is None else received_hash == self._network.hash32,
             supply_v=self._value(status, "SupplyVoltage"),
             temperature_degc=self._value(message.name, "Temperature"),
             error_flags=None if flags is None else int(flags),
@@ -180,7 +198,7 @@ class Observer:
         )
 
     def _value(self, message: str, signal: str) -> float | None:
-        """The last good value; None: the message never came, or the network has no such signal."""
+        """Return the last valid value, or None without a received message or without such a signal in the network."""
         row = self._image.codec.rows.get(message)
         if row is None or self._image.age[row] >= NEVER:
             return None
@@ -197,7 +215,11 @@ class Observer:
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """The report as one JSON object."""
+    """Return the report as a JSON object.
+
+    Args:
+        report: Report to convert.
+    """
     value = asdict(report)
     value["load"] = {bus: {"measured": load[0], "worst_case": load[1]} for bus, load in report.load.items()}
     return value

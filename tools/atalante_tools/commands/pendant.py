@@ -1,4 +1,7 @@
-"""`atalante pendant`: be the operator, from any process on the bus."""
+"""`atalante pendant`: acts as the operator's pendant, from any process on the bus.
+
+keyboard -> Session -> PendantNode -> bus -> HAL
+"""
 
 from __future__ import annotations
 
@@ -24,15 +27,16 @@ for_option = click.option(
     "seconds",
     type=Between(0.01, 86400.0),
     metavar="SECONDS",
-    help="End after so long [s], with STOP; otherwise on Ctrl-C.",
+    help="Time until STOP is pressed and the command ends [s].  [default: until Ctrl-C]",
 )
 
 
 @click.group()
 def command() -> None:
-    """Be the operator of the robot on a bus. One pendant speaks at a time: a new one takes over from the one before.
+    """Act as the operator's pendant of the robot on a bus.
 
-    While `start` and `xi` run they hold the dead-man, and take typed lines: start, stop, hold, xi 0.3.
+    Only one pendant sends at a time: a new pendant takes over from the previous one. While `start` and `xi` run, they hold
+    the dead-man switch and read commands from the keyboard: start, stop, hold, xi 0.3.
 
     \b
     Example: atalante pendant start -i socketcan -c vcan0
@@ -41,11 +45,13 @@ def command() -> None:
     """
 
 
-@command.command(short_help="Hold the dead-man, press START, and stay.")
+@command.command(short_help="Hold the dead-man switch and press START.")
 @target_options(embedded=False, clock=False)
 @for_option
 def start(target: Target, seconds: float | None) -> None:
-    """Hold the dead-man, press START when the HAL is READY or in HOLD, and stay. Ctrl-C is STOP.
+    """Hold the dead-man switch, and press START when the HAL is in READY or HOLD.
+
+    The command runs until Ctrl-C, which presses STOP.
 
     \b
     Example: atalante pendant start -i socketcan -c vcan0
@@ -57,12 +63,14 @@ def start(target: Target, seconds: float | None) -> None:
     raise SystemExit(operator.stop.exit_code)
 
 
-@command.command(short_help="Set the assistance factor, and stay.")
+@command.command(short_help="Set the assistance factor and hold the dead-man switch.")
 @click.argument("factor", metavar="X", type=Between(0.0, 1.0))
 @target_options(embedded=False, clock=False)
 @for_option
 def xi(factor: float, target: Target, seconds: float | None) -> None:
-    """Set the assistance factor to X, from 0 (patient alone) to 1 (robot alone), hold the dead-man, and stay.
+    """Set the assistance factor to X, from 0 (patient alone) to 1 (robot alone).
+
+    The command holds the dead-man switch and runs until Ctrl-C, which presses STOP.
 
     \b
     Example: atalante pendant xi 0.3 -i socketcan -c vcan0
@@ -78,7 +86,7 @@ def xi(factor: float, target: Target, seconds: float | None) -> None:
 @command.command(short_help="Press STOP.")
 @target_options(embedded=False, clock=False)
 def stop(target: Target) -> None:
-    """Press STOP for half a second and say what the HAL made of it.
+    """Press STOP for half a second, and print the state of the HAL before and after.
 
     \b
     Example: atalante pendant stop -i socketcan -c vcan0
@@ -89,7 +97,7 @@ def stop(target: Target) -> None:
 @command.command(short_help="Press HOLD.")
 @target_options(embedded=False, clock=False)
 def hold(target: Target) -> None:
-    """Press HOLD for half a second and say what the HAL made of it.
+    """Press HOLD for half a second, and print the state of the HAL before and after.
 
     \b
     Example: atalante pendant hold -i socketcan -c vcan0
@@ -98,10 +106,15 @@ def hold(target: Target) -> None:
 
 
 def press_once(target: Target, button: str) -> None:
-    """STOP or HOLD, as a command of its own.
+    """Press STOP or HOLD once, and print the state of the HAL before and after.
+
+    Args:
+        target: Bus of the robot.
+        button: "STOP" or "HOLD".
 
     Raises:
-        Failed: no HAL, or one that goes on.
+        Failed: If no HAL is running, if another pendant keeps sending, or if the HAL is still ACTIVE.
+        SystemExit: If a signal arrived.
     """
     from atalante_hal.types import SupervisorState
     from atalante_tools.session.pendant_node import Request
@@ -111,7 +124,7 @@ def press_once(target: Target, button: str) -> None:
         node = operator.node
         operator.listen()
         if node.hal is None:
-            raise Failed(f"no SYNC on {target}: no HAL is running there, so there is nothing to {button.lower()}")
+            raise Failed(f"no SYNC received on {target}: start a HAL first, {button} has no effect without one")
         before = node.hal
         node.press(Request[button])
         node.speak()
@@ -119,16 +132,24 @@ def press_once(target: Target, button: str) -> None:
         if operator.stop.wanted:
             raise SystemExit(operator.stop.exit_code)
         if node.refused:
-            raise Failed("another pendant keeps speaking and does not give way: use that one")
+            raise Failed("another pendant keeps sending: use that pendant, or end it first")
         after = node.hal
     if after in (SupervisorState.ACTIVE, SupervisorState.FULL_ASSIST):
-        raise Failed(f"the HAL is still {after.name} after {button}")
+        raise Failed(f"the HAL must be in HOLD after {button}, got {after.name}")
     click.echo(f"{button}: the HAL was {before.name} and is {after.name}")
 
 
 @contextmanager
 def session(target: Target) -> Iterator[Session]:
-    """An operator on the bus; signals and keyboard are his."""
+    """Open a pendant session on a bus. It reads the keyboard and ends at a signal.
+
+    Args:
+        target: Bus of the robot.
+
+    Raises:
+        BusError: If the bus cannot be opened.
+        ChannelMapError: If the channel map is invalid.
+    """
     from atalante_tools.session.pendant_node import PendantNode
     from atalante_tools.session.pendant_session import Keyboard, Session
 
@@ -141,7 +162,15 @@ def session(target: Target) -> Iterator[Session]:
 
 
 def open_pendant_bus(target: Target) -> tuple[Network, Bus]:
-    """The network, and the one bus of it that carries the pendant. Raises `BusError`, `ChannelMapError`."""
+    """Return the network, and the open bus that carries the messages of the pendant.
+
+    Args:
+        target: Interface and channel, or channel map.
+
+    Raises:
+        BusError: If the bus cannot be opened.
+        ChannelMapError: If the channel map is invalid.
+    """
     import atalante_dbc
     from atalante_hal.bus import open_bus
     from atalante_hal.bus.channel_map import parse_channel_map

@@ -1,4 +1,7 @@
-"""`atalante status`: listen to a bus and say what every node says; nothing is ever sent."""
+"""`atalante status`: receives the frames of a bus and prints the state of every node. It sends nothing.
+
+bus -> Observer -> Report -> tables, or one JSON object
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ if TYPE_CHECKING:
     from atalante_hal.bus import Bus
     from atalante_tools.commands.observer import Observer, Report
 
-#: Longest wait for a frame before looking at clock and signals [s].
+#: Longest wait for a frame before clock and stop request are checked [s].
 LOOK_UP: Final = 0.02
 _BLANK: Final = "-"
 
@@ -30,14 +33,14 @@ _BLANK: Final = "-"
     default=1.0,
     show_default=True,
     metavar="SECONDS",
-    help="Listen so long before each table [s].",
+    help="Listening time before each table [s].",
 )
-@click.option("--watch", is_flag=True, help="Again and again, until Ctrl-C.")
+@click.option("--watch", is_flag=True, help="Repeat the table until Ctrl-C.")
 @json_option
 def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
-    """Listen to a bus and print every node, every joint (degrees, Nm), the supervisor and the load of the buses.
+    """Listen to a bus and print its nodes, joints (degrees, Nm), supervisor state and bus load.
 
-    Sends nothing. Ends with code 1 when nothing was heard, 4 when a fault is latched.
+    The command sends nothing. The exit code is 1 when no frame was received, and 4 when a fault is latched.
 
     \b
     Example: atalante status -i socketcan -c vcan0
@@ -71,7 +74,14 @@ def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
 
 
 def listen(bus: Bus, listener: Observer, seconds: float, stop: StopRequest) -> Report:
-    """Collect frames for a while."""
+    """Return the report of the frames received during a time.
+
+    Args:
+        bus: Bus to listen to.
+        listener: Observer that takes the frames.
+        seconds: Listening time [s].
+        stop: Stop request that ends the listening early.
+    """
     from atalante_hal.wire.frame import new_frames
 
     frames = new_frames(256)
@@ -83,15 +93,19 @@ def listen(bus: Bus, listener: Observer, seconds: float, stop: StopRequest) -> R
 
 
 def judge(report: Report, target: Target) -> None:
-    """End the command by what was heard.
+    """End the command with an error if the report shows no traffic or a fault.
+
+    Args:
+        report: Report to check.
+        target: Bus named in the message.
 
     Raises:
-        Failed: nothing.
-        FaultLatched: the supervisor or a drive is in FAULT.
+        Failed: If no frame was received.
+        FaultLatched: If the supervisor or a drive is in FAULT.
     """
     if not report.frames:
         raise Failed(
-            f"nothing was heard on {target} for {report.seconds:.1f} s: "
+            f"no frame received on {target} for {report.seconds:.1f} s: "
             f"start a robot (atalante emulator {target.arguments}) and a HAL"
         )
     faults = [joint.joint for joint in report.joints if joint.drive_state == "FAULT"]
@@ -100,17 +114,22 @@ def judge(report: Report, target: Target) -> None:
 
 
 def render(report: Report, target: Target) -> str:
-    """The report for a person."""
-    nodes = [("node", "heard", "state", "DBC", "supply V", "degC", "errors", "emergency")]
+    """Return the report as tables for the terminal.
+
+    Args:
+        report: Report to print.
+        target: Bus named in the first line.
+    """
+    nodes = [("node", "received", "state", "DBC", "supply V", "degC", "errors", "emergency")]
     for n in report.nodes:
-        heard = "never" if n.age_ms is None else f"{n.age_ms} ms ago" if n.late else "yes"
+        received = "never" if n.age_ms is None else f"{n.age_ms} ms ago" if n.late else "yes"
         dbc = _BLANK if n.dbc_ok is None else "same" if n.dbc_ok else "OTHER"
         flags = _BLANK if n.error_flags is None else f"0x{n.error_flags:04X}" if n.error_flags else "0"
         state = n.state or _BLANK
         nodes.append(
             (
                 n.node,
-                heard,
+                received,
                 state,
                 dbc,
                 _number(n.supply_v, 1),
@@ -128,7 +147,7 @@ def render(report: Report, target: Target) -> str:
     loads += [(bus, f"{100 * used:.1f}", f"{100 * worst:.1f}") for bus, (used, worst) in report.load.items()]
     counts = f"{report.frames} frames in {report.seconds:.1f} s, {report.crc_errors} CRC errors, {report.dropped} lost"
     if report.foreign:
-        counts += f", {report.foreign} of no message of this network"
+        counts += f", {report.foreign} with an identifier unknown to this network"
     return "\n\n".join([_headline(report, target), table(nodes), table(joints), table(loads), counts])
 
 
@@ -136,19 +155,17 @@ def _headline(report: Report, target: Target) -> str:
     from atalante_tools.commands.observer import GONE
 
     if report.supervisor is None:
-        return f"{target}: no HAL (no SYNC was heard)"
+        return f"{target}: no HAL (no SYNC received)"
     hal = next(n for n in report.nodes if n.kind == "master")
     if hal.age_ms is not None and hal.age_ms > GONE:
-        return (
-            f"{target}: the HAL has been silent for {hal.age_ms} ms; it was {report.supervisor} in cycle {report.cycle}"
-        )
-    said = [f"{target}: HAL {report.supervisor}, cycle {report.cycle}"]
+        return f"{target}: no SYNC of the HAL for {hal.age_ms} ms; it was {report.supervisor} in cycle {report.cycle}"
+    parts = [f"{target}: HAL {report.supervisor}, cycle {report.cycle}"]
     if report.assistance_factor is not None:
-        said.append(f"assistance factor {report.assistance_factor:.2f}")
-        said.append(f"{report.overruns} overruns")
+        parts.append(f"assistance factor {report.assistance_factor:.2f}")
+        parts.append(f"{report.overruns} overruns")
     if report.dead_man is not None:
-        said.append(f"dead-man {'pressed' if report.dead_man else 'released'}")
-    return ", ".join(said) + (f"\ndiagnostic: {report.diagnostic}" if report.diagnostic else "")
+        parts.append(f"dead-man {'pressed' if report.dead_man else 'released'}")
+    return ", ".join(parts) + (f"\ndiagnostic: {report.diagnostic}" if report.diagnostic else "")
 
 
 def _number(value: float | None, digits: int) -> str:

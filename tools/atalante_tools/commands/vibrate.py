@@ -1,4 +1,4 @@
-"""`atalante vibrate`: run one vibration motor, to feel where it is."""
+"""`atalante vibrate`: runs one vibration motor while the robot holds its pose."""
 
 from __future__ import annotations
 
@@ -25,16 +25,17 @@ if TYPE_CHECKING:
     default=1.0,
     show_default=True,
     metavar="SECONDS",
-    help="How long [s].",
+    help="Duration of the vibration [s].",
 )
 @target_options(embedded=True)
 @json_option
 def command(motor: str, level: float, seconds: float, target: Target, as_json: bool) -> None:
-    """Run one vibration motor at a level from 0 (still) to 1 (strongest); all joints hold the pose they are in.
+    """Run one vibration motor at a LEVEL from 0 (off) to 1 (strongest). All joints hold their pose.
 
     MOTOR is left_ or right_, thigh_ or shank_, and front or back: left_thigh_front.
 
-    The operator has to press START (`atalante pendant start`); the embedded robot has one who does. Ends in HOLD.
+    The motor runs after the operator presses START (`atalante pendant start`). The embedded robot has an emulated
+    operator that presses START. The robot ends in HOLD.
 
     \b
     Example: atalante vibrate left_thigh_front 0.5 --for 2
@@ -75,5 +76,5 @@ def command(motor: str, level: float, seconds: float, target: Target, as_json: b
             }
         )
     else:
-        click.echo(f"{MOTORS[index]}: asked for {level:.2f}, measured {strongest:.2f} at most, {seconds:g} s")
+        click.echo(f"{MOTORS[index]}: commanded {level:.2f}, measured at most {strongest:.2f}, for {seconds:g} s")
     say("the robot is in HOLD")

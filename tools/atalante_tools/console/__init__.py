@@ -1,1 +1,1 @@
-"""What the commands share: options, output, exit codes, stop requests."""
+"""Shared parts of the commands: options, output, exit codes and stop requests."""

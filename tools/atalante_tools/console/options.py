@@ -1,4 +1,4 @@
-"""Options the commands share: which bus, which clock, what output. `-i` and `-c` are python-can's names."""
+"""Shared options of the commands: bus, clock, output, patient. `-i` and `-c` have the meaning they have in python-can."""
 
 from __future__ import annotations
 
@@ -19,108 +19,131 @@ if TYPE_CHECKING:
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 EMBEDDED: Final = "embedded"
-#: Interfaces of python-can that do not join processes as a wire does, and why.
+#: Interfaces of python-can that do not connect processes like a CAN bus -> the reason.
 NO_WIRE: Final = {
-    "virtual": "stays inside one process",
-    "udp_multicast": "hands every sender its own frames, which a HAL takes for another HAL's",
+    "virtual": "works inside one process only",
+    "udp_multicast": "returns every sent frame to its sender, which a HAL mistakes for a second HAL",
 }
 
-#: --json: one object a line on stdout, everything else on stderr.
-json_option = click.option("--json", "as_json", is_flag=True, help="JSON objects on stdout, one a line.")
+#: Option `--json`: one object per line on stdout, all other text on stderr.
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON objects on stdout, one per line.")
 
-#: Of random numbers: an option's type.
+#: Option type: seed of random numbers.
 SEED: Final = click.IntRange(min=0)
 
 
 class Between(click.FloatRange):
-    """A number in a range, which nan is not: an option's type."""
+    """Option type: a number in a range. NaN is rejected."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The number."""
+        """Return the number.
+
+        Raises:
+            click.BadParameter: If the value is not a number, is NaN or is out of range.
+        """
         number = super().convert(value, param, ctx)
         if math.isnan(number):
-            self.fail("nan is not a number", param, ctx)
+            self.fail("must be a number, got nan", param, ctx)
         return number
 
 
 class OutputFile(click.Path):
-    """A file to be written, of a kind that its suffix names: an option's type. What cannot be is told before the work."""
+    """Option type: an output file with one of the allowed suffixes, in an existing folder.
+
+    An invalid path is rejected before the command starts its work.
+    """
 
     def __init__(self, *suffixes: str) -> None:
         super().__init__(dir_okay=False)
         self._suffixes = suffixes
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The path."""
+        """Return the path.
+
+        Raises:
+            click.BadParameter: If the suffix is not allowed or the folder does not exist.
+        """
         path = Path(str(super().convert(value, param, ctx)))
         if self._suffixes and path.suffix.lower() not in self._suffixes:
-            self.fail(f"{path} must end in {' or '.join(self._suffixes)}", param, ctx)
+            self.fail(f"must end in {' or '.join(self._suffixes)}, got {path}", param, ctx)
         if not path.parent.is_dir():
-            self.fail(f"there is no folder {path.parent} for {path.name}", param, ctx)
+            self.fail(f"the folder {path.parent} of {path.name} does not exist: create it first", param, ctx)
         return path
 
 
-#: From here on a length means centimetres: nobody is 5 m tall, and no thigh or step is under 5 cm.
+#: A number from here on is a length in centimetres, a smaller one in metres: no person is 5 m tall, no step is under 5 cm.
 _CENTIMETRES: Final = 5.0
 
-
-#: Length [m] and duration [s] of a step when a patient is given and his step is not.
+#: Default length [m] and duration [s] of a patient's step.
 DEFAULT_STEP: Final = (0.15, 0.9)
 
 
 def length(text: str) -> float:
-    """A length of a body or a step as people write it, 1.75 or 175 for the same height: an option's type, in metres."""
+    """Return a length in metres (option type). 1.75 and 175 are the same height.
+
+    Args:
+        text: Length of a body part or a step, in metres or, from 5 on, in centimetres.
+
+    Raises:
+        click.BadParameter: If the text is not a number.
+    """
     try:
         metres = float(text)
     except ValueError:
-        raise click.BadParameter(f"{text!r} is no length; write metres (1.75) or centimetres (175)") from None
+        raise click.BadParameter(f"must be a length in metres (1.75) or centimetres (175), got {text!r}") from None
     return metres / 100.0 if metres >= _CENTIMETRES else metres
 
 
 def options_as(
     name: str, meaning: Callable[..., object], options: Sequence[Callable[[Any], Any]]
 ) -> Callable[[_Command], _Command]:
-    """Give a command options, in this order, and hand it what they mean together as one argument.
+    """Return a decorator that adds options to a command and passes their combined value as one argument.
 
     Args:
-        name: of the argument.
-        meaning: called with the options by its parameters' names.
-        options: click's, or decorators that hand over an argument themselves.
+        name: Name of the argument of the command.
+        meaning: Function that combines the option values; its parameters have the names of the options.
+        options: Click options, or decorators that pass one argument themselves, in the order of the help.
     """
     parameters = inspect.signature(meaning).parameters
 
     def decorate(command: _Command) -> _Command:
         @functools.wraps(command)
-        def with_meaning(**arguments: Any) -> Any:
-            meant = meaning(**{key: arguments.pop(key) for key in parameters if key in arguments})
-            return command(**{name: meant}, **arguments)
+        def with_value(**arguments: Any) -> Any:
+            value = meaning(**{key: arguments.pop(key) for key in parameters if key in arguments})
+            return command(**{name: value}, **arguments)
 
-        decorated: Any = with_meaning
+        decorated: Any = with_value
         for option in reversed(options):
             decorated = option(decorated)
-        given: _Command = decorated
-        return given
+        result: _Command = decorated
+        return result
 
     return decorate
 
 
 def patient_options(*, legs: bool) -> Callable[[_Command], _Command]:
-    """Give a command `--mass` and `--height`, and hand it the patient as the argument `patient`; None without them.
+    """Return a decorator that adds `--mass` and `--height` and passes `patient`, which is None without these options.
 
     Args:
-        legs: `--thigh` and `--shank` too.
+        legs: Whether to add `--thigh` and `--shank` too.
     """
     options = [
-        click.option("--mass", type=float, metavar="KG", help="Of the patient, kg."),
-        click.option("--height", type=length, metavar="M", help="Of the patient, m (1.75) or cm (175)."),
+        click.option("--mass", type=float, metavar="KG", help="Body mass of the patient [kg]."),
+        click.option("--height", type=length, metavar="M", help="Body height of the patient, in m (1.75) or cm (175)."),
     ]
     if legs:
         options += [
             click.option(
-                "--thigh", type=length, metavar="M", help="Hip to knee, m or cm.  [default: Winter's for the height]"
+                "--thigh",
+                type=length,
+                metavar="M",
+                help="Distance from hip to knee, in m or cm.  [default: from the height (Winter)]",
             ),
             click.option(
-                "--shank", type=length, metavar="M", help="Knee to ankle, m or cm.  [default: Winter's for the height]"
+                "--shank",
+                type=length,
+                metavar="M",
+                help="Distance from knee to ankle, in m or cm.  [default: from the height (Winter)]",
             ),
         ]
 
@@ -128,7 +151,11 @@ def patient_options(*, legs: bool) -> Callable[[_Command], _Command]:
 
 
 def subject_options(command: _Command) -> _Command:
-    """Give a command `--mass`, `--height`, `--step-length` and `--step-duration`, handed over as `subject`; None without."""
+    """Add `--mass`, `--height`, `--step-length` and `--step-duration`, and pass `subject`, which is None without them.
+
+    Args:
+        command: Command to decorate.
+    """
     step_length, step_duration = DEFAULT_STEP
     options = [
         patient_options(legs=False),
@@ -136,10 +163,13 @@ def subject_options(command: _Command) -> _Command:
             "--step-length",
             type=length,
             metavar="M",
-            help=f"Of the patient's gait, m or cm.  [default: {step_length:g}]",
+            help=f"Step length of the patient's gait, in m or cm.  [default: {step_length:g}]",
         ),
         click.option(
-            "--step-duration", type=float, metavar="S", help=f"Of the patient's gait, s.  [default: {step_duration:g}]"
+            "--step-duration",
+            type=float,
+            metavar="S",
+            help=f"Step duration of the patient's gait [s].  [default: {step_duration:g}]",
         ),
     ]
     return options_as("subject", _subject, options)(command)
@@ -148,7 +178,7 @@ def subject_options(command: _Command) -> _Command:
 def _subject(patient: Patient | None, step_length: float | None, step_duration: float | None) -> Subject | None:
     if patient is None:
         if step_length is not None or step_duration is not None:
-            raise click.UsageError("a step of one's own needs a patient: --mass and --height")
+            raise click.UsageError("--step-length and --step-duration need a patient: add --mass and --height")
         return None
     from atalante_control.gait.subject import Subject
 
@@ -180,33 +210,33 @@ def _patient(
 
 @dataclass(frozen=True)
 class Target:
-    """Where the robot is: an interface of python-can, or embedded: emulated for this program alone."""
+    """Bus of the robot: a CAN interface, or `embedded` for an emulated robot that this command starts."""
 
     interface: str
-    channel: str  # one channel, or a channel map; empty when embedded
-    lockstep: bool  # cycles follow the nodes' answers instead of the wall clock
+    channel: str  # one channel, or a channel map of the four buses; empty for the embedded robot
+    lockstep: bool  # a cycle ends when the nodes have answered, not after 1 ms of wall-clock time
 
     @property
     def embedded(self) -> bool:
-        """The robot is emulated for this program alone, in its process or in one beside it."""
+        """Return whether the robot is the embedded one, emulated in this process or in a subprocess."""
         return self.interface == EMBEDDED
 
     def __str__(self) -> str:
-        """As the user named it."""
+        """Return the interface and the channel as the user typed them."""
         return self.interface if self.embedded else f"{self.interface} {self.channel}"
 
     @property
     def arguments(self) -> str:
-        """The options that make another process of ours find the same bus."""
+        """Return the options with which another `atalante` command uses the same bus."""
         return f"-i {self.interface} -c {self.channel}"
 
 
 def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command], _Command]:
-    """Give a command `-i`, `-c` and `--lockstep/--wall`, and hand it their meaning as the argument `target`.
+    """Return a decorator that adds `-i`, `-c` and `--lockstep/--wall` and passes them as the argument `target`.
 
     Args:
-        embedded: whether an embedded robot is a choice, and then the default.
-        clock: whether the command has one.
+        embedded: Whether to allow the embedded robot, which is then the default.
+        clock: Whether to add `--lockstep/--wall`.
     """
     interfaces = "socketcan, pcan, kvaser, ..."
     options = [
@@ -216,14 +246,15 @@ def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command]
             default=EMBEDDED if embedded else "socketcan",
             show_default=True,
             metavar="NAME",
-            help=f"{interfaces}{' or embedded: an emulated robot of its own' if embedded else ''}",
+            help=f"CAN interface: {interfaces}{', or embedded (starts an emulated robot)' if embedded else ''}.",
         ),
         click.option(
             "-c",
             "--channel",
             default="",
             metavar="CHANNEL",
-            help="For all four buses (vcan0), or one each: left_leg=can0,right_leg=can1,left_sense=can2,right_sense=can3.",
+            help="Channel of all four buses (vcan0), or one per bus: "
+            "left_leg=can0,right_leg=can1,left_sense=can2,right_sense=can3.",
         ),
     ]
     if clock:
@@ -232,7 +263,7 @@ def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command]
             click.option(
                 "--lockstep/--wall",
                 default=None,
-                help=f"Wait for the other side in every cycle (slow machines), or run at 1 kHz.  [default: {default}]",
+                help=f"Wait for all nodes in every cycle (slow machines), or run at 1 kHz.  [default: {default}]",
             )
         )
 
@@ -242,12 +273,16 @@ def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command]
 def _target(interface: str, channel: str, lockstep: bool | None = None, *, embedded: bool) -> Target:
     if interface == EMBEDDED:
         if not embedded:
-            raise click.UsageError("this needs a bus that other processes are on: -i socketcan -c vcan0")
+            raise click.UsageError(
+                "this command needs a CAN bus, got -i embedded: use for example -i socketcan -c vcan0"
+            )
         if channel:
-            raise click.UsageError(f"the embedded robot has no channel; to use {channel} say -i socketcan -c {channel}")
+            raise click.UsageError(
+                f"the embedded robot has no channel; to use {channel}, type -i socketcan -c {channel}"
+            )
     elif interface in NO_WIRE:
         raise click.UsageError(
-            f"{interface} {NO_WIRE[interface]}: use an adapter, or a vcan of Linux (`atalante doctor -i socketcan -c vcan0`)"
+            f"{interface} {NO_WIRE[interface]}: use a CAN adapter, or Linux vcan (`atalante doctor -i socketcan -c vcan0`)"
         )
     elif not channel:
         raise click.UsageError(f"{interface} needs a channel: -c vcan0, or a channel map of the four buses")

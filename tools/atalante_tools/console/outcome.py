@@ -1,4 +1,6 @@
-"""How a command ends: exit codes, and the one sentence for each error a user can meet.
+"""Exit codes of the commands, and the conversion of known errors into one sentence for the user.
+
+    library error -> failure_of -> Failed -> one line on stderr, exit code
 
 0 ok, 1 failed, 2 usage, 3 no device, 4 fault latched, 130 Ctrl-C, 143 SIGTERM.
 """
@@ -19,35 +21,35 @@ INTERRUPTED: Final = 130
 
 
 class Failed(click.ClickException):
-    """The command could not do what was asked; the message is one sentence that says what would be right."""
+    """Failure of a command, with exit code 1. The message is one sentence: what was expected, received, and what to do."""
 
     exit_code = FAILED
 
     def show(self, file: IO[Any] | None = None) -> None:
-        """Print the sentence on stderr."""
+        """Print the message on stderr, or to `file`."""
         click.echo(f"atalante: {self.format_message()}", file=file, err=file is None)
 
 
 class InvalidUsage(Failed):
-    """The command line does not make sense."""
+    """Invalid command line, with exit code 2."""
 
     exit_code = USAGE
 
 
 class NoDevice(Failed):
-    """The bus is not there."""
+    """Missing or failed CAN interface, with exit code 3."""
 
     exit_code = NO_DEVICE
 
 
 class FaultLatched(Failed):
-    """The robot is in FAULT and stays there until the operator acknowledges."""
+    """Latched fault, with exit code 4: the robot stays in FAULT until the operator acknowledges it."""
 
     exit_code = FAULT_LATCHED
 
 
-#: Errors of the libraries that have a message for the user: module, class, and how the command ends; first match wins. By
-#: name, so that asking costs no import: an error that was raised comes from a module that is loaded.
+#: Library errors whose message is for the user: module, class, and the failure they become. The first match counts.
+#: They are listed by name to avoid imports: the module of a raised error is already loaded.
 KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_hal.bus", "BusAbsent", NoDevice),
     ("atalante_hal.bus", "BusDown", NoDevice),
@@ -67,24 +69,27 @@ KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_tools.canlog.validate.project", "ProjectError", InvalidUsage),
 )
 
-#: Lines of a message, one a problem, that still make a sentence with the first.
+#: Largest number of further lines (problems) that are joined to the first line; more are only counted.
 MOST: Final = 2
-#: What a disk says that takes no more: full, over quota, read-only, broken. Such an error may name no file.
+#: Error numbers of a disk that cannot be written: full, over quota, read-only, I/O error. They may come without a file name.
 DISK: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
 
 
 def failure_of(error: BaseException) -> Failed | None:
-    """What a library's error means for the command; None: it is a defect and deserves its traceback.
+    """Return the failure that a library error becomes, or None for a defect, which keeps its traceback.
 
-    A file or folder that the system refuses is named with its reason, without the error's number.
-    An error with a diagnostic code (FAULTS.md: CONFIG_INVALID, DBC_INVALID, GAIT_INVALID, ...) is told with it.
+    The message of an operating-system error contains the file and the reason, without the error number.
+    The message of an error with a diagnostic code (FAULTS.md: CONFIG_INVALID, DBC_INVALID, ...) starts with that code.
+
+    Args:
+        error: Exception that ended the command.
     """
     for module, name, failure in KNOWN:
         kind = getattr(sys.modules.get(module), name, None)
         if kind is not None and isinstance(error, kind):
             first, *others = str(error).splitlines() or [""]
-            said = f"{first}, and {len(others)} more" if len(others) > MOST else str(error)
-            sentence = " ".join(said.split())
+            text = f"{first}, and {len(others)} more" if len(others) > MOST else str(error)
+            sentence = " ".join(text.split())
             code = getattr(error, "code", "")
             return failure(f"{code}: {sentence}" if code else sentence)
     if isinstance(error, OSError) and (error.filename is not None or error.errno in DISK):

@@ -1,10 +1,10 @@
-"""SIGINT (Ctrl-C) and SIGTERM as the stop request of the process, kept until the process ends.
+"""Stop request of the process: SIGINT (Ctrl-C) and SIGTERM, stored until the process ends.
 
-    signal -> handler -> StopRequest: `Stopped` is raised where the program is, or a loop reads `wanted`
+    signal -> handler -> StopRequest: the handler raises `Stopped`, or a loop reads `wanted`
 
-An exception raised by a handler can be lost: a callback that compiled code calls reports it as ignored and goes on, an optimiser
-takes it for a failed evaluation. The request stays, and `check` raises again before something moves. Imports next to nothing,
-because it is imported before the signals are handled.
+An exception raised by a signal handler can be lost. A callback of compiled code reports it as ignored and continues; an
+optimiser treats it as a failed evaluation. Therefore the request is stored, and `check` raises it again before the robot moves.
+This module has few imports, because it is imported before the signals are handled.
 """
 
 from __future__ import annotations
@@ -14,28 +14,32 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-TYPE_CHECKING = False  # as `typing.TYPE_CHECKING`, without importing `typing`
+TYPE_CHECKING = False  # same as `typing.TYPE_CHECKING`; importing `typing` would delay the signal handlers
 if TYPE_CHECKING:
     from types import FrameType
 
-#: A shell reports a process that a signal ended as 128 and the signal's number.
+#: Exit code of a process that a signal ended, minus the signal number (shell convention).
 SIGNALLED = 128
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stopped(SystemExit):
-    """The stop request as an exception, which `except Exception` does not catch."""
+    """Exception raised by a stop request. `except Exception` does not catch it."""
 
 
 class StopRequest:
-    """Whether a signal asked the process to stop, and the exit code of the first one."""
+    """Record of the first stop signal: `wanted` after it arrived, and its `exit_code`."""
 
     def __init__(self) -> None:
         self.wanted = False
         self.exit_code = 0
 
     def ask(self, number: int) -> None:
-        """Note that a signal arrived."""
+        """Record that a signal arrived.
+
+        Args:
+            number: Signal number.
+        """
         if not self.wanted:
             self.exit_code = SIGNALLED + number
             self.wanted = True
@@ -44,26 +48,26 @@ class StopRequest:
         """End the command if a signal arrived.
 
         Raises:
-            Stopped: with the exit code of the signal.
+            Stopped: If a signal arrived, with its exit code.
         """
         if self.wanted:
             raise Stopped(self.exit_code)
 
     def settle(self) -> None:
-        """Forget the request: the command has ended as the signal asked and this is its usual end."""
+        """Clear the request of a command for which a signal is the normal end."""
         self.wanted = False
         self.exit_code = 0
 
 
-#: The request of this process, while one of the blocks below handles its signals.
+#: Stop request of this process, while one of the context managers below handles its signals.
 _request: StopRequest | None = None
 
 
 def check_stop() -> None:
-    """End the command if a signal arrived whose exception was lost; to be called between two parts of long work.
+    """End the command if a signal arrived and its exception was lost. Call it between two parts of long work.
 
     Raises:
-        Stopped: with the exit code of the signal.
+        Stopped: If a signal arrived, with its exit code.
     """
     if _request is not None:
         _request.check()
@@ -71,12 +75,12 @@ def check_stop() -> None:
 
 @contextmanager
 def _handled(react: Callable[[StopRequest, int, bool], None]) -> Iterator[StopRequest]:
-    """Note signals inside the block in the request of this process.
+    """Record the signals that arrive inside the block in the stop request of this process.
 
-    Outside the main thread signals cannot be handled and the request stays as it is.
+    Python handles signals in the main thread only. In any other thread the block gets a request that is never set.
 
     Args:
-        react: called after a signal with the request, its number, and whether one came before it.
+        react: Called after each signal with the request, the signal number, and whether it repeats an earlier signal.
     """
     global _request
     outer = _request
@@ -103,10 +107,10 @@ def _handled(react: Callable[[StopRequest, int, bool], None]) -> Iterator[StopRe
 
 @contextmanager
 def interruptible() -> Iterator[StopRequest]:
-    """Raise `Stopped` wherever the program is, at each SIGINT and SIGTERM inside the block, which is the whole program.
+    """Raise `Stopped` at each SIGINT and SIGTERM inside the block, which is the whole program.
 
-    A `Stopped` that is raised where no exception can pass is not reported: the request is kept. After the block a signal ends
-    the process as the system does, without Python's traceback.
+    A `Stopped` raised where Python ignores exceptions (e.g. in `__del__`) is not reported, because the request is stored.
+    After the block a signal ends the process with the default action of the system, without a Python traceback.
     """
 
     def stop(request: StopRequest, _number: int, _repeated: bool) -> None:
@@ -130,31 +134,31 @@ def interruptible() -> Iterator[StopRequest]:
 
 @contextmanager
 def stop_requested() -> Iterator[StopRequest]:
-    """Turn the first SIGINT or SIGTERM inside the block into `wanted`; the second ends the process at once.
+    """Set `wanted` at the first SIGINT or SIGTERM inside the block, and end the process at the second.
 
-    Nothing is raised inside the block, which has to look at `wanted`. The drives' own watchdog holds the robot when the process
-    is gone.
+    No exception is raised inside the block, so the block must read `wanted`. If the process ends, the watchdog of each drive
+    holds the robot.
 
     Raises:
-        Stopped: a signal arrived before the block.
+        Stopped: If a signal arrived before the block.
     """
 
-    def note(_request: StopRequest, number: int, repeated: bool) -> None:
+    def end_on_repetition(_request: StopRequest, number: int, repeated: bool) -> None:
         if repeated:
             signal.signal(number, signal.SIG_DFL)
             signal.raise_signal(number)
 
-    with _handled(note) as request:
+    with _handled(end_on_repetition) as request:
         request.check()
         yield request
 
 
 @contextmanager
 def ended_by(end: Callable[[], None]) -> Iterator[StopRequest]:
-    """Call `end` at each SIGINT and SIGTERM inside the block, which then ends by itself; no signal cuts it short.
+    """Call `end` at each SIGINT and SIGTERM inside the block. No signal interrupts the block.
 
     Args:
-        end: called between any two instructions of the block, so it may only set what the block looks at.
+        end: Requests the end of the block. It may be called between any two instructions, so it must only set a flag.
     """
 
     def ask(_request: StopRequest, _number: int, _repeated: bool) -> None:

@@ -1,4 +1,4 @@
-"""What a command shows: log lines and a live progress line on stderr, tables and JSON objects on stdout."""
+"""Output of the commands: log lines and a progress line on stderr, tables and JSON objects on stdout."""
 
 from __future__ import annotations
 
@@ -11,44 +11,45 @@ from typing import Any, Final, TextIO
 
 import click
 
-#: Seconds between two progress lines: on a terminal, where each replaces the last, and in a log.
+#: Time between two progress lines on a terminal, where each line replaces the previous one [s].
 LIVE: Final = 0.2
+#: Time between two progress lines in a log [s].
 LOGGED: Final = 5.0
 
 
 def say(text: str) -> None:
-    """One line for the person at the terminal, on stderr."""
+    """Print one line for the user on stderr."""
     click.echo(text, err=True)
 
 
 class Patience(logging.Handler):
-    """Says once that hot loops are being compiled, which takes seconds, when the first one is."""
+    """Log handler that prints one notice when the first function is compiled, which takes seconds."""
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
-        self._said = False
+        self._printed = False
 
     @classmethod
     def begin(cls) -> None:
-        """Listen to `atalante_hal.compiled`, without importing it: most commands compile nothing."""
+        """Install the handler on the logger of `atalante_hal.compiled`, without importing that module."""
         logger = logging.getLogger("atalante_hal.compiled")
         logger.addHandler(cls())
         logger.setLevel(logging.INFO)
 
     def emit(self, _record: logging.LogRecord) -> None:
-        """A loop is compiled."""
-        if not self._said:
-            self._said = True
-            say("preparing machine code: some seconds, once after an installation or an update")
+        """Print the notice at the first log record, which reports a compilation."""
+        if not self._printed:
+            self._printed = True
+            say("compiling: takes some seconds, only once after an installation or an update")
 
 
 def show_json(value: Mapping[str, Any]) -> None:
-    """One JSON object on a line of stdout. A number that is not finite is null."""
+    """Print one JSON object as a line on stdout. NaN and infinity become null."""
     click.echo(json.dumps(_finite(value), allow_nan=False))
 
 
 def table(rows: Sequence[Sequence[str]]) -> str:
-    """Rows as aligned columns, the first row being the head; numbers to the right."""
+    """Return rows as text with aligned columns. The first row is the header; columns of numbers are right-aligned."""
     columns = list(zip(*rows, strict=True))
     widths = [max(map(len, column)) for column in columns]
     right = [all(_is_number(cell) for cell in column[1:]) for column in columns]
@@ -60,15 +61,21 @@ def table(rows: Sequence[Sequence[str]]) -> str:
 
 
 class Progress:
-    """A line that says how far things are: rewritten in place on a terminal, every few seconds in a log.
+    """Progress line of a command: overwritten on a terminal, printed every few seconds in a log.
 
-    `due()` is cheap enough to be asked every cycle.
+    `due()` is fast enough to be called every cycle.
     """
 
     def __init__(
         self, *, period: float | None = None, stream: TextIO | None = None, now: Callable[[], float] = time.monotonic
     ) -> None:
-        """Begin now; `period` [s] replaces both usual ones."""
+        """Start the first period now.
+
+        Args:
+            period: Time between two lines [s]; None: `LIVE` on a terminal, `LOGGED` otherwise.
+            stream: Text stream of the lines; None: stderr.
+            now: Monotonic clock [s].
+        """
         self._stream = stream or sys.stderr
         self._live = self._stream.isatty()
         self._now = now
@@ -77,11 +84,11 @@ class Progress:
         self._width = 0
 
     def due(self) -> bool:
-        """Whether it is time for the next line."""
+        """Return whether the next line is due."""
         return self._now() >= self._next
 
     def show(self, text: str) -> None:
-        """Print the line."""
+        """Print the line and start the next period."""
         self._next = self._now() + self._period
         if self._live:
             self._stream.write("\r" + text.ljust(self._width))
@@ -91,7 +98,7 @@ class Progress:
             self._stream.write(text + "\n")
 
     def clear(self) -> None:
-        """Take the line away, before something else is printed."""
+        """Erase the progress line on a terminal, before other text is printed."""
         if self._live and self._width:
             self._stream.write("\r" + " " * self._width + "\r")
             self._stream.flush()

@@ -1,1 +1,1 @@
-"""A run of the robot: rig, emulated body, pendant, run folder and figures."""
+"""Parts of a run: rig (HAL on its bus), emulated body, pendant, run folder and figures."""

@@ -1,6 +1,6 @@
-"""The paper's first experiment, behind `atalante demo` and `atalante airwalk`: steps in the air inside a virtual guide.
+"""Trial of `atalante demo` and `atalante airwalk`: steps in the air inside a virtual guide (first experiment of the paper).
 
-guide shape -> certificate (announced) -> steps -> recording, summary.json, figure
+guide shape -> certificate (printed) -> steps -> recording, summary.json, figure
 """
 
 from __future__ import annotations
@@ -41,69 +41,91 @@ if TYPE_CHECKING:
     from atalante_tools.session.rig import Rig
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
-#: Those of `shapes.SHAPES`, for help that imports no controller.
+#: Names of `shapes.SHAPES`, repeated here because the help must not import the controller.
 SHAPE_NAMES = "constant, widening, narrowing, pinched, asymmetric, snap"
-#: Cycles between two looks at the telemetry process.
+#: Number of cycles between two checks of the telemetry process.
 _TEND_CYCLES = 250
 
 
 @dataclass(frozen=True)
 class Options:
-    """What the user asked for."""
+    """Options of a trial."""
 
-    steps: int  # right-stance steps a shape
-    xi: float  # assistance factor
-    seed: int
+    steps: int  # number of right-stance steps per shape
+    xi: float  # assistance factor, 0 to 1
+    seed: int  # seed of the sensor noise
     out: Path  # run folder
-    record_rate: int  # Hz
-    can_log: Path | None
-    telemetry: Path | None  # telemetry file: endpoint, TLS, users
-    subject: Subject | None = None  # whose gait of the network; None: the gait drawn for the air
+    record_rate: int  # recording rate, Hz
+    can_log: Path | None  # file for all frames; None: frames are not logged
+    telemetry: Path | None  # telemetry file (endpoint, TLS, users); None: loopback only
+    subject: Subject | None = (
+        None  # subject of a gait from the gait network; None: the default gait for walking in the air
+    )
 
 
 @dataclass
 class Walked:
-    """What a trial has so far; complete once its telemetry is closed."""
+    """Results and recording of a trial, complete after the telemetry is closed."""
 
-    results: list[Result] = field(default_factory=list)  # one a shape
-    recording: Recording | None = None  # None: the telemetry was not started
+    results: list[Result] = field(default_factory=list)  # one per finished shape
+    recording: Recording | None = None  # None: telemetry not started
 
 
 def _record_rate(text: str) -> int:
-    """A rate [Hz] that takes every n-th cycle: an option's type."""
+    """Return a recording rate in Hz (option type). It must be a divisor of the 1000 Hz of the loop.
+
+    Args:
+        text: Rate as the user typed it.
+
+    Raises:
+        click.BadParameter: If the text is not a divisor of 1000.
+    """
     if text.isdecimal() and int(text) and not 1000 % int(text):
         return int(text)
-    raise click.BadParameter(f"{text!r} does not divide 1000 as 1, 10, 50, 100, 200, 250, 500 and 1000 do")
+    raise click.BadParameter(f"must be a divisor of 1000 (1, 10, 50, 100, 200, 250, 500, 1000, ...), got {text!r}")
 
 
 def trial_options(steps: int, out: str) -> Callable[[_Command], _Command]:
-    """Give a command the options scripts may rely on, handed over as the argument `options`."""
+    """Return a decorator that adds the options of a trial to a command and passes them as the argument `options`.
+
+    Args:
+        steps: Default of `--steps`.
+        out: Default of `--out`.
+    """
     options = [
         click.option("--steps", type=click.IntRange(1), default=steps, show_default=True, metavar="N",
-                     help="Right-stance steps with each shape."),
+                     help="Number of right-stance steps per guide shape."),
         click.option("--xi", type=Between(0.0, 1.0), default=0.5, show_default=True, metavar="X",
-                     help="Assistance factor: 0 widest guide (7.5 deg), 1 full assistance. The pendant may change it."),
-        click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Of the emulated sensors' noise."),
+                     help="Assistance factor from 0 (widest guide, 7.5 deg) to 1 (full assistance); the pendant may change it."),
+        click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the sensor noise."),
         click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=out, show_default=True,
-                     metavar="DIR", help="Run folder: recording.mcap, summary.json, figure; an earlier run's are replaced."),
+                     metavar="DIR", help="Folder for recording.mcap, summary.json and the figure. Existing files are replaced."),
         click.option("--record-rate", type=_record_rate, default="100", show_default=True, metavar="HZ",
-                     help="Recorded cycles a second, a divisor of 1000, which is every cycle."),
+                     help="Recording rate [Hz], a divisor of 1000. 1000 records every cycle."),
         click.option("--can-log", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
-                     help="Log every frame; format by suffix: .log, .asc, .blf, .log.gz, .asc.gz."),
+                     help="Log every CAN frame to FILE. Its suffix sets the format: .log, .asc, .blf, .log.gz, .asc.gz."),
         click.option("--telemetry", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
-                     help="Telemetry file (TOML): Zenoh endpoint, TLS certificate, users."),
+                     help="Read Zenoh endpoint, TLS certificate and users from this TOML file.  [default: loopback only]"),
     ]  # fmt: skip
 
     return options_as("options", Options, [*options, json_option, subject_options])
 
 
 def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_json: bool) -> None:
-    """Walk behind each shape in turn, record everything, and say how it went.
+    """Walk with one shape after the other, record the run, and print the results.
+
+    If the run ends early, the recording and the results until then are kept.
+
+    Args:
+        target: Bus and clock.
+        shapes: Names of the guide shapes.
+        options: Options of the user.
+        as_json: Whether to print JSON objects instead of a table.
 
     Raises:
-        Failed, FaultLatched: the robot left ACTIVE before the steps were done; what was walked until then is kept.
-        Failed: the steps were done and the recording is not complete.
-        SystemExit: a signal ended it.
+        Failed: If the robot left ACTIVE before the last step, or the recording is incomplete.
+        FaultLatched: If the robot is in FAULT.
+        SystemExit: If a signal ended the run.
     """
     from atalante_control.guide.shapes import SHAPES
     from atalante_hal.telemetry.access import load_telemetry_file
@@ -128,10 +150,10 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
 
 
 def _require_complete(recording: Recording | None) -> None:
-    """Refuse a recording with gaps.
+    """Check that the recording has no gaps.
 
     Raises:
-        Failed: cycles are missing, or its file has no end; names the files and the number of cycles.
+        Failed: If cycles are missing or the file is truncated; the message contains the files and the number of missing cycles.
     """
     if recording is not None and not recording.complete:
         raise Failed(
@@ -141,7 +163,7 @@ def _require_complete(recording: Recording | None) -> None:
 
 
 def _asked(options: Options) -> dict[str, Any]:
-    """Return what the user asked for as JSON types: a path as text, without the files that the run itself writes."""
+    """Return the options as JSON types for summary.json, without the output paths."""
     asked = {key: value for key, value in asdict(options).items() if key not in ("out", "can_log")}
     telemetry = None if options.telemetry is None else str(options.telemetry)
     return {**asked, "telemetry": telemetry, "version": version("atalante-hal")}
@@ -166,29 +188,31 @@ def _walk_all(
     *,
     as_json: bool,
 ) -> None:
-    """Walk behind each shape in turn and add what became of it and of the recording to `walked`; raises as `run_trial`."""
+    """Walk with one shape after the other, and add results and recording to `walked`. Raise the errors of `run_trial`."""
     import atalante_dbc
     from atalante_hal.robot import load_robot
 
     with ExitStack() as stack:
-        robot_process = _start_robot(target, stack)  # it loads what it needs while the controllers are made
+        robot_process = _start_robot(
+            target, stack
+        )  # the subprocess imports its modules while the controllers are created
         network, robot = atalante_dbc.load(), load_robot()
         exoskeleton, gait, controllers = _controllers(options.subject, robot, shapes)
-        promised: dict[str, Certificate] = {}
+        certificates: dict[str, Certificate] = {}
         telemetry: TelemetryProcess | None = None
         last = [*controllers][-1]
         for name, controller in controllers.items():
             with _open(target, options, network, robot, controller, gait.hash32, robot_process, exoskeleton) as rig:
                 robot_process = _start_robot(target, stack) if name != last else None
                 if telemetry is None:
-                    # Promises come when the bus is there to keep them on.
-                    promised = {shape: guarded.certificate(options.xi) for shape, guarded in controllers.items()}
-                    _announce(promised.values())
+                    # Printed only after the bus is open: without a robot the certificates have no meaning.
+                    certificates = {shape: guarded.certificate(options.xi) for shape, guarded in controllers.items()}
+                    _announce(certificates.values())
                     telemetry = _telemetry(target, options, outlet, rig.hal, network, gait.hash32)
                     stack.enter_context(telemetry)
                     stack.callback(_close, telemetry, walked)
                     report_endpoint = _EndpointReport(telemetry)
-                telemetry.begin_run(name, {"shape": name, "xi": options.xi, **_promise(promised[name])})
+                telemetry.begin_run(name, {"shape": name, "xi": options.xi, **_bounds(certificates[name])})
                 walk = _Walk(rig, controller, telemetry, report_endpoint, name, options.steps)
                 with stop_requested() as stop:
                     statistics = walk.run(stop)
@@ -200,7 +224,7 @@ def _walk_all(
 
 
 class _Walk:
-    """One shape: the loop, its telemetry and its progress line."""
+    """Run of one guide shape: loop, telemetry and progress line."""
 
     def __init__(
         self,
@@ -215,7 +239,7 @@ class _Walk:
 
         self._rig, self._controller, self._telemetry = rig, controller, telemetry
         self._report_endpoint, self._name, self._steps = report_endpoint, name, steps
-        self._told = 0
+        self._reported = 0
         self._watch_of = functools.partial(Watch, rig, done=self._done, describe=self._describe)
         hal = rig.hal
         if telemetry.frames is not None:
@@ -225,12 +249,18 @@ class _Walk:
                 hal.tap = telemetry.tap(stamps=lambda: hal.bus.stamps)
 
     def run(self, stop: Any) -> Statistics:
+        """Walk until all steps are done, the stop request is set, or the robot leaves ACTIVE.
+
+        Args:
+            stop: Stop request of the process.
+        """
         self._watch = self._watch_of(stop)
         statistics = self._rig.run(self._controller, until=self._watch, record=self._record)
-        self._tell()
+        self._report_events()
         return statistics
 
     def conclude(self) -> None:
+        """End the command with an error unless all steps were done; see `Watch.conclude`."""
         self._watch.conclude()
 
     def _record(self) -> None:
@@ -239,21 +269,21 @@ class _Walk:
         if not hal.state.cycle % _TEND_CYCLES:
             self._telemetry.tend()
             self._report_endpoint()
-        if hal.events.count != self._told:
-            self._tell()
+        if hal.events.count != self._reported:
+            self._report_events()
 
-    def _tell(self) -> None:
+    def _report_events(self) -> None:
         events = self._rig.hal.events
-        for event in events.since(self._told):
+        for event in events.since(self._reported):
             self._telemetry.event(event.cycle, event.code, event.text, event.severity, event.node, event.value)
-        self._told = events.count
+        self._reported = events.count
 
     def _done(self, state: State) -> bool:
         return self._controller.statistics.steps >= self._steps
 
     def _describe(self, state: State) -> str:
         statistics = self._controller.statistics
-        # Counted from the first completed step on.
+        # The statistics start after the first completed step, which starts from rest.
         largest = f"   largest |e|/q_bound {statistics.max_ratio:.2f}" if statistics.cycles else ""
         return (
             f"{self._name:<11} step {statistics.steps:3d}/{self._steps}   t {state.time:6.1f} s   "
@@ -264,7 +294,7 @@ class _Walk:
 def _controllers(
     subject: Subject | None, robot: Robot, shapes: Mapping[str, GuideShape]
 ) -> tuple[ExoskeletonParameters, Gait, dict[str, AirwalkController]]:
-    """The exoskeleton adjusted to the subject, his gait, and a controller of each shape that walks it in the air."""
+    """Return the exoskeleton adjusted to the subject, the gait, and one controller per shape."""
     from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
     from atalante_control.dynamics.gait_network import load_network
     from atalante_control.dynamics.suspended import suspended_gait
@@ -278,32 +308,33 @@ def _controllers(
         exoskeleton = exoskeleton.fitted(subject.patient)
         gait = suspended_gait(load_network().gait(subject, robot), exoskeleton, robot)
         config = AirwalkConfig(feedforward=True)
-    made = {name: AirwalkController(robot, gait, shape, config, exoskeleton) for name, shape in shapes.items()}
-    if subject is not None:  # the gait was accepted
-        say(f"gait of the network: {subject}; nobody is in the exoskeleton")
-    return exoskeleton, gait, made
+    controllers = {name: AirwalkController(robot, gait, shape, config, exoskeleton) for name, shape in shapes.items()}
+    if subject is not None:  # printed here, because the gait is now known to be valid
+        say(f"gait of the network: {subject}; the exoskeleton is empty")
+    return exoskeleton, gait, controllers
 
 
 def _announce(certificates: Collection[Certificate]) -> None:
-    """Print before the run what each filter is built for, and what is not included in it."""
+    """Print the certificate of each shape before the run: disturbance torques, and the effects that are not included."""
     for certificate in certificates:
         name, xi, bound = certificate.shape, certificate.xi, certificate.joint_torque
         if bound is None:
-            say(f"{name}: NOT CERTIFIED at Xi {xi:g}, the guide may be left: {certificate.reason}")
+            say(f"{name}: NOT CERTIFIED at Xi {xi:g}, the robot may leave the guide: {certificate.reason}")
             continue
         say(
-            f"{name}: certified on the model at Xi {xi:g}: built for {bound.hip:.2f} Nm at the hip and {bound.knee:.2f} Nm at "
-            f"the knee together (worst pose: knee at {math.degrees(bound.worst_knee):.0f} deg); {certificate.reason}"
+            f"{name}: certified on the model at Xi {xi:g} for disturbances of {bound.hip:.2f} Nm at the hip and "
+            f"{bound.knee:.2f} Nm at the knee together (worst pose: knee at {math.degrees(bound.worst_knee):.0f} deg); "
+            f"{certificate.reason}"
         )
     if any(certificate.certified for certificate in certificates):
         say(
-            "certified is a margin on the model, no guarantee: joint torque and rate limits, delay, the torque carried over a "
-            "step change and errors of friction and mass are not included"
+            "a certificate is a margin on the model, no guarantee: joint torque and rate limits, delay, the torque carried "
+            "over a step change, and errors of friction and mass are not included"
         )
 
 
-def _promise(certificate: Certificate) -> dict[str, Any]:
-    """Return `certified` and the bounds, as in `Result`."""
+def _bounds(certificate: Certificate) -> dict[str, Any]:
+    """Return the certificate as the fields `certified`, `bound_hip_nm` and `bound_knee_nm` of `Result`."""
     bound = certificate.joint_torque
     return {
         "certified": certificate.certified,
@@ -313,17 +344,17 @@ def _promise(certificate: Certificate) -> dict[str, Any]:
 
 
 def _weakest(controller: AirwalkController, factors: Iterable[float]) -> Certificate:
-    """Return the certificate that promises least of those at the assistance factors."""
+    """Return the certificate with the smallest hip bound of all assistance factors of the run."""
     certificates = [controller.certificate(xi) for xi in factors]
     return min(certificates, key=lambda c: -1.0 if c.joint_torque is None else c.joint_torque.hip)
 
 
-#: Processor cores for HAL, telemetry and a robot in a process of its own.
+#: Number of processor cores for HAL, telemetry and the embedded robot in a subprocess.
 _CORES = 3
 
 
 def _start_robot(target: Target, stack: ExitStack) -> EmbeddedRobot | None:
-    """A process for the embedded robot, where it gets a core of its own: sharing one, each waits for the other."""
+    """Start the embedded robot in a subprocess if there are enough cores; on a shared core it would slow down the HAL."""
     from atalante_tools.session.embedded import EmbeddedRobot
 
     robot_process = target.embedded and len(os.sched_getaffinity(0)) >= _CORES
@@ -366,7 +397,7 @@ def _telemetry(
         record_rate=options.record_rate,
         can_log=options.can_log,
         lock_step=target.lockstep,
-        slots=8192,  # 8 s: a demo runs many times faster than real time, and a recorder may pause
+        slots=8192,  # 8 s of cycles: a demo runs many times faster than real time, and the recorder may pause
         **outlet,
     )
     return TelemetryProcess(
@@ -389,7 +420,7 @@ def _telemetry(
 
 
 class _EndpointReport:
-    """Print where subscribers connect: when it is made, and on each call after a restart that changed the endpoint."""
+    """Printer of the Zenoh endpoint: prints it when created, and on a call after a restart has changed it."""
 
     def __init__(self, telemetry: TelemetryProcess) -> None:
         for notice in telemetry.notices:
@@ -399,7 +430,7 @@ class _EndpointReport:
         self()
 
     def __call__(self) -> None:
-        """Print the endpoint unless it is the one printed last."""
+        """Print the endpoint if it has changed since the last print."""
         endpoint = self._telemetry.endpoint
         if endpoint != self._endpoint:
             self._endpoint = endpoint
@@ -408,21 +439,21 @@ class _EndpointReport:
 
 
 def _close(telemetry: TelemetryProcess, walked: Walked) -> None:
-    """Close the telemetry, print what it could not record or publish, and add its recording to `walked`."""
+    """Close the telemetry, print its notices about lost data, and add its recording to `walked`."""
     summary = telemetry.close()
     walked.recording = summary.recording
     for notice in summary.notices:
-        if notice not in telemetry.notices:  # those were told at the start
+        if notice not in telemetry.notices:  # notices of the start are already printed
             say(notice)
     if not summary.complete and not summary.notices:
-        say("the telemetry process has died: the recording may end early")
+        say("the telemetry process ended unexpectedly: the recording may be truncated")
 
 
 def _result(certificate: Certificate, controller: AirwalkController, hal: Hal, statistics: Statistics) -> Result:
     walked = controller.statistics
     return Result(
         shape=certificate.shape,
-        **_promise(certificate),
+        **_bounds(certificate),
         steps=walked.steps,
         max_ratio=round(walked.max_ratio, 4),
         inside=round(walked.inside_fraction, 4),

@@ -1,4 +1,4 @@
-"""The body of an emulated robot: the empty exoskeleton hanging from its pelvis, in PyBullet."""
+"""Body of the emulated robot: the empty exoskeleton in PyBullet, suspended at its pelvis."""
 
 from __future__ import annotations
 
@@ -18,13 +18,22 @@ if TYPE_CHECKING:
 
 
 def require_engine() -> None:
-    """Raise `Failed` with what to type where PyBullet is not installed."""
+    """Check that PyBullet is installed.
+
+    Raises:
+        Failed: If it is not installed; the message contains the installation command.
+    """
     if find_spec("pybullet") is None:
         raise Failed("the emulated robot needs PyBullet: type `pip install 'atalante-hal[emulator]'`")
 
 
 def describe(robot: Robot, exoskeleton: ExoskeletonParameters | None = None) -> str:
-    """Its URDF; the legs as they come from the factory unless an exoskeleton is given."""
+    """Return the URDF of the exoskeleton.
+
+    Args:
+        robot: Robot with the joint limits.
+        exoskeleton: Geometry and masses; None: default leg lengths.
+    """
     from atalante_control.model import ExoskeletonParameters, urdf
 
     return urdf(exoskeleton or ExoskeletonParameters(), robot)
@@ -34,10 +43,15 @@ def describe(robot: Robot, exoskeleton: ExoskeletonParameters | None = None) -> 
 def open_body(
     robot: Robot, pose: Sequence[float] | None = None, exoskeleton: ExoskeletonParameters | None = None
 ) -> Iterator[PyBulletBody]:
-    """The body of a robot. `pose` shape (12,) [rad].
+    """Open the body of a robot, and close it after the block.
+
+    Args:
+        robot: Robot with the joint limits.
+        pose: Initial joint angles, shape (12,) [rad]; None: all zero.
+        exoskeleton: Geometry and masses; None: default leg lengths.
 
     Raises:
-        Failed: PyBullet is not installed.
+        Failed: If PyBullet is not installed.
     """
     require_engine()
     with open_described(describe(robot, exoskeleton), pose) as body:
@@ -46,7 +60,12 @@ def open_body(
 
 @contextmanager
 def open_described(urdf: str, pose: Sequence[float] | None = None) -> Iterator[PyBulletBody]:
-    """The body of a URDF. `pose` shape (12,) [rad]."""
+    """Open the body of a URDF, and close it after the block.
+
+    Args:
+        urdf: URDF text.
+        pose: Initial joint angles, shape (12,) [rad]; None: all zero.
+    """
     with no_banner():
         from atalante_emulator.body import PyBulletBody
     body = PyBulletBody(urdf)
@@ -60,7 +79,7 @@ def open_described(urdf: str, pose: Sequence[float] | None = None) -> Iterator[P
 
 @contextmanager
 def no_banner() -> Iterator[None]:
-    """Keep what a library's C code prints on import off the terminal."""
+    """Discard everything written to file descriptor 2 inside the block, e.g. the import banner of PyBullet."""
     sys.stderr.flush()
     terminal, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:

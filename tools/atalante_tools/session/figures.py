@@ -1,4 +1,4 @@
-"""Figures from a recording, drawn from what was recorded and nothing else."""
+"""Figures of a run, drawn from its recording: `recording.mcap -> guide_shapes.png`."""
 
 from __future__ import annotations
 
@@ -19,19 +19,23 @@ from matplotlib import pyplot as plt
 
 _LEFT_HIP = "left_SH"
 _RIGHT_STANCE = 1
-#: A step recorded up to this phase was walked to its end.
+#: Phase from which the last step of a run counts as complete.
 _WHOLE = 0.9
-#: (phase, measured, desired, upper edge, lower edge [deg]) of the cycles of a step.
+#: Samples of one step: phase, then measured angle, desired angle, upper and lower edge of the guide [deg].
 _Step = list[tuple[float, ...]]
 
 
 def guide_shapes(recording: Path, picture: Path) -> None:
-    """The paper's figure of guide shapes: left hip over the phase, every right-stance step overlaid, one panel a shape.
+    """Draw the left hip angle over the phase of all right-stance steps, one panel per guide shape.
 
-    A run that was stopped ends in the middle of a step, which is left out unless it is the only one.
+    An incomplete last step of a run that was stopped is left out, unless it is the only step.
+
+    Args:
+        recording: MCAP recording of the run.
+        picture: Output file.
     """
     steps: dict[str, dict[int, _Step]] = defaultdict(lambda: defaultdict(list))
-    last: dict[str, tuple[int, int]] = {}  # step and stance that a run ends in
+    last: dict[str, tuple[int, int]] = {}  # run -> step and stance at its end
     for run, guide, upper, lower in _guide_samples(recording):
         last[run] = guide.step, guide.stance
         if guide.stance == _RIGHT_STANCE and guide.name and guide.name[0] == _LEFT_HIP:
@@ -57,7 +61,7 @@ def guide_shapes(recording: Path, picture: Path) -> None:
 
 
 def _whole(walked: dict[int, _Step], last: tuple[int, int]) -> dict[int, _Step]:
-    """The steps that were walked to their end, or all when none was."""
+    """Return the complete steps, or all steps if none is complete."""
     number, stance = last
     whole = {
         step: samples
@@ -82,7 +86,7 @@ def _panel(axis: Any, run: str, walked: dict[int, _Step]) -> None:
 
 
 def _guide_samples(recording: Path) -> Iterator[tuple[str, Any, float, float]]:
-    """(run, Guide, upper, lower [rad]) of every recorded cycle with a guide in it."""
+    """Yield run name, `Guide` message, upper and lower edge [rad] of every recorded cycle with a guide."""
     classes = {name: message_class(name) for name in ("SystemState", "Guide", "Controller")}
     run, edges = "", (0.0, 0.0)
     pending: Any = None

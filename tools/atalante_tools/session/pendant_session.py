@@ -1,4 +1,4 @@
-"""An operator with a pendant, at a keyboard: when the node speaks, what it presses, and what the person is told."""
+"""Session of a pendant at a terminal: `keyboard and HAL state -> Session -> PendantNode`, with messages to the user."""
 
 from __future__ import annotations
 
@@ -17,23 +17,26 @@ from atalante_tools.console.stop_request import StopRequest
 from atalante_tools.console.terminal import say
 from atalante_tools.session.pendant_node import PendantNode, Request
 
-#: Listening for another pendant before speaking [s], and SYNCs in it on a machine too slow for that.
+#: Shortest listening time for another pendant before sending [s].
 LISTEN: Final = 0.05
+#: Smallest number of SYNCs received while listening, for machines slower than real time.
 LISTEN_CYCLES: Final = 3
-#: Without a SYNC for so long there is no HAL [s].
+#: Time without a SYNC after which no HAL is assumed [s].
 NO_HAL: Final = 1.0
-#: Longest wait for a frame before looking at signals and the keyboard [s].
+#: Longest wait for a frame before stop request and keyboard are checked [s].
 LOOK_UP: Final = 0.02
-#: Cycles: of `stop` and `hold` in all, of STOP at the end of the others, of the released dead-man after it.
+#: Number of SYNCs that `pendant stop` and `pendant hold` answer.
 SAY: Final = 500
+#: Number of SYNCs answered with STOP at the end of `pendant start` and `pendant xi`.
 SAY_STOP: Final = 20
+#: Number of SYNCs answered after the dead-man switch is released.
 SAY_RELEASED: Final = 5
-#: Cycles after START in which a well robot becomes ACTIVE.
+#: Number of cycles after START within which a healthy robot becomes ACTIVE.
 STARTED_BY: Final = 400
 
 
 class Session:
-    """An operator with a pendant, at a keyboard."""
+    """Session of one pendant node, controlled by the keyboard."""
 
     def __init__(
         self,
@@ -44,7 +47,7 @@ class Session:
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self.node, self.stop = node, stop
-        #: Press START as soon as the HAL can be started.
+        #: Whether to press START as soon as the HAL is in READY or HOLD.
         self.start_wanted = False
         self._target, self._keyboard, self._now = target, keyboard, now
         self._begun = self._synced_at = now()
@@ -53,7 +56,7 @@ class Session:
         self._pressed_at: int | None = None
 
     def listen(self) -> None:
-        """Hear whether there is a HAL and another pendant, without a word."""
+        """Listen for a HAL and for another pendant, without sending."""
         begun = self._now()
         while not self.stop.wanted:
             self.node.poll(LOOK_UP)
@@ -62,29 +65,44 @@ class Session:
                 return
 
     def take(self) -> None:
-        """Take the pendant from whoever has it, and press the dead-man."""
+        """Take over from another pendant if there is one, press the dead-man switch and start to send."""
         self.listen()
-        say(f"taking over from another pendant on {self._target}" if self.node.heard_another else "pendant in hand")
+        say(
+            f"taking over from another pendant on {self._target}"
+            if self.node.heard_another
+            else "the pendant is active"
+        )
         self.node.dead_man = True
         self.node.speak()
 
     def speak_for(self, cycles: int) -> None:
-        """Answer that many SYNCs, fewer if the HAL falls silent, the pendant is taken away or somebody wants to stop."""
+        """Answer a number of SYNCs.
+
+        It ends early if the HAL stops sending, another pendant takes over, or a signal arrives.
+
+        Args:
+            cycles: Number of SYNCs to answer.
+        """
         wanted = self.stop.wanted
-        last, heard_at = self.node.spoken + cycles, self._now()
+        last, received_at = self.node.spoken + cycles, self._now()
         while self.node.spoken < last and not (self.node.displaced or self.node.refused):
             if self.node.poll(LOOK_UP):
-                heard_at = self._now()
-            elif self._now() - heard_at > NO_HAL:
+                received_at = self._now()
+            elif self._now() - received_at > NO_HAL:
                 return
             if self.stop.wanted and not wanted:
                 return
 
     def stay(self, seconds: float | None) -> None:
-        """Hold the pendant until somebody wants to stop, takes it, or the time is over; then STOP.
+        """Answer SYNCs until a signal arrives, another pendant takes over, or the time is over; then press STOP.
+
+        After a takeover STOP is not pressed.
+
+        Args:
+            seconds: Duration [s]; None: until a signal arrives.
 
         Raises:
-            Failed: the pendant heard before does not give way.
+            Failed: If the older pendant keeps sending.
         """
         node = self.node
         self._begun = self._now()
@@ -93,22 +111,22 @@ class Session:
                 self._follow()
             elif self._hal_there and self._now() - self._synced_at > NO_HAL:
                 self._hal_there = False
-                say(f"no SYNC on {self._target}: no HAL is running there; waiting for one")
+                say(f"no SYNC received on {self._target}: waiting for a HAL")
             if node.displaced:
                 say("another pendant has taken over")
                 return
             if node.refused:
-                raise Failed("another pendant keeps speaking and does not give way: use that one")
+                raise Failed("another pendant keeps sending: use that pendant, or end it first")
             for line in self._keyboard.lines():
                 self.typed(line)
         self.put_down()
 
     def _elapsed(self) -> float:
-        """Seconds of the robot's time, of ours while there is no robot."""
+        """Return the time since the start [s]: robot time after the first answered SYNC, wall-clock time before."""
         return self.node.spoken * PERIOD if self.node.spoken else self._now() - self._begun
 
     def put_down(self) -> None:
-        """STOP, and only then let the dead-man go."""
+        """Press STOP, then release the dead-man switch."""
         self.node.press(Request.STOP)
         self.speak_for(SAY_STOP)
         self.node.dead_man = False
@@ -117,7 +135,11 @@ class Session:
             say(f"STOP: the HAL is {self.node.hal.name}")
 
     def typed(self, line: str) -> None:
-        """A line of the operator."""
+        """Execute a command line of the operator.
+
+        Args:
+            line: start, stop, hold, or xi with a factor from 0 to 1.
+        """
         word, *arguments = line.lower().split() or [""]
         if word in ("start", "stop", "hold") and not arguments:
             self.start_wanted = False
@@ -128,20 +150,20 @@ class Session:
             self.node.assist(factor)
             say(f"assistance factor {factor:g}")
         elif word:
-            say(f"{line.strip()!r} is none of: start, stop, hold, xi X with X from 0 to 1")
+            say(f"a command must be start, stop, hold or xi X with X from 0 to 1, got {line.strip()!r}")
 
     def _follow(self) -> None:
-        """Say what the HAL does, and press START when that is due."""
+        """Print a new state of the HAL, and press START when it is due."""
         node = self.node
         self._synced_at, self._hal_there = self._now(), True
         if node.hal is not self._hal and node.hal is not None:
             self._hal = node.hal
             say(f"the HAL is {node.hal.name}")
             if self._pressed_at is not None and node.hal is not SupervisorState.ACTIVE:
-                say("one START is one change of state; type start to press START again")
+                say("each START changes the state once; type start to press START again")
             self._pressed_at = None
         startable = node.hal in (SupervisorState.READY, SupervisorState.HOLD)
-        # The HAL trusts the pendant from its frame number `REQUALIFY` on.
+        # The HAL ignores requests until it has received `REQUALIFY` valid frames of the pendant.
         if self.start_wanted and startable and node.spoken > REQUALIFY:
             self.start_wanted = False
             self._pressed_at = node.cycles
@@ -149,21 +171,21 @@ class Session:
             say("START pressed")
         elif self._pressed_at is not None and node.cycles - self._pressed_at > STARTED_BY:
             self._pressed_at = None
-            say("the HAL did not become ACTIVE, its events say why; type start to press START again")
+            say("the HAL did not become ACTIVE, see its event log; type start to press START again")
 
 
 class Keyboard:
-    """Lines typed on a file descriptor, without waiting for them; None: nobody types."""
+    """Non-blocking reader of typed lines from a file descriptor; with None it returns no lines."""
 
     def __init__(self, file: int | None) -> None:
         self._file = file
         self._begun = b""
 
     def lines(self) -> list[str]:
-        """Whole lines typed since the last call."""
+        """Return the complete lines typed since the last call."""
         if self._file is None or not select.select([self._file], (), (), 0.0)[0]:
             return []
-        # In the background a read from the terminal would stop the process.
+        # The system suspends a background process that reads from the terminal.
         if os.isatty(self._file) and os.tcgetpgrp(self._file) != os.getpgrp():
             return []
         typed = os.read(self._file, 4096)

@@ -1,4 +1,4 @@
-"""The controller of `jog` and `vibrate`: hold the pose that was measured at the start, and lead one joint elsewhere."""
+"""Controller of `jog` and `vibrate`: holds the pose measured at the start, and moves one joint to a target angle."""
 
 from __future__ import annotations
 
@@ -21,40 +21,60 @@ PEAK: Final = 15.0 / 8.0
 
 @dataclass(frozen=True)
 class Move:
-    """One joint to an angle, along the minimum-jerk profile."""
+    """Move of one joint to an angle, along the minimum-jerk profile."""
 
-    joint: int  # of JOINTS
-    target: float  # rad
-    speed: float  # rad/s, the fastest on the way
+    joint: int  # index in JOINTS
+    target: float  # target angle, rad
+    speed: float  # peak speed, rad/s
 
 
 def minimum_jerk(phase: float) -> tuple[float, float]:
-    """Share of the way and its derivative at a phase, 0 to 1: s = 10 x^3 - 15 x^4 + 6 x^5 (Flash and Hogan, 1985)."""
+    """Return the minimum-jerk profile and its derivative: s = 10 x^3 - 15 x^4 + 6 x^5 (Flash and Hogan, 1985).
+
+    Args:
+        phase: Time divided by the duration of the move; clipped to 0 to 1.
+
+    Returns:
+        Covered share of the distance, 0 to 1, and its derivative with respect to the phase.
+    """
     x = min(max(phase, 0.0), 1.0)
     return x**3 * (10.0 + x * (6.0 * x - 15.0)), 30.0 * (x * (1.0 - x)) ** 2
 
 
 class PoseHold:
-    """PD with the robot's own hold gains around a reference, plus the gravity of the hanging empty exoskeleton.
+    """PD controller with the hold gains of the robot, plus gravity compensation of the suspended empty exoskeleton.
 
-    `telemetry` is the reference, shape (12,) [rad].
+    Attributes:
+        telemetry: Reference angles, shape (12,) [rad].
+        duration: Duration of the move [s].
+        elapsed: Time since the move started [s].
     """
 
     telemetry_fields: Sequence[tuple[str, int]] = (("reference", len(JOINTS)),)
 
     def __init__(self, robot: Robot, *, move: Move | None = None, vibration: Vector | None = None) -> None:
-        """Prepare; `vibration` is the level of each of MOTORS, 0 to 1."""
+        """Prepare the controller.
+
+        Args:
+            robot: Robot with the hold gains.
+            move: Move of one joint; None: hold all joints.
+            vibration: Level of each motor, shape (8,), 0 to 1; None: all off.
+        """
         self._robot, self._move = robot, move
         self._gravity = Gravity(pinocchio_model(urdf(ExoskeletonParameters(), robot)))
         self._speed = np.zeros_like(robot.hold_kp)
         self._command = Command(np.zeros_like(robot.hold_kp), np.zeros(len(MOTORS)) if vibration is None else vibration)
         self._from = 0.0
-        self.duration = 0.0  # s, of the move
-        self.elapsed = 0.0  # s, since it began
+        self.duration = 0.0
+        self.elapsed = 0.0
         self.telemetry = np.zeros_like(robot.hold_kp)
 
     def reset(self, state: State) -> None:
-        """Hold here."""
+        """Take the measured pose as the reference, and start the move from it.
+
+        Args:
+            state: Measured state of the robot.
+        """
         self.telemetry[:] = state.position
         self.elapsed = 0.0
         if self._move is not None:
@@ -62,13 +82,17 @@ class PoseHold:
             self.duration = PEAK * abs(self._move.target - self._from) / self._move.speed
 
     def update(self, state: State) -> Command:
-        """One cycle."""
+        """Return the torque and vibration command of one cycle.
+
+        Args:
+            state: Measured state of the robot.
+        """
         self.elapsed += PERIOD
         if self._move is not None and self.duration:
             share, rate = minimum_jerk(self.elapsed / self.duration)
-            way = self._move.target - self._from
-            self.telemetry[self._move.joint] = self._from + way * share
-            self._speed[self._move.joint] = way * rate / self.duration
+            distance = self._move.target - self._from
+            self.telemetry[self._move.joint] = self._from + distance * share
+            self._speed[self._move.joint] = distance * rate / self.duration
         w, x, y, z = state.imu_quaternion[_PELVIS].tolist()
         torque = self._command.torque
         torque[:] = self._gravity.torque(state.position, (w, x, y, z))

@@ -1,7 +1,8 @@
-"""A HAL ready to run, whatever carries its frames: `target -> buses -> Hal`, and the emulated robot when it is embedded.
+"""Rig of a run: `target -> buses -> Hal`, with an emulated robot when the target is embedded.
 
-There is one HAL code path: an embedded robot differs from a real one in the bus alone. It lives in this process, where its
-emulator can be looked into, or in one of its own, where its body moves while the HAL works; the bytes on the bus are the same.
+The HAL code path is the same for every target: an embedded robot differs from a real one only in the bus. It runs in this
+process, where tests can inspect the emulator, or in a subprocess, where its physics runs in parallel with the HAL. The bytes on
+the bus are the same.
 """
 
 from __future__ import annotations
@@ -36,14 +37,22 @@ if TYPE_CHECKING:
     from atalante_emulator.faults import Fault
     from atalante_emulator.pendant import Operator
 
-#: How long the nodes may take to answer a SYNC [s]: on the wall clock half a cycle, in lock-step as long as a slow machine needs.
+#: Longest wait for the answers to a SYNC on the wall clock: half a cycle [s].
 PATIENCE: Final = 0.5e-3
+#: Longest wait for the answers to a SYNC in lock-step, long enough for a slow machine [s].
 LOCKSTEP_PATIENCE: Final = 2.0
 
 
 @dataclass
 class Rig:
-    """A HAL on its bus; `emulator` and `operator` are those of a robot embedded in this process."""
+    """HAL on its bus.
+
+    Attributes:
+        target: Bus and clock.
+        hal: The HAL.
+        emulator: Emulator of a robot embedded in this process; None: any other robot.
+        operator: Emulated operator of that robot; None: any other robot.
+    """
 
     target: Target
     hal: Hal
@@ -53,13 +62,21 @@ class Rig:
     def run(
         self, controller: Controller, *, until: Callable[[State], bool], record: Callable[[], None] = lambda: None
     ) -> Statistics:
-        """`loop.run` on the clock of the target; ends in HOLD. On the wall clock the process asks for real-time rights.
+        """Run the loop on the clock of the target. It ends in HOLD.
 
-        A signal makes the HAL refuse every START and go to HOLD; no further signal cuts that short. `until` has to look at the
-        stop request.
+        On the wall clock the process requests real-time priority and locked memory. A signal makes the HAL refuse every START
+        and change to HOLD; further signals do not interrupt this. `until` must read the stop request.
+
+        Args:
+            controller: Controller that is updated in every cycle.
+            until: End condition, called with the state after every cycle.
+            record: Called after every cycle, to record it.
+
+        Returns:
+            Statistics of the loop.
 
         Raises:
-            Stopped: a signal arrived before; the robot was not driven.
+            Stopped: If a signal arrived before the run; the robot was not driven.
         """
         with ended_by(self.hal.end) as stop:
             stop.check()
@@ -87,27 +104,33 @@ def open_hal(
     robot_process: EmbeddedRobot | None = None,
     exoskeleton: ExoskeletonParameters | None = None,
 ) -> Iterator[Rig]:
-    """Assemble a HAL for a command and take it apart in order.
+    """Open the buses, create the HAL and, for an embedded target, the emulated robot. Close everything after the block.
 
     Args:
-        network, robot: read from the project's files unless given.
-        seed: of the embedded robot's noise.
-        pose: joint angles the embedded robot starts from, shape (12,) [rad].
-        operator: who holds the embedded pendant; one who starts as soon as the HAL is ready unless given.
-        assistance_factor, controller_fields, gait_hash, tap: see `Hal`.
-        faults: of the embedded robot.
-        robot_process: a process that is to be the embedded robot, with an operator who starts as soon as the HAL is ready;
-            closed in the end. None: this process is.
-        exoskeleton: the embedded robot's legs; as they come from the factory unless given.
+        target: Bus and clock.
+        network: Network; None: read from the project's DBC.
+        robot: Robot parameters; None: read from the project's file.
+        seed: Seed of the sensor noise of the embedded robot.
+        pose: Initial joint angles of the embedded robot, shape (12,) [rad]; None: all zero.
+        operator: Emulated operator of the embedded robot; None: one that presses START as soon as the HAL is READY.
+        assistance_factor: Initial assistance factor Xi, 0 to 1.
+        controller_fields: Name and size of each telemetry field of the controller.
+        gait_hash: Hash of the gait that the HAL reports.
+        tap: Recorder of all frames; None: frames are not recorded.
+        faults: Faults to inject into the embedded robot.
+        robot_process: Subprocess that runs the embedded robot and is closed after the block. Its operator presses START as soon
+            as the HAL is READY. None: the embedded robot runs in this process.
+        exoskeleton: Geometry and masses of the embedded robot; None: default leg lengths.
 
     Raises:
-        ValueError: an operator of this process for a robot in another.
-        FaultError: the network has no such target or signal.
-        BusError, ChannelMapError: the buses cannot be opened, or another HAL is at work on them.
-        Failed: the embedded robot needs PyBullet and it is not installed.
-        Stopped: a signal arrived before or meanwhile.
+        ValueError: If both `operator` and `robot_process` are given.
+        FaultError: If a fault names a target or signal that the network does not have.
+        BusError: If a bus cannot be opened, or another HAL uses it.
+        ChannelMapError: If the channel map is invalid.
+        Failed: If the embedded robot needs PyBullet and it is not installed.
+        Stopped: If a signal arrived before or during the start.
     """
-    check_stop()  # an import may have lost its exception, as may what is made here
+    check_stop()  # the exception of a signal may have been lost during imports
     network = network or atalante_dbc.load()
     robot = robot or load_robot()
     with ExitStack() as stack:
@@ -115,19 +138,21 @@ def open_hal(
         if robot_process is not None:
             stack.enter_context(robot_process)
             if operator is not None:
-                raise ValueError("the operator of a robot in a process of its own is there, too: leave `operator` out")
+                raise ValueError(
+                    "operator must be None for a robot in a subprocess, which creates its own: remove `operator`"
+                )
             robot_process.begin(SpawnConfig(network, robot, describe(robot, exoskeleton), pose, seed, faults))
             bus: Bus = robot_process.bus
         elif target.embedded:
-            ours, theirs = lockstep_pair()
-            bus = ours
+            hal_end, robot_end = lockstep_pair()
+            bus = hal_end
             body = stack.enter_context(open_body(robot, pose, exoskeleton))
             from atalante_emulator.emulator import Emulator
             from atalante_emulator.pendant import Operator
 
             operator = operator or Operator()
-            emulator = Emulator(network, robot, body, theirs, seed=seed, operator=operator, faults=faults)
-            ours.step = emulator.poll
+            emulator = Emulator(network, robot, body, robot_end, seed=seed, operator=operator, faults=faults)
+            hal_end.step = emulator.poll
         else:
             bus = join(network, open_buses(network, target))
         stack.callback(bus.close)
@@ -148,21 +173,35 @@ def open_hal(
 
 
 def open_buses(network: Network, target: Target) -> dict[str, Bus]:
-    """The open bus of each of `network.buses`. Raises `BusError`, `ChannelMapError`."""
+    """Open the bus of each name in `network.buses`.
+
+    Args:
+        network: Network with the bus names.
+        target: Interface and channel, or channel map.
+
+    Raises:
+        BusError: If a bus cannot be opened.
+        ChannelMapError: If the channel map is invalid.
+    """
     return open_channels(target.interface, parse_channel_map(target.channel, network.buses))
 
 
 def join(network: Network, buses: dict[str, Bus]) -> Bus:
-    """One bus for all: itself if it is one already."""
+    """Return one bus that sends and receives on all buses.
+
+    Args:
+        network: Network that assigns messages to buses.
+        buses: Open bus of each name; the same object if several names share a channel.
+    """
     first, *others = {id(bus): bus for bus in buses.values()}.values()
     return JoinedBus(network, buses) if others else first
 
 
 class Watch:
-    """Asked once a cycle whether a run goes on; meanwhile says what the run is waiting for, or how far it is.
+    """End condition of a run, called once per cycle. It prints the progress, or what the run is waiting for.
 
-    A run ends when `done(state)`, asked while ACTIVE, says so; when somebody wants to stop; and when the robot leaves ACTIVE
-    or is in FAULT. After the run `conclude` turns all but the first into the command's end.
+    A run ends when `done(state)` returns True while ACTIVE, when a signal arrives, or when the robot leaves ACTIVE or is in
+    FAULT. After the run `conclude` raises an error unless the run ended by `done`.
     """
 
     def __init__(
@@ -175,7 +214,11 @@ class Watch:
         self._state, self._reason = SupervisorState.OFF, ""
 
     def __call__(self, state: State) -> bool:
-        """Whether the run is over."""
+        """Return whether the run is over.
+
+        Args:
+            state: State of the robot after a cycle.
+        """
         active = self._rig.hal.moving
         if self._stop.wanted:
             over = True
@@ -195,11 +238,12 @@ class Watch:
         return over
 
     def conclude(self) -> None:
-        """End the command unless its work was done.
+        """End the command with an error unless the run was completed.
 
         Raises:
-            SystemExit: with the code of the signal.
-            FaultLatched, Failed: with the reason.
+            SystemExit: If a signal ended the run, with its exit code.
+            FaultLatched: If the robot is in FAULT.
+            Failed: If the robot left ACTIVE early.
         """
         if self._stop.wanted:
             say("stopped, the robot is in HOLD")
@@ -211,18 +255,24 @@ class Watch:
 
 
 def waiting_for(rig: Rig) -> str:
-    """What keeps the robot from ACTIVE, one sentence with what to type."""
+    """Return what the run is waiting for before ACTIVE, with the command to type.
+
+    Args:
+        rig: Rig whose robot is not ACTIVE yet.
+    """
     hal, target = rig.hal, rig.target
     if hal.state.supervisor is SupervisorState.OFF:
         missing = hal.missing()
         if hal.silent:
-            return f"no node answers on {target}; an emulated robot is `atalante emulator {target.arguments}`"
+            return (
+                f"no node answers on {target}; to start an emulated robot, type `atalante emulator {target.arguments}`"
+            )
         return f"waiting for {', '.join(missing)}" if missing else f"OFF: {hal.reason}"
     if hal.reason.startswith(REFUSED):
         return f"{hal.state.supervisor.name}: {hal.reason}"
-    waits = f"{hal.state.supervisor.name}: waiting for the operator"
+    waits = f"{hal.state.supervisor.name}: waiting for START"
     return (
-        f"{waits} of the embedded robot"
+        f"{waits} of the emulated operator"
         if target.embedded
-        else f"{waits}, who is `atalante pendant start {target.arguments}`"
+        else f"{waits}; type `atalante pendant start {target.arguments}`"
     )

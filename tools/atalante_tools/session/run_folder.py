@@ -1,4 +1,4 @@
-"""The folder of a run: kept for one run at a time, and what `atalante demo` and `airwalk` leave in it and say at the end.
+"""Folder of a run of `atalante demo` or `airwalk`: locked during the run, summary and figure written at its end.
 
 results -> table, summary.json; recording -> figure
 """
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Result:
-    """One shape; the keys of `--json` and of summary.json."""
+    """Result of one guide shape. The field names are the keys of `--json` and of summary.json."""
 
     shape: str
-    certified: bool  # on the model, at every assistance factor that was walked
+    certified: bool  # whether the guide is certified on the model at every assistance factor of the run
     bound_hip_nm: (
         float | None
-    )  # real torque the filter is built for, together with that at the knee; None: not certified
-    bound_knee_nm: float | None
-    steps: int  # completed right-stance steps
-    max_ratio: float  # largest |e| / q_bound from the first completed step on
-    inside: float  # share of that time both assisted joints were in the guide
-    filter_active: float  # share of that time the filter acted
+    )  # disturbance torque at the hip that the filter tolerates together with the one at the knee; None: not certified
+    bound_knee_nm: float | None  # the same at the knee
+    steps: int  # number of completed right-stance steps
+    max_ratio: float  # largest |e| / q_bound after the first completed step
+    inside: float  # share of that time with both assisted joints inside the guide, 0 to 1
+    filter_active: float  # share of that time with an active filter, 0 to 1
     cycles: int
     real_time_factor: float
     frames: int
@@ -43,13 +43,18 @@ class Result:
 
 @contextmanager
 def run_folder(out: Path) -> Iterator[None]:
-    """Make the folder and keep it for this process: two recordings in one file are none. Made for nothing, it goes again.
+    """Create the folder and lock it, because two runs must not write the same files.
+
+    A new folder that is still empty after the block is removed.
+
+    Args:
+        out: Path of the folder.
 
     Raises:
-        Failed: another run is at work in it.
-        OSError: it cannot be made.
+        Failed: If another run uses the folder.
+        OSError: If the folder cannot be created.
     """
-    found = out.exists()
+    existed = out.exists()
     out.mkdir(parents=True, exist_ok=True)
     folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -57,21 +62,23 @@ def run_folder(out: Path) -> Iterator[None]:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise Failed(
-                f"another run is writing into {out}: let it end, or give this one a folder with --out"
+                f"another run is writing into {out}: wait for its end, or choose another folder with --out"
             ) from None
         yield
     finally:
         os.close(folder)
-        if not found and not any(out.iterdir()):
+        if not existed and not any(out.iterdir()):
             out.rmdir()
 
 
 def leave(out: Path, asked: Mapping[str, Any], results: Sequence[Result], recording: Recording) -> None:
-    """Write summary.json and the figure, and say where everything is.
+    """Write summary.json and the figure, and print the names of all files.
 
     Args:
-        asked: what the user asked for, first in the summary.
-        recording: its files, and whether they have every cycle.
+        out: Folder of the run.
+        asked: Options of the user; the first keys of the summary.
+        results: Results, one per shape.
+        recording: Recording files, and whether they contain every cycle.
     """
     summary = {**asked, "recording": asdict(recording), "shapes": [asdict(result) for result in results]}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
@@ -80,7 +87,7 @@ def leave(out: Path, asked: Mapping[str, Any], results: Sequence[Result], record
 
 
 def _figure(out: Path) -> str:
-    """Name of the figure; empty, and the reason said, where there is none."""
+    """Draw the figure and return its name, or print why there is none and return an empty string."""
     name = "guide_shapes.png"
     try:
         from mcap.exceptions import McapError
@@ -92,13 +99,17 @@ def _figure(out: Path) -> str:
     try:
         guide_shapes(out / "recording.mcap", out / name)
     except McapError as error:
-        say(f"no figure: recording.mcap is not whole: {error}")
+        say(f"no figure: recording.mcap is incomplete: {error}")
         return ""
     return name
 
 
 def results_table(results: Sequence[Result]) -> str:
-    """The results for a person."""
+    """Return the results as a table for the terminal.
+
+    Args:
+        results: Results, one per shape.
+    """
     head = ["shape", "certified", "bound hip Nm", "bound knee Nm", "steps", "max |e|/q_bound", "inside %", "filter active %",
             "cycles", "x real time", "frames", "CRC errors"]  # fmt: skip
     rows = [
@@ -119,7 +130,7 @@ def results_table(results: Sequence[Result]) -> str:
 
 
 def _judged(result: Result) -> tuple[str, str, str]:
-    """What became of the guide, from the first completed step on: of a single step there is nothing to say."""
+    """Return the three cells of the tracking error, which is measured after the first completed step."""
     if result.steps < 2:
         return "-", "-", "-"
     return f"{result.max_ratio:.2f}", f"{100 * result.inside:.1f}", f"{100 * result.filter_active:.1f}"

@@ -1,12 +1,12 @@
-"""The embedded robot in a process of its own, so that its body moves while the HAL and the controller work.
+"""Embedded robot in a subprocess, so that its physics runs in parallel with the HAL and the controller.
 
     HAL <- SharedBus -> python -m atalante_tools.session.embedded: emulator -> body
 
-The child is a fresh interpreter, in a process group of its own: the terminal's Ctrl-C goes to the loop, which ends in HOLD and
-then closes the bus. Whichever side dies, the other notices by the bus, and nothing is left behind.
+The child is a new interpreter in a separate process group. Ctrl-C therefore reaches only the parent, whose loop ends in HOLD and
+then closes the bus. If either process ends, the other detects it on the bus and ends too.
 
-The two never share a core: each waits for the other in turn, and a system that thinks they belong together puts them on one,
-where they go several times slower and stay.
+The two processes run on different cores. They wait for each other in turn, so the scheduler of the system would otherwise put
+both on one core, where they run several times slower.
 """
 
 from __future__ import annotations
@@ -31,76 +31,82 @@ from atalante_tools.session.body import require_engine
 if TYPE_CHECKING:
     from atalante_emulator.faults import Fault
 
-#: Longest wait for an answer to a SYNC, until the robot is there, and until it has gone [s].
+#: Longest wait for the answer to a SYNC, for the start of the robot, and for the end of the child [s].
 _PATIENCE, _START, _END = 2.0, 60.0, 5.0
 
 
 @dataclass(frozen=True)
 class SpawnConfig:
-    """The robot that is wanted."""
+    """Description of the robot that the child creates; sent through its stdin."""
 
     network: Network
     robot: Robot
     urdf: str
-    pose: Sequence[float] | None  # rad, shape (12,)
+    pose: Sequence[float] | None  # initial joint angles, shape (12,), rad; None: all zero
     seed: int
     faults: Sequence[Fault]
 
 
 class EmbeddedRobot(Closing):
-    """The child, and `bus`, the HAL's end of the bus to it; as a context manager it is there for the block.
+    """Subprocess with the embedded robot; a context manager that closes it after the block.
 
-    Starting it early is worth while: until `begin` it loads what it needs.
+    Create it early, because the child imports its modules while the parent prepares the run.
+
+    Attributes:
+        bus: End of the HAL on the bus to the child.
     """
 
     _open: ClassVar[list[EmbeddedRobot]] = []
-    _cores: ClassVar[set[int]] = set()  # of this thread, before the first of those that are open
+    _cores: ClassVar[set[int]] = set()  # cores of this thread before the first open robot
 
     def __init__(self) -> None:
         """Start the child.
 
         Raises:
-            Failed: PyBullet is not installed.
+            Failed: If PyBullet is not installed.
         """
         require_engine()
-        memory, ours, theirs = descriptors()
+        memory, parent_bell, child_bell = descriptors()
         self._child = subprocess.Popen(
-            [sys.executable, "-P", "-m", "atalante_tools.session.embedded", str(memory), str(theirs)],
+            [sys.executable, "-P", "-m", "atalante_tools.session.embedded", str(memory), str(child_bell)],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
-            pass_fds=(memory, theirs),
+            pass_fds=(memory, child_bell),
             process_group=0,
         )
         self._begun = False
-        os.close(theirs)  # or its end would stay open when it dies
-        self.bus = SharedBus("embedded", memory, ours, 0)
+        os.close(child_bell)  # an open copy would hide the end of the child
+        self.bus = SharedBus("embedded", memory, parent_bell, 0)
         self.bus.patience = _PATIENCE
         self._part_from_child()
 
     def _part_from_child(self) -> None:
-        """Give the child cores of its own, shared with other robots that are open: the next loads while the last walks."""
+        """Assign different cores to this thread and the child. All open robots share the cores of the children."""
         if not self._open:
             EmbeddedRobot._cores = os.sched_getaffinity(0)
         self._open.append(self)
-        kept, given = halves(self._cores)
-        os.sched_setaffinity(self._child.pid, given)
-        os.sched_setaffinity(0, kept)
+        own_cores, child_cores = halves(self._cores)
+        os.sched_setaffinity(self._child.pid, child_cores)
+        os.sched_setaffinity(0, own_cores)
 
     @property
     def pid(self) -> int:
-        """Of the child."""
+        """Return the process identifier of the child."""
         return self._child.pid
 
     def begin(self, order: SpawnConfig) -> None:
-        """Make the robot.
+        """Send the description to the child, and wait until the robot exists.
+
+        Args:
+            order: Robot to create.
 
         Raises:
-            Failed: it cannot be made; the message says why.
+            Failed: If the child cannot create the robot; the message contains the reason.
         """
         pipe = self._child.stdin
         assert pipe is not None
         self._begun = True
-        # Should the child have died, the bus says so.
+        # If the child has ended, `meet` raises the reason.
         with suppress(BrokenPipeError), pipe:
             pickle.dump(order, pipe)
         try:
@@ -109,14 +115,17 @@ class EmbeddedRobot(Closing):
             raise Failed(str(error)) from error
 
     def close(self) -> None:
-        """Close the bus and see the child off; a second call does nothing. By the thread that made it."""
+        """Close the bus and wait for the end of the child. A second call does nothing.
+
+        Call it from the thread that created this object, because it restores the cores of that thread.
+        """
         self.bus.close()
         if self in self._open:
             self._open.remove(self)
             if not self._open:
                 os.sched_setaffinity(0, self._cores)
         if not self._begun:
-            self._child.kill()  # it is of no use, and nobody waits until it has loaded everything
+            self._child.kill()  # without a robot the child is still importing, and waiting for it is useless
         try:
             self._child.wait(_END)
         except subprocess.TimeoutExpired:
@@ -127,7 +136,14 @@ class EmbeddedRobot(Closing):
 
 
 def halves(cores: set[int]) -> tuple[set[int], set[int]]:
-    """The cores of this thread and of the child, both all of them where there is but one; the odd one is this thread's."""
-    place = (len(cores) + 1) // 2
-    first, others = set(sorted(cores)[:place]), set(sorted(cores)[place:])
+    """Split processor cores between this thread and the child.
+
+    Args:
+        cores: Available cores.
+
+    Returns:
+        Cores of this thread (the larger half) and cores of the child. Both are the same core if there is only one.
+    """
+    count = (len(cores) + 1) // 2
+    first, others = set(sorted(cores)[:count]), set(sorted(cores)[count:])
     return first, others or first

@@ -1,6 +1,6 @@
-"""The embedded robot's process: `python -m atalante_tools.session.embedded MEMORY BELL`, started by `EmbeddedRobot` alone.
+"""Subprocess of the embedded robot: `python -m atalante_tools.session.embedded MEMORY BELL`, started by `EmbeddedRobot`.
 
-The order comes through stdin; everything else is said on the bus. Ends when the other end of the bus closes or dies.
+It reads the `SpawnConfig` from stdin; all other communication uses the bus. It ends when the other end of the bus closes.
 """
 
 from __future__ import annotations
@@ -14,34 +14,44 @@ from atalante_hal.bus.shared import SharedBus
 from atalante_tools.session.body import no_banner, open_described
 from atalante_tools.session.embedded import SpawnConfig
 
-with no_banner():  # while the order is being written
+with no_banner():  # these slow imports run while the parent prepares the `SpawnConfig`
     from atalante_emulator.emulator import Emulator
     from atalante_emulator.pendant import Operator
 
 
 def answer(bus: SharedBus, order: SpawnConfig) -> None:
-    """Be the robot until the bus is down."""
+    """Emulate the robot until the bus is closed.
+
+    Args:
+        bus: End of the robot on the bus.
+        order: Robot to create.
+    """
     with open_described(order.urdf, order.pose) as body:
         emulator = Emulator(
             order.network, order.robot, body, bus, seed=order.seed, operator=Operator(), faults=order.faults
         )
-        # What lives now lives as long as the run, and the collector need not look at it again and again.
+        # All objects of this point are needed until the end, so the garbage collector need not scan them again.
         gc.collect()
         gc.freeze()
         bus.serve(emulator.poll)
 
 
 def main(memory: str, bell: str) -> None:
-    """Make the robot that is ordered, and answer."""
+    """Create the robot and answer the SYNCs of the HAL.
+
+    Args:
+        memory: File descriptor of the shared memory, as text.
+        bell: File descriptor of the notification socket, as text.
+    """
     bus = SharedBus("the embedded robot's bus", int(memory), int(bell), 1)
-    last_words = ""
+    reason = ""
     try:
         answer(bus, pickle.load(sys.stdin.buffer))
     except (BusDown, EOFError):
-        pass  # the HAL has gone, perhaps before it ordered
-    except Exception as error:  # noqa: BLE001 - whatever it is, the other process has to say it
-        last_words = f"the robot's process failed with {type(error).__name__}: {error}"
-    bus.close(last_words)
+        pass  # the parent has ended, maybe before it sent the `SpawnConfig`
+    except Exception as error:  # noqa: BLE001 - the parent reports every kind of error to the user
+        reason = f"the robot's process failed with {type(error).__name__}: {error}"
+    bus.close(reason)
 
 
 if __name__ == "__main__":
