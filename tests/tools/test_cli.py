@@ -1,4 +1,4 @@
-"""The command line as a whole: help, version, exit codes, one sentence for an error, JSON alone on stdout, start-up."""
+"""The command line as a whole: help, version, exit codes, one sentence per error, only JSON on stdout, start-up."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def helps(command: click.Command, path: list[str]) -> Iterator[str]:
-    """The help of a command and of every command below it."""
+    """Yield the help of a command and of all its subcommands."""
     result = CliRunner().invoke(cli, [*path, "--help"])
     assert (result.exit_code, result.stderr) == (0, "")
     yield result.stdout
@@ -89,14 +89,14 @@ print(sorted(sys.modules), file=sys.stderr)
     assert done.stdout.splitlines()[-1].startswith("atalante ")
 
 
-def test_angles_say_their_unit() -> None:
+def test_help_of_jog_contains_the_units() -> None:
     text = CliRunner().invoke(cli, ["jog", "--help"]).stdout
     assert "degrees" in text
     assert "deg/s" in text
 
 
 @pytest.mark.parametrize("group", ["pendant", "dbc", "faults", "gait"])
-def test_the_list_of_a_group_is_whole_sentences(group: str) -> None:
+def test_the_command_list_of_a_group_has_one_full_sentence_per_line(group: str) -> None:
     text = CliRunner().invoke(cli, [group, "--help"], terminal_width=80).stdout
     lines = text.split("Commands:\n")[1].splitlines()
     assert len(lines) >= 3
@@ -107,7 +107,7 @@ def test_the_list_of_a_group_is_whole_sentences(group: str) -> None:
 @pytest.mark.parametrize(
     ("command", "names"), [("jog", JOINTS), ("vibrate", MOTORS), ("demo", SHAPES), ("airwalk", SHAPES)]
 )
-def test_help_says_what_there_is_to_name(command: str, names: Sequence[str]) -> None:
+def test_help_lists_all_valid_names(command: str, names: Sequence[str]) -> None:
     words = set(re.findall(r"\w+", CliRunner().invoke(cli, [command, "--help"]).stdout))
     for name in names:
         side, *rest = name.split("_")
@@ -120,7 +120,7 @@ def test_help_says_what_there_is_to_name(command: str, names: Sequence[str]) -> 
 
 @pytest.fixture
 def failing(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Let the command `jog` raise."""
+    """Return a function that runs the command `jog` with a given error."""
 
     def fail(error: BaseException) -> Any:
         @click.command()
@@ -167,11 +167,11 @@ def test_a_known_error_is_one_sentence_and_its_code(failing: Any, error: BaseExc
     assert "Traceback" not in result.stderr
 
 
-def test_a_sentence_of_several_lines_becomes_one(failing: Any) -> None:
+def test_an_error_of_several_lines_is_printed_as_one_line(failing: Any) -> None:
     assert failing(BusError("first\n  second\tthird")).stderr == "atalante: first second third\n"
 
 
-def test_of_a_list_of_problems_the_first_is_told(failing: Any) -> None:
+def test_a_list_of_problems_is_shortened_to_the_first_and_a_count(failing: Any) -> None:
     problems = "\n".join(f"a.dbc:{line}: no unit" for line in range(1, 25))
     assert failing(DbcError(problems)).stderr == "atalante: DBC_INVALID: a.dbc:1: no unit, and 23 more\n"
 
@@ -180,21 +180,21 @@ def test_of_a_list_of_problems_the_first_is_told(failing: Any) -> None:
     ("error", "sentence"),
     [
         (PermissionError(13, "Permission denied", "/root/run"), "/root/run cannot be used: Permission denied"),
-        (OSError(28, "No space left on device"), "what was to be written cannot be used: No space left on device"),
+        (OSError(28, "No space left on device"), "the output file cannot be used: No space left on device"),
     ],
 )
-def test_a_file_that_the_system_refuses_is_one_sentence(failing: Any, error: OSError, sentence: str) -> None:
+def test_an_operating_system_error_of_a_file_is_one_sentence(failing: Any, error: OSError, sentence: str) -> None:
     result = failing(error)
     assert (result.exit_code, result.stderr) == (1, f"atalante: {sentence}\n")
 
 
-def test_a_system_call_that_goes_wrong_without_a_file_is_a_defect(failing: Any) -> None:
+def test_an_operating_system_error_without_a_file_keeps_its_traceback(failing: Any) -> None:
     error = OSError(9, "Bad file descriptor")
     assert failing(error).exception is error
 
 
 @pytest.mark.parametrize("group", ["pendant", "dbc", "faults", "gait"])
-def test_a_group_alone_says_what_is_in_it(group: str) -> None:
+def test_a_group_without_subcommand_prints_its_help(group: str) -> None:
     alone, asked = CliRunner().invoke(cli, [group]), CliRunner().invoke(cli, [group, "--help"])
     assert (alone.exit_code, alone.stdout, alone.stderr) == (2, "", asked.stdout)
 
@@ -250,7 +250,7 @@ def test_version_and_codes_reach_the_shell() -> None:
     assert unknown.stderr.startswith("atalante: there is no CAN interface 'pigeon'")
 
 
-def test_json_is_alone_on_stdout_whatever_libraries_print() -> None:
+def test_stdout_contains_only_json_when_libraries_print() -> None:
     done = run("jog", "left_SK", "--to", "2", "--speed", "60", "--json")
     assert done.returncode == 0
     (line,) = done.stdout.splitlines()
@@ -276,7 +276,7 @@ def test_a_signal_ends_a_running_command_in_hold(number: signal.Signals, code: i
 
 
 def main_with(command: str) -> subprocess.CompletedProcess[str]:
-    """`atalante` with Python code for its command, which may call `send(number)`."""
+    """Run `atalante` with Python code as its command; the code may call `send(number)`."""
     program = f"""
 import atexit, ctypes, os, signal, sys
 from atalante_tools import cli, entry
@@ -305,7 +305,7 @@ def test_a_signal_outside_a_run_decides_the_exit_code(number: signal.Signals, co
     assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
 
 
-def test_an_error_that_a_library_makes_of_a_signal_is_not_reported() -> None:
+def test_a_library_error_caused_by_a_signal_is_not_reported() -> None:
     lines = ("try: send(2)", "except BaseException as error: raise ImportError('half imported') from error")
     done = main_with("\n    ".join(lines))
     assert (done.returncode, done.stderr) == (130, "")
@@ -352,7 +352,7 @@ main()
     assert first == "atalante_tools.cli True True"
 
 
-def test_a_reader_that_goes_away_is_no_traceback() -> None:
+def test_a_closed_pipe_ends_without_a_traceback() -> None:
     reading, writing = os.pipe()
     os.close(reading)
     done = subprocess.run(

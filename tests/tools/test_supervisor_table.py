@@ -16,7 +16,7 @@ from atalante_tools.supervisor_table import FACTS, a_diagnostic, page
 PAGE = Path(__file__).parents[2] / "SUPERVISOR.md"
 
 
-def test_the_page_is_what_the_function_does():
+def test_the_page_matches_the_state_machine():
     assert PAGE.read_text() == page(), "SUPERVISOR.md is stale: type `make supervisor-table`"
 
 

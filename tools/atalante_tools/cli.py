@@ -1,4 +1,4 @@
-"""The `atalante` command: a group that imports a subcommand when it is called, and ends an error in one sentence.
+"""The `atalante` command: a group that imports a subcommand when it is called, and reports an error as one sentence.
 
 entry.main -> cli -> commands.<name>.command -> exit code (see console/outcome.py)
 """

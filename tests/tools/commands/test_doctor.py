@@ -1,4 +1,4 @@
-"""`atalante doctor`: every answer on machines of all kinds, and the real one."""
+"""`atalante doctor`: all checks on simulated machines and on this machine."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GOOD = Interface("vcan0", virtual=True, up=True, mtu=72, queue=1000)
 
 @dataclass
 class AnyMachine:
-    """A machine that lacks nothing, unless told."""
+    """Simulated machine that passes all checks unless a field is changed."""
 
     refusal: str | None = None
     has_vcan: bool = True
@@ -59,11 +59,11 @@ def needed(machine: AnyMachine, interface: str, *channels: str) -> list[str]:
 
 
 @pytest.mark.parametrize(("interface", "channels"), [("embedded", ()), ("socketcan", ("vcan0",)), ("virtual", ("x",))])
-def test_a_good_machine_lacks_nothing(interface: str, channels: tuple[str, ...]) -> None:
+def test_all_checks_pass_on_a_complete_machine(interface: str, channels: tuple[str, ...]) -> None:
     assert missing(AnyMachine(), interface, *channels) == {}
 
 
-def test_a_kernel_without_can_matters_to_socketcan_alone() -> None:
+def test_a_kernel_without_can_fails_only_for_socketcan() -> None:
     bare = AnyMachine(refusal="Address family not supported by protocol", there=[])
     assert needed(bare, "embedded") == []
     assert needed(bare, "virtual", "x") == []
@@ -83,32 +83,32 @@ def test_a_kernel_without_can_matters_to_socketcan_alone() -> None:
         (Interface("vcan0", True, False, 72, 1000), "ip link set vcan0 up"),
     ],
 )
-def test_an_interface_that_cannot_carry_the_robot_says_what_to_type(interface: Interface, fix: str) -> None:
+def test_an_unusable_interface_fails_with_the_command_that_repairs_it(interface: Interface, fix: str) -> None:
     found = missing(AnyMachine(there=[interface]), "socketcan", interface.name)
     assert list(found) == [interface.name]
     assert found[interface.name].needed
     assert found[interface.name].fix == fix
 
 
-def test_a_short_queue_is_advice() -> None:
+def test_a_short_transmit_queue_is_reported_but_not_required() -> None:
     found = missing(AnyMachine(there=[Interface("can0", False, True, 72, 10)]), "socketcan", "can0")
     assert not found["can0"].needed
     assert found["can0"].fix == "ip link set can0 txqueuelen 1000"
 
 
-def test_a_channel_that_is_not_there_can_be_made() -> None:
+def test_a_missing_channel_fails_with_the_command_that_creates_it() -> None:
     found = missing(AnyMachine(), "socketcan", "vcan0", "vcan1")
     assert list(found) == ["vcan1"]
     assert found["vcan1"].fix == "ip link add vcan1 type vcan && ip link set vcan1 mtu 72 txqueuelen 1000 up"
 
 
-def test_without_a_channel_all_interfaces_are_shown_and_none_is_needed() -> None:
+def test_without_a_channel_all_interfaces_are_listed_and_none_is_required() -> None:
     machine = AnyMachine(there=[GOOD, Interface("can7", False, False, 72, 1000)])
     assert needed(machine, "socketcan") == []
     assert list(missing(machine, "socketcan")) == ["can7"]
 
 
-def test_pybullet_is_for_the_emulated_robot_and_pinocchio_for_everything() -> None:
+def test_pybullet_is_required_for_embedded_and_pinocchio_always() -> None:
     machine = AnyMachine(lacks=("pybullet", "pinocchio", "zenoh", "mcap", "matplotlib", "gcc", "candump"))
     assert needed(machine, "embedded") == ["pinocchio", "pybullet"]
     assert needed(machine, "socketcan", "vcan0") == ["pinocchio"]
@@ -116,13 +116,13 @@ def test_pybullet_is_for_the_emulated_robot_and_pinocchio_for_everything() -> No
     assert missing(machine, "embedded")["zenoh"].fix == "pip install 'atalante-hal[telemetry]'"
 
 
-def test_python_can_names_its_interfaces() -> None:
+def test_an_unknown_interface_fails_with_the_list_of_python_can() -> None:
     found = missing(AnyMachine(), "pigeon", "x")
     assert found["python-can"].needed
     assert "virtual" in found["python-can"].fix
 
 
-def test_realtime_rights_are_advice() -> None:
+def test_missing_realtime_limits_are_reported_but_not_required() -> None:
     machine = AnyMachine(priority=0, memory=8 << 20)
     assert needed(machine, "socketcan", "vcan0") == []
     found = missing(machine, "socketcan", "vcan0")
@@ -130,7 +130,7 @@ def test_realtime_rights_are_advice() -> None:
     assert "8192 KiB" in found["locked memory"].text
 
 
-def test_what_is_missing_says_what_to_type() -> None:
+def test_every_failed_check_has_a_command_that_repairs_it() -> None:
     worst = AnyMachine(
         "no such family", False, [], 0, 0, ("pybullet", "pinocchio", "zenoh", "mcap", "matplotlib", "gcc", "candump")
     )
@@ -167,13 +167,13 @@ def test_can_interfaces_are_read_from_sys(tmp_path: Path) -> None:
     assert machine.vcan()
 
 
-def test_vcan_is_a_module_without_interfaces_too(tmp_path: Path) -> None:
+def test_vcan_is_found_as_a_module_without_interfaces(tmp_path: Path) -> None:
     assert not ThisMachine(tmp_path).vcan()
     (tmp_path / "module/vcan").mkdir(parents=True)
     assert ThisMachine(tmp_path).vcan()
 
 
-def test_this_machine_answers_everything() -> None:
+def test_this_machine_returns_a_value_for_every_query() -> None:
     machine = ThisMachine()
     assert machine.package("numpy")
     assert not machine.package("no_such_package_at_all")
@@ -194,7 +194,7 @@ def bare(monkeypatch: pytest.MonkeyPatch) -> AnyMachine:
     return machine
 
 
-def test_it_ends_well_when_nothing_needed_is_missing(bare: AnyMachine) -> None:
+def test_the_exit_code_is_0_when_all_required_checks_pass(bare: AnyMachine) -> None:
     result = CliRunner().invoke(cli, ["doctor"])
     assert result.exit_code == 0
     assert (
@@ -202,7 +202,7 @@ def test_it_ends_well_when_nothing_needed_is_missing(bare: AnyMachine) -> None:
     )
 
 
-def test_it_fails_and_names_what_is_needed(bare: AnyMachine) -> None:
+def test_the_exit_code_is_1_and_the_error_lists_failed_checks(bare: AnyMachine) -> None:
     result = CliRunner().invoke(
         cli, ["doctor", "-i", "socketcan", "-c", "left_leg=can0,right_leg=can1,left_sense=can0,right_sense=can1"]
     )
@@ -213,7 +213,7 @@ def test_it_fails_and_names_what_is_needed(bare: AnyMachine) -> None:
     )
 
 
-def test_json_is_one_check_a_line(bare: AnyMachine) -> None:
+def test_json_prints_one_check_per_line(bare: AnyMachine) -> None:
     result = CliRunner().invoke(cli, ["doctor", "-i", "socketcan", "-c", "vcan0", "--json"])
     checks = [json.loads(line) for line in result.stdout.splitlines()]
     assert {tuple(check) for check in checks} == {("name", "ok", "needed", "text", "fix")}

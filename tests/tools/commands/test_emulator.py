@@ -1,4 +1,4 @@
-"""`atalante emulator`: the robot answers on a bus until Ctrl-C, says how it is, and gives its pendant away."""
+"""`atalante emulator`: the emulated robot answers on a bus until Ctrl-C and prints a status line."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from atalante_tools.session import rig as rig_module
 
 
 class OtherProcess:
-    """A HAL at the far end, one cycle at each look of the emulator; after `cycles` somebody presses Ctrl-C."""
+    """HAL at the other end of the bus: one cycle per poll of the emulator, and SIGINT after `cycles` cycles."""
 
     def __init__(self, network: Network, robot: Robot, cycles: int, monkeypatch: pytest.MonkeyPatch) -> None:
         ours, self.bus = lockstep_pair()
@@ -57,7 +57,7 @@ class OtherProcess:
         return CliRunner().invoke(cli, ["emulator", "-i", "pcan", "-c", "test", "--lockstep", *arguments])
 
 
-def test_a_hal_at_the_other_end_finds_every_node_and_an_operator(
+def test_a_hal_on_the_bus_receives_every_node_and_becomes_active(
     network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = OtherProcess(network, robot, 400, monkeypatch)
@@ -74,7 +74,7 @@ def test_a_hal_at_the_other_end_finds_every_node_and_an_operator(
         other.bus.receive(new_frames(1))
 
 
-def test_without_an_operator_the_pendant_is_somebody_elses(
+def test_without_the_emulated_operator_the_hal_stays_ready(
     network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = OtherProcess(network, robot, 500, monkeypatch)
@@ -84,7 +84,7 @@ def test_without_an_operator_the_pendant_is_somebody_elses(
     assert other.hal.state.supervisor is SupervisorState.READY
 
 
-def test_its_legs_are_those_of_the_patient_the_other_side_walks_for(
+def test_the_legs_are_adjusted_to_the_given_patient(
     network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bodies: list[str] = []
@@ -100,7 +100,7 @@ def test_its_legs_are_those_of_the_patient_the_other_side_walks_for(
     assert "atalante airwalk -i pcan -c test --mass 75 --height 1.75\n" in result.stderr
 
 
-def test_one_seed_is_one_robot(network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_equal_seeds_give_equal_sensor_noise(network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     def measured(seed: str) -> bytes:
         other = OtherProcess(network, robot, 50, monkeypatch)
         assert other.run("--seed", seed).exit_code == 130
@@ -117,7 +117,7 @@ def test_the_status_line_counts_cycles_frames_and_drives(
     result = OtherProcess(network, robot, 20, monkeypatch).run()
     lines = [line for line in result.stderr.splitlines() if "cycles" in line]
     assert lines[0] == "0 cycles, 0 frames in, 0 out; drives: 12 SWITCH_ON_DISABLED"
-    # Every cycle seven frames come; nineteen go, and now and then one more.
+    # Every cycle the emulator receives 7 frames and sends 19, plus slower messages.
     cycles, came, went = (int(word) for word in lines[-1].split() if word.isdigit() and word != "12")
     assert came == 7 * cycles
     assert 19 * cycles < went < 21 * cycles
@@ -133,7 +133,7 @@ def test_the_status_line_counts_cycles_frames_and_drives(
         ([], "socketcan needs a channel: -c vcan0"),
     ],
 )
-def test_misuse_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
+def test_an_invalid_command_line_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
     result = CliRunner().invoke(cli, ["emulator", *arguments])
     assert result.exit_code == 2
     assert sentence in result.stderr

@@ -1,4 +1,4 @@
-"""The emulated robot's end of a bus that other processes are on."""
+"""Bus of the emulated robot, shared with other processes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def received(bus: PairBus) -> list[int]:
     return ids
 
 
-def test_the_line_counts_and_keeps_the_pendant_back_once_another_speaks() -> None:
+def test_the_line_counts_frames_and_drops_its_pendant_after_another_sends() -> None:
     near, far = lockstep_pair()
     line = Line(near, pendant_id=0x194)
     batch, alone, none = frames_with([0x181, 0x194, 0x701]), frames_with([0x194]), new_frames(0)
@@ -56,7 +56,7 @@ def test_the_line_counts_and_keeps_the_pendant_back_once_another_speaks() -> Non
     assert (line.sent, line.received) == (9, 4)
 
 
-def test_what_lies_behind_the_received_frames_is_not_heard() -> None:
+def test_buffer_rows_after_the_received_frames_are_ignored() -> None:
     near, far = lockstep_pair()
     line = Line(near, pendant_id=0x194)
     block = frames_with([0x194] * 8)
@@ -68,7 +68,7 @@ def test_what_lies_behind_the_received_frames_is_not_heard() -> None:
 
 
 class Interface(WrappedBus):
-    """A SocketCAN interface that goes down and comes up: receiving fails once, sending as long as it is down."""
+    """SocketCAN interface that goes down and up again: receiving fails once, sending as long as it is down."""
 
     _up = True
     _told = True
@@ -88,9 +88,7 @@ class Interface(WrappedBus):
         return super().receive(frames, timeout) if self._up else 0
 
 
-def test_an_interface_that_goes_down_is_waited_for_and_the_robot_starts_again(
-    network: Network, robot: Robot, urdf_text: str
-) -> None:
+def test_the_robot_restarts_after_the_interface_was_down(network: Network, robot: Robot, urdf_text: str) -> None:
     ours, theirs = lockstep_pair()
     interface = Interface(theirs)
     line = Line(interface, network.message("PENDANT_STATE").frame_id)
@@ -130,7 +128,7 @@ def test_an_interface_that_goes_down_is_waited_for_and_the_robot_starts_again(
     body.close()
 
 
-def test_an_adapter_that_is_gone_does_not_keep_a_processor_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_removed_adapter_does_not_cause_a_busy_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     near, _ = lockstep_pair()
     slept: list[float] = []
     monkeypatch.setattr(emulator_line.time, "sleep", slept.append)

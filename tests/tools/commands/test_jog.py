@@ -1,4 +1,4 @@
-"""`atalante jog`: the profile, the refusals, a joint moved on the embedded robot, and how it ends."""
+"""`atalante jog`: motion profile, invalid arguments, a move of the embedded robot, exit codes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def jog(*arguments: str) -> Result:
 
 @pytest.fixture
 def prepared(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Rig], None]], list[Rig]]:
-    """Let a test change the rig a command opens, and look at it afterwards."""
+    """Return a function that changes the rig of a command before its run and keeps it for inspection."""
     opened: list[Rig] = []
     original = rig_module.open_hal
 
@@ -47,7 +47,7 @@ def prepared(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Rig], None]
 # -- the profile -----------------------------------------------------------------------------------------------------
 
 
-def test_the_profile_starts_and_ends_at_rest_and_never_turns_back() -> None:
+def test_the_profile_is_monotonic_and_starts_and_ends_at_rest() -> None:
     phase = np.linspace(0.0, 1.0, 1001)
     share, rate = np.array([minimum_jerk(float(x)) for x in phase]).T
     assert (share[0], share[-1], rate[0], rate[-1]) == (0.0, 1.0, 0.0, 0.0)
@@ -63,7 +63,7 @@ def test_the_profile_starts_and_ends_at_rest_and_never_turns_back() -> None:
 
 
 @pytest.mark.parametrize("index", range(len(JOINTS)))
-def test_a_target_outside_the_limits_names_them_in_degrees(robot: Robot, index: int) -> None:
+def test_a_target_outside_the_limits_is_rejected_with_the_range(robot: Robot, index: int) -> None:
     name = JOINTS[index]
     low, high = math.degrees(robot.position_min[index]), math.degrees(robot.position_max[index])
     for target in (low - 0.1, high + 0.1):
@@ -85,7 +85,7 @@ def test_a_target_outside_the_limits_names_them_in_degrees(robot: Robot, index: 
         (["left_SK", "--to", "5", "-c", "vcan0"], "to use vcan0, type -i socketcan -c vcan0"),
     ],
 )
-def test_misuse_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
+def test_an_invalid_command_line_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
     result = jog(*arguments)
     assert result.exit_code == 2
     assert sentence in result.stderr
@@ -96,7 +96,7 @@ def test_misuse_is_one_sentence_and_code_2(arguments: list[str], sentence: str) 
 # -- the move --------------------------------------------------------------------------------------------------------
 
 
-def test_one_joint_moves_and_the_others_stay(prepared: Callable[[Callable[[Rig], None]], list[Rig]]) -> None:
+def test_one_joint_moves_and_all_others_hold_their_pose(prepared: Callable[[Callable[[Rig], None]], list[Rig]]) -> None:
     track: list[np.ndarray] = []
 
     def follow(rig: Rig) -> None:
@@ -119,7 +119,7 @@ def test_one_joint_moves_and_the_others_stay(prepared: Callable[[Callable[[Rig],
     assert np.ptp(others[-500:], axis=0).max() < 1.0
 
 
-def test_the_sentence_names_the_angle_reached() -> None:
+def test_the_output_contains_the_reached_angle() -> None:
     result = jog("right_SH", "--to", "-5", "--speed", "60")
     assert result.exit_code == 0
     assert result.stdout.startswith("right_SH: ")
@@ -127,7 +127,7 @@ def test_the_sentence_names_the_angle_reached() -> None:
     assert result.stderr.splitlines() == ["ACTIVE on embedded; Ctrl-C ends in HOLD", "the robot is in HOLD"]
 
 
-def test_a_joint_that_does_not_get_there_fails(prepared: Callable[[Callable[[Rig], None]], list[Rig]]) -> None:
+def test_a_joint_that_misses_its_target_fails(prepared: Callable[[Callable[[Rig], None]], list[Rig]]) -> None:
     def stand_in_its_way(rig: Rig) -> None:
         assert rig.emulator is not None
         rig.emulator.drives.motors.push(JOINTS.index("left_SK"), -150.0)
@@ -139,7 +139,7 @@ def test_a_joint_that_does_not_get_there_fails(prepared: Callable[[Callable[[Rig
     assert 10.0 < json.loads(result.stdout)["reached_deg"] < 19.0
 
 
-def test_a_drive_fault_ends_it_with_code_4(prepared: Callable[[Callable[[Rig], None]], list[Rig]]) -> None:
+def test_a_drive_fault_ends_jog_with_code_4(prepared: Callable[[Callable[[Rig], None]], list[Rig]]) -> None:
     def fail(rig: Rig) -> None:
         assert rig.emulator is not None
         place = rig.emulator.signals.index("RIGHT_HA_STATE", "DriveState")
@@ -157,7 +157,7 @@ def test_a_drive_fault_ends_it_with_code_4(prepared: Callable[[Callable[[Rig], N
     assert result.stdout == ""
 
 
-def test_an_operator_who_stops_ends_it_as_failed(prepared: Callable[[Callable[[Rig], None]], list[Rig]]) -> None:
+def test_stop_of_the_operator_ends_jog_with_code_1(prepared: Callable[[Callable[[Rig], None]], list[Rig]]) -> None:
     def stop(rig: Rig) -> None:
         assert rig.emulator is not None
         rig.emulator.before_send.append(lambda now, values: rig.operator.stop() if now == 500 else None)  # type: ignore[union-attr]

@@ -1,4 +1,4 @@
-"""`atalante pendant`: the node on the wire, taking over, what the operator is told, the commands."""
+"""`atalante pendant`: node on the bus, takeover, messages to the operator, commands."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TARGET = Target("pcan", "test", lockstep=False)
 
 
 class Wire:
-    """A wire with any number of ends, in lock-step: what one end sends, all others receive."""
+    """Lock-step bus with any number of ends: every end receives the frames of all others."""
 
     def __init__(self) -> None:
         self.ends: list[WireEnd] = []
@@ -45,7 +45,7 @@ class Wire:
 
 
 class WireEnd:
-    """One of them; `empty` is called when nothing has arrived and the owner asks."""
+    """End of the bus; `empty` is called by a receive without pending frames."""
 
     name = "wire"
     dropped = 0
@@ -78,7 +78,7 @@ class WireEnd:
 
 
 class World:
-    """A HAL, an emulated robot without an operator, and ends for pendants that make time go on by listening."""
+    """HAL, emulated robot without an operator, and bus ends for pendants; a pendant that listens advances the time."""
 
     def __init__(self, network: Network, robot: Robot, body: PyBulletBody, operator: Operator | None = None) -> None:
         self.network, self.wire = network, Wire()
@@ -192,13 +192,13 @@ def test_stop_and_hold_end_in_hold(world: World, request_: Request) -> None:
     assert world.run(3) is HOLD
 
 
-def test_a_pendant_that_falls_silent_is_a_stop(world: World) -> None:
+def test_a_lost_pendant_ends_in_hold(world: World) -> None:
     world.active()
     world.nodes.clear()
     assert world.run(10) is HOLD
 
 
-def test_the_dial_sets_the_assistance_factor_and_otherwise_leaves_it(world: World) -> None:
+def test_the_assistance_factor_changes_only_when_the_pendant_sets_it(world: World) -> None:
     node = world.active()
     assert world.hal.state.assistance_factor == 1.0
     node.assist(0.3)
@@ -221,7 +221,7 @@ def test_a_damaged_sync_is_not_answered(world: World, network: Network) -> None:
 # -- taking over -----------------------------------------------------------------------------------------------------
 
 
-def test_a_new_pendant_takes_over_without_the_hal_noticing(world: World) -> None:
+def test_a_takeover_by_a_new_pendant_does_not_disturb_the_hal(world: World) -> None:
     old = world.active()
     old.assist(0.4)
     world.run(100)
@@ -253,7 +253,7 @@ def test_a_press_of_the_new_pendant_counts_once(world: World) -> None:
     assert world.run(30) is ACTIVE
 
 
-def test_a_pendant_that_does_not_give_way_keeps_the_pendant(world: World) -> None:
+def test_a_pendant_that_keeps_sending_prevents_the_takeover(world: World) -> None:
     hardware = world.active()
     hardware._other_received = lambda check: None  # type: ignore[method-assign]
     new = world.node()
@@ -265,7 +265,7 @@ def test_a_pendant_that_does_not_give_way_keeps_the_pendant(world: World) -> Non
     assert not hardware.displaced
 
 
-def test_the_emulated_operator_gives_his_pendant_away(make_world: Callable[..., World]) -> None:
+def test_the_emulated_pendant_yields_to_a_pendant_process(make_world: Callable[..., World]) -> None:
     world = make_world(Operator())
     for _ in range(400):
         world.run(1)
@@ -285,7 +285,7 @@ def test_the_emulated_operator_gives_his_pendant_away(make_world: Callable[..., 
 # -- the session -----------------------------------------------------------------------------------------------------
 
 
-def test_start_presses_once_the_hal_is_ready_and_says_so(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+def test_start_is_pressed_when_the_hal_is_ready_and_printed(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     operator = world.session()
     operator.take()
     operator.start_wanted = True
@@ -305,7 +305,7 @@ HEAD_STARTS = (1, 5, 10, 15, 16, 17, 50, 100)
 
 
 def started_once(world: World, capsys: pytest.CaptureFixture[str]) -> None:
-    """`pendant start` ends in ACTIVE with one press, within 250 cycles of the pendant and the HAL being there."""
+    """Check that `pendant start` leads to ACTIVE with one press, within 250 cycles after pendant and HAL are running."""
     operator = world.session()
     operator.take()
     operator.start_wanted = True
@@ -318,7 +318,7 @@ def started_once(world: World, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize("cycles", HEAD_STARTS)
-def test_start_is_followed_by_a_hal_that_comes_later(
+def test_a_hal_started_after_the_pendant_becomes_active(
     world: World, cycles: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     world.running = False
@@ -333,7 +333,7 @@ def test_start_is_followed_by_a_hal_that_comes_later(
 
 
 @pytest.mark.parametrize("cycles", HEAD_STARTS)
-def test_start_is_followed_by_a_hal_that_was_there_before(
+def test_a_hal_started_before_the_pendant_becomes_active(
     world: World, cycles: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     world.run(cycles)
@@ -342,7 +342,7 @@ def test_start_is_followed_by_a_hal_that_was_there_before(
 
 @pytest.mark.parametrize("cycles", HEAD_STARTS)
 @pytest.mark.parametrize("state", [READY, HOLD])
-def test_start_of_a_late_pendant_is_followed(
+def test_a_start_of_a_late_pendant_makes_the_hal_active(
     world: World, state: SupervisorState, cycles: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     if state is HOLD:
@@ -372,9 +372,7 @@ def test_a_late_pendant_may_press_from_its_second_frame_on(world: World, state: 
     assert world.run(300) is HOLD
 
 
-def test_one_start_in_fault_is_one_move_and_the_operator_is_told(
-    world: World, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_start_in_fault_leads_to_hold_with_a_message(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     operator = world.session()
     operator.take()
     operator.start_wanted = True
@@ -405,9 +403,7 @@ def test_one_start_in_fault_is_one_move_and_the_operator_is_told(
     ]
 
 
-def test_a_start_that_is_refused_is_said_and_the_hal_has_the_reason(
-    world: World, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_refused_start_is_printed_and_its_reason_logged(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     world.active()
     world.nodes.clear()
     world.run(10)
@@ -423,7 +419,7 @@ def test_a_start_that_is_refused_is_said_and_the_hal_has_the_reason(
     assert world.hal.reason.startswith("START refused: LEFT_FH: its torque limit is")
 
 
-def test_typed_lines_are_obeyed(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+def test_typed_commands_are_executed(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     operator = world.session()
     operator.take()
     operator.start_wanted = True
@@ -482,7 +478,7 @@ def test_the_older_session_ends_with_a_sentence(world: World, capsys: pytest.Cap
     assert world.hal.state.supervisor is ACTIVE
 
 
-def test_no_hal_is_said_once_and_waited_for(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_hal_is_reported_once_and_waited_for(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     world.running = False
     operator = world.session()
     operator.take()
@@ -493,7 +489,7 @@ def test_no_hal_is_said_once_and_waited_for(world: World, capsys: pytest.Capture
     ]
 
 
-def test_a_start_that_leads_nowhere_is_said(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_start_without_effect_is_reported(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     operator = world.session()
     operator.take()
     operator.speak_for(200)
@@ -507,7 +503,7 @@ def test_a_start_that_leads_nowhere_is_said(world: World, capsys: pytest.Capture
     )
 
 
-def test_the_keyboard_gives_whole_lines_and_ends_with_the_file() -> None:
+def test_the_keyboard_returns_complete_lines_until_end_of_file() -> None:
     reading, writing = os.pipe()
     keyboard = Keyboard(reading)
     assert keyboard.lines() == []
@@ -531,7 +527,9 @@ def invoke(world: World, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> Re
 
 
 @pytest.mark.parametrize("button", ["stop", "hold"])
-def test_stop_and_hold_say_what_became_of_the_hal(world: World, monkeypatch: pytest.MonkeyPatch, button: str) -> None:
+def test_stop_and_hold_print_the_state_before_and_after(
+    world: World, monkeypatch: pytest.MonkeyPatch, button: str
+) -> None:
     world.active()
     result = invoke(world, monkeypatch, button)
     assert (result.exit_code, result.stdout) == (0, f"{button.upper()}: the HAL was ACTIVE and is HOLD\n")
@@ -571,7 +569,7 @@ def test_xi_takes_over_and_sets_the_factor(world: World, monkeypatch: pytest.Mon
         (["stop", "-c", "left_leg=a,b"], "'b' in the channel map is not BUS=CHANNEL"),
     ],
 )
-def test_misuse_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
+def test_an_invalid_command_line_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
     result = CliRunner().invoke(cli, ["pendant", *arguments])
     assert result.exit_code == 2
     assert sentence in result.stderr

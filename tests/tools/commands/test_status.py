@@ -1,4 +1,4 @@
-"""`atalante status`: what a listener knows, the table, the object, the exit code."""
+"""`atalante status`: report of the observer, tables, JSON object, exit codes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TARGET = Target("pcan", "test", lockstep=False)
 
 
 class Tap:
-    """All frames of the embedded bus, in order."""
+    """Recorder of all frames of the embedded bus, in their order."""
 
     def __init__(self) -> None:
         self.batches: list[Frames] = []
@@ -44,7 +44,7 @@ class Tap:
 
 @pytest.fixture(scope="module")
 def traffic(network: Network, robot: Robot, urdf_text: str) -> list[Frames]:
-    """Every frame of half a second from power-on to ACTIVE, a block a cycle."""
+    """Return all frames of half a second from power-on to ACTIVE, one block per cycle."""
     from atalante_emulator.body import PyBulletBody
     from atalante_emulator.emulator import Emulator
     from atalante_emulator.pendant import Operator
@@ -73,7 +73,7 @@ def traffic(network: Network, robot: Robot, urdf_text: str) -> list[Frames]:
 
 
 def observe(network: Network, robot: Robot, cycles: list[Frames], start: float = 10.0) -> tuple[Observer, float]:
-    """An observer that heard these cycles, and the time then."""
+    """Return an observer that has received these cycles, and its time afterwards."""
     observer = Observer(network, robot, start)
     block = new_frames(64)
     for number, frames in enumerate(cycles, 1):
@@ -86,7 +86,7 @@ def node(report: Report, name: str) -> NodeReport:
     return next(n for n in report.nodes if n.node == name)
 
 
-def test_everything_the_nodes_say_is_known(network: Network, robot: Robot, traffic: list[Frames]) -> None:
+def test_the_report_contains_the_state_of_every_node(network: Network, robot: Robot, traffic: list[Frames]) -> None:
     observer, now = observe(network, robot, traffic)
     report = observer.report(now)
     assert report.supervisor == "ACTIVE"
@@ -110,7 +110,7 @@ def test_everything_the_nodes_say_is_known(network: Network, robot: Robot, traff
     assert [j.drive_state for j in report.joints] == ["OPERATION_ENABLED"] * 12
 
 
-def test_joints_are_in_degrees_on_the_joints_side(network: Network, robot: Robot) -> None:
+def test_joint_values_are_in_degrees_on_the_output_side(network: Network, robot: Robot) -> None:
     from dataclasses import replace
 
     from atalante_hal.wire.process_image import TransmitImage
@@ -132,7 +132,7 @@ def test_joints_are_in_degrees_on_the_joints_side(network: Network, robot: Robot
             assert joint.drive_state == "FAULT"
 
 
-def test_a_node_that_falls_silent_grows_old(network: Network, robot: Robot, traffic: list[Frames]) -> None:
+def test_the_age_of_a_lost_node_increases(network: Network, robot: Robot, traffic: list[Frames]) -> None:
     ids = {m.frame_id for m in network.sent_by("LEFT_SK")}
     silent = [frames[[i not in ids for i in frames["can_id"].tolist()]] for frames in traffic[400:]]
     observer, now = observe(network, robot, traffic[:400] + silent)
@@ -144,14 +144,14 @@ def test_a_node_that_falls_silent_grows_old(network: Network, robot: Robot, traf
     assert f"LEFT_SK          {lost.age_ms} ms ago" in render(report, TARGET)
 
 
-def test_a_hal_that_is_gone_is_said_to_be(network: Network, robot: Robot, traffic: list[Frames]) -> None:
+def test_a_lost_hal_is_reported_in_the_first_line(network: Network, robot: Robot, traffic: list[Frames]) -> None:
     observer, now = observe(network, robot, [*traffic, *[new_frames(0)] * 600])
     assert render(observer.report(now), TARGET).startswith(
         "pcan test: no SYNC of the HAL for 600 ms; it was ACTIVE in cycle 5"
     )
 
 
-def test_what_was_never_heard_is_none_and_not_zero(network: Network, robot: Robot) -> None:
+def test_values_never_received_are_none(network: Network, robot: Robot) -> None:
     report = Observer(network, robot, 0.0).report(1.0)
     assert report.supervisor is None
     assert all(n.age_ms is None and n.late and n.state is None and n.dbc_ok is None for n in report.nodes)
@@ -159,7 +159,7 @@ def test_what_was_never_heard_is_none_and_not_zero(network: Network, robot: Robo
     assert "no HAL (no SYNC received)" in render(report, TARGET)
 
 
-def test_another_dbc_and_damaged_frames_are_told(network: Network, robot: Robot, traffic: list[Frames]) -> None:
+def test_a_different_dbc_and_damaged_frames_are_reported(network: Network, robot: Robot, traffic: list[Frames]) -> None:
     from dataclasses import replace
 
     observer, now = observe(replace(network, hash32=network.hash32 ^ 1), robot, traffic)
@@ -174,7 +174,9 @@ def test_another_dbc_and_damaged_frames_are_told(network: Network, robot: Robot,
     assert observer.report(now).crc_errors == 100
 
 
-def test_load_is_the_wire_time_of_what_was_heard(network: Network, robot: Robot, traffic: list[Frames]) -> None:
+def test_the_bus_load_is_the_wire_time_of_the_received_frames(
+    network: Network, robot: Robot, traffic: list[Frames]
+) -> None:
     observer, now = observe(network, robot, traffic)
     load = observer.report(now).load
     bus_of = {m.frame_id: m.bus for m in network.messages}
@@ -199,7 +201,7 @@ def test_foreign_frames_are_counted(network: Network, robot: Robot) -> None:
     assert "3 with an identifier unknown to this network" in render(report, TARGET)
 
 
-def test_an_emergency_is_told(network: Network, robot: Robot) -> None:
+def test_an_emergency_is_reported(network: Network, robot: Robot) -> None:
     from atalante_hal.wire.process_image import TransmitImage
 
     image = TransmitImage([network.message("LEFT_SK_EMCY")])
@@ -210,7 +212,7 @@ def test_an_emergency_is_told(network: Network, robot: Robot) -> None:
     assert node(observer.report(0.002), "LEFT_SK").emergency == "0x4310 (register 0x09)"
 
 
-def test_the_object_says_all_of_it(network: Network, robot: Robot, traffic: list[Frames]) -> None:
+def test_the_json_object_contains_the_whole_report(network: Network, robot: Robot, traffic: list[Frames]) -> None:
     observer, now = observe(network, robot, traffic)
     value = json.loads(json.dumps(as_json(observer.report(now))))
     assert value["supervisor"] == "ACTIVE"
@@ -223,7 +225,7 @@ def test_the_object_says_all_of_it(network: Network, robot: Robot, traffic: list
 
 
 class Recorded:
-    """A bus on which these cycles arrive, one at each `receive`, and on which nothing may be sent."""
+    """Bus that delivers one cycle per `receive` and rejects every `send`."""
 
     name = "recorded"
     dropped = 2
@@ -281,7 +283,7 @@ def test_json_is_one_object(monkeypatch: pytest.MonkeyPatch, traffic: list[Frame
     assert json.loads(line)["supervisor"] == "ACTIVE"
 
 
-def test_silence_fails_with_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bus_without_frames_fails_with_code_1(monkeypatch: pytest.MonkeyPatch) -> None:
     result = invoke(monkeypatch, [], "--for", "0.1", "--json")
     assert result.exit_code == 1
     assert (

@@ -1,4 +1,4 @@
-"""`atalante vibrate`: one motor runs, the others are still."""
+"""`atalante vibrate`: one motor runs, all others are off."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def vibrate(*arguments: str) -> Result:
 
 
 @pytest.mark.parametrize("index", [0, 5])
-def test_the_motor_runs_alone_and_is_still_afterwards(monkeypatch: pytest.MonkeyPatch, index: int) -> None:
+def test_only_the_chosen_motor_runs_and_it_stops_afterwards(monkeypatch: pytest.MonkeyPatch, index: int) -> None:
     felt: list[np.ndarray] = []
     original = rig_module.open_hal
 
@@ -48,7 +48,7 @@ def test_the_motor_runs_alone_and_is_still_afterwards(monkeypatch: pytest.Monkey
     assert felt[-1].max() < 0.02
 
 
-def test_the_sentence_says_what_was_measured() -> None:
+def test_the_output_contains_commanded_and_measured_level() -> None:
     result = vibrate("left_thigh_front", "0.5", "--for", "0.4")
     assert result.exit_code == 0
     assert result.stdout == "left_thigh_front: commanded 0.50, measured at most 0.50, for 0.4 s\n"
@@ -65,7 +65,7 @@ def test_the_sentence_says_what_was_measured() -> None:
         (["left_thigh_front"], "Missing argument 'LEVEL'"),
     ],
 )
-def test_misuse_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
+def test_an_invalid_command_line_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
     result = vibrate(*arguments)
     assert result.exit_code == 2
     assert sentence in result.stderr

@@ -1,4 +1,4 @@
-"""What the options of several commands take: numbers that are numbers, seeds, pictures, a patient's own step."""
+"""Shared options: ranges, seeds, output files and steps of a patient."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_an_invalid_option_value_is_rejected_before_any_work(arguments: list[str
     assert result.stderr.count("\n") == 1
 
 
-def test_a_campaign_finds_out_that_its_report_has_no_place_before_it_runs(tmp_path: Path) -> None:
+def test_a_campaign_rejects_an_invalid_report_folder_before_it_runs(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     result = CliRunner().invoke(cli, ["faults", "campaign", "F56", "--out", str(tmp_path / "file" / "report")])
     assert result.exit_code == 1

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a flag."""
+"""Stop request: SIGINT and SIGTERM set a flag and an exit code."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from atalante_tools.console.stop_request import Stopped, check_stop, ended_by, s
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_is_a_wish_with_an_exit_code(number: signal.Signals, code: int) -> None:
+def test_a_signal_sets_the_stop_request_and_its_exit_code(number: signal.Signals, code: int) -> None:
     before = signal.getsignal(number)
     with stop_requested() as stop:
         assert (stop.wanted, stop.exit_code) == (False, 0)
@@ -22,7 +22,7 @@ def test_a_signal_is_a_wish_with_an_exit_code(number: signal.Signals, code: int)
     assert signal.getsignal(number) is before
 
 
-def test_the_handlers_come_back_after_an_error() -> None:
+def test_the_signal_handlers_are_restored_after_an_error() -> None:
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(ZeroDivisionError), stop_requested():
         raise ZeroDivisionError
@@ -30,7 +30,7 @@ def test_the_handlers_come_back_after_an_error() -> None:
 
 
 @pytest.mark.parametrize("numbers", [("SIGINT", "SIGINT"), ("SIGTERM", "SIGINT"), ("SIGINT", "SIGTERM")])
-def test_the_second_ends_the_process_at_once(numbers: tuple[str, str]) -> None:
+def test_the_second_signal_ends_the_process_immediately(numbers: tuple[str, str]) -> None:
     first, second = numbers
     program = f"""
 import signal
@@ -48,7 +48,7 @@ finally:
     assert done.stdout == ""
 
 
-def test_another_thread_has_no_signals_and_no_error() -> None:
+def test_in_another_thread_no_handler_is_installed_and_no_error_raised() -> None:
     seen = []
 
     def work() -> None:
@@ -61,7 +61,7 @@ def test_another_thread_has_no_signals_and_no_error() -> None:
     assert seen == [False]
 
 
-def test_a_block_inside_has_the_request_of_the_block_around_it() -> None:
+def test_a_nested_block_shares_the_stop_request_of_the_outer_block() -> None:
     with stop_requested() as outer:
         with stop_requested() as inner:
             assert inner is outer
@@ -80,7 +80,7 @@ def test_a_block_inside_has_the_request_of_the_block_around_it() -> None:
         assert later is not outer
 
 
-def test_a_block_that_ends_by_itself_is_cut_short_by_no_signal() -> None:
+def test_a_block_with_an_end_callback_is_not_interrupted_by_signals() -> None:
     ends: list[bool] = []
     with stop_requested() as stop:
         with ended_by(lambda: ends.append(stop.wanted)) as request:

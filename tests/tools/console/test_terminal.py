@@ -1,4 +1,4 @@
-"""What commands print: log lines, progress, tables, JSON."""
+"""Output of the commands: log lines, progress, tables, JSON."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_a_table_aligns_numbers_right_and_words_left() -> None:
     assert table(rows).splitlines() == ["node        V  degC", "LEFT_FH  48.0     -", "HAL         -    -5"]
 
 
-def test_progress_is_rewritten_on_a_terminal() -> None:
+def test_a_progress_line_is_overwritten_on_a_terminal() -> None:
     now = [0.0]
     terminal = Terminal()
     progress = Progress(stream=terminal, now=lambda: now[0])
@@ -47,7 +47,7 @@ def test_progress_is_rewritten_on_a_terminal() -> None:
     assert terminal.getvalue() == "\ra long line\rshort      \r     \r"
 
 
-def test_progress_is_lines_now_and_then_in_a_log() -> None:
+def test_progress_is_printed_as_separate_lines_in_a_log() -> None:
     now = [0.0]
     log = io.StringIO()
     progress = Progress(stream=log, now=lambda: now[0])
@@ -60,7 +60,7 @@ def test_progress_is_lines_now_and_then_in_a_log() -> None:
     assert log.getvalue() == "one\n"
 
 
-def test_a_period_of_ones_own_replaces_both() -> None:
+def test_a_given_period_replaces_both_default_periods() -> None:
     now = [0.0]
     progress = Progress(period=1.0, stream=io.StringIO(), now=lambda: now[0])
     now[0] = 1.0

@@ -1,4 +1,4 @@
-"""`atalante demo` and `airwalk`: what scripts may rely on, and the promises of the paper's first experiment."""
+"""`atalante demo` and `airwalk`: output for scripts, and the results of the paper's first experiment."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def atalante(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([ATALANTE, *arguments], capture_output=True, text=True, timeout=300)
 
 
-def test_the_table_judges_no_guide_by_a_single_step() -> None:
+def test_the_table_shows_no_tracking_error_for_a_single_step() -> None:
     walked = Result("pinched", True, 1.97, 1.18, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0)
     head, two, one = results_table([walked, replace(walked, steps=1)]).splitlines()
     assert head.split("  ")[0].strip() == "shape"
@@ -72,7 +72,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[subprocess.Completed
     return done, out
 
 
-def test_stdout_is_one_object_a_shape_and_one_of_the_recording(demo):
+def test_stdout_has_one_object_per_shape_and_one_of_the_recording(demo):
     *results, recording = [json.loads(line) for line in demo[0].stdout.splitlines()]
     assert recording == {"recording": {"files": ["recording.mcap"], "complete": True, "missing_cycles": 0}}
     assert [list(result) for result in results] == [KEYS, KEYS]
@@ -102,7 +102,7 @@ def test_stdout_is_one_object_a_shape_and_one_of_the_recording(demo):
     assert snap["max_ratio"] > 1.0
 
 
-def test_an_uncertified_guide_is_announced_before_the_run(demo):
+def test_certificates_are_printed_before_the_run(demo):
     stderr = demo[0].stderr
     announced = stderr.index("snap: NOT CERTIFIED")
     assert announced < stderr.index("ACTIVE on")
@@ -117,7 +117,7 @@ def test_an_uncertified_guide_is_announced_before_the_run(demo):
 
 
 @pytest.mark.parametrize(("factors", "certified"), [({0.5}, True), ({0.5, 0.9}, True), ({0.5, 0.95}, False)])
-def test_a_run_promises_the_least_of_all_factors_walked(factors: set[float], certified: bool):
+def test_the_result_has_the_weakest_certificate_of_all_assistance_factors(factors: set[float], certified: bool):
     robot = load_robot()
     controller = AirwalkController(robot, load_gait(AIRWALK_GAIT, robot), SHAPES["constant"])
     promise = trial._bounds(trial._weakest(controller, factors))
@@ -175,7 +175,7 @@ def test_the_can_log_is_the_same_to_the_byte_for_the_same_seed_and_another_for_a
 
 
 class CommandFrames:
-    """The bytes of every command frame."""
+    """Recorder of the bytes of every command frame."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -190,7 +190,7 @@ class CommandFrames:
 
 
 class Baseline(AirwalkController):
-    """The same controller without the assistance; its guide says nothing that could be merged."""
+    """The same controller without assistance; its guide parameters are NaN, so that any use of them is detected."""
 
     def _change_step(self, state: State, stance: int) -> None:
         super()._change_step(state, stance)
@@ -235,7 +235,7 @@ def test_bad_input_gets_one_sentence_that_says_what_is_valid(arguments, code, sa
     out = tmp_path / "run"
     done = CliRunner().invoke(cli, ["airwalk", "--out", str(out), *arguments])
     assert done.exit_code == code, done.stderr
-    # Not a word about the guide before: nothing can be promised where nothing runs.
+    # No certificate is printed before the error, because no robot runs.
     assert done.stderr.startswith("atalante: ")
     assert done.stderr.count("\n") == 1
     assert says in done.stderr
@@ -246,7 +246,7 @@ RECORDING = Recording(("recording.mcap",), False, 70)
 
 
 class Child:
-    """A telemetry process at its end."""
+    """Telemetry process with a given summary at its end."""
 
     notices = ("nothing is published: no port",)
 
@@ -266,7 +266,7 @@ class Child:
         ((), True, ""),
     ],
 )
-def test_what_was_not_recorded_is_told_once(notices, complete, said, capsys):
+def test_notices_about_lost_records_are_printed_once(notices, complete, said, capsys):
     walked = trial.Walked()
     trial._close(Child(*notices, complete=complete), walked)
     assert walked.recording is RECORDING
@@ -274,7 +274,7 @@ def test_what_was_not_recorded_is_told_once(notices, complete, said, capsys):
 
 
 def kill_and_take_the_port(telemetry: TelemetryProcess) -> socket.socket:
-    """Kill the telemetry process when it has handled what was written, and listen where it listened."""
+    """Kill the telemetry process after it has processed all records, and occupy its port."""
     child, squatter = telemetry._child, socket.socket()
     assert child is not None
     while telemetry.records.taken != telemetry.records.written:
@@ -326,7 +326,7 @@ def test_a_recording_with_a_gap_fails_the_run_and_is_counted(tmp_path: Path, mon
     assert done.stderr.splitlines()[-1] == f"atalante: the recording must be {said}"
 
 
-def test_every_event_is_recorded_of_a_hal_that_keeps_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_every_event_is_recorded_when_the_event_log_holds_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(fault_memory, "EventLog", functools.partial(fault_memory.EventLog, 1))
     done = CliRunner().invoke(cli, ["airwalk", "--steps", "1", "--out", str(tmp_path)])
     assert done.exit_code == 0, done.stderr
@@ -339,7 +339,7 @@ def test_every_event_is_recorded_of_a_hal_that_keeps_one(tmp_path: Path, monkeyp
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_ends_in_hold_with_its_code_and_keeps_what_was_walked(number, code, tmp_path: Path):
+def test_a_signal_ends_in_hold_and_keeps_recording_and_summary(number, code, tmp_path: Path):
     command = [ATALANTE, "airwalk", "--steps", "1000", "--out", str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as airwalk:
         assert airwalk.stderr is not None
@@ -381,7 +381,7 @@ def test_a_patient_s_gait_of_the_network_is_walked_inside_a_certified_guide(tmp_
         (["--mass", "75", "--height", "175", "--step-duration", "0.85123"], 2, "a whole number of milliseconds"),
     ],
 )
-def test_a_subject_out_of_range_gets_the_range(arguments, code, says, tmp_path: Path):
+def test_a_subject_out_of_range_is_rejected_with_the_range(arguments, code, says, tmp_path: Path):
     done = CliRunner().invoke(cli, ["airwalk", "--out", str(tmp_path), *arguments])
     assert done.exit_code == code, done.stderr
     assert says in done.stderr

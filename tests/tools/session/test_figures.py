@@ -1,4 +1,4 @@
-"""The figure of guide shapes: whole steps alone, however the run ended."""
+"""Figure of guide shapes: only complete steps are drawn, however the run ended."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RIGHT, LEFT = 1, 0
 
 
 def samples(*steps: tuple[int, int, float]) -> Iterator[tuple[str, Any, float, float]]:
-    """A run through these steps (number, stance, phase it ends at), a hundred cycles each."""
+    """Yield the guide samples of these steps (number, stance, final phase)."""
     for number, stance, end in steps:
         for phase in np.arange(0.0, end, 0.01).tolist():
             guide = SimpleNamespace(
@@ -33,7 +33,7 @@ def samples(*steps: tuple[int, int, float]) -> Iterator[tuple[str, Any, float, f
 
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
-    """Draw a run; the title, and the phases each line ends at by its label."""
+    """Draw a run, and return the title and, per line, its label and final phase."""
     kept: list[Any] = []
     monkeypatch.setattr(figures.plt, "close", kept.append)
 
@@ -66,7 +66,7 @@ def test_a_run_that_ended_after_its_steps_or_while_the_left_foot_stands_shows_th
         assert lines[-1][1] == pytest.approx(0.95, abs=0.011)
 
 
-def test_a_step_cut_off_is_drawn_where_it_is_the_only_one(drawn: Any) -> None:
+def test_an_incomplete_step_is_drawn_if_it_is_the_only_one(drawn: Any) -> None:
     title, lines = drawn((0, RIGHT, 0.5))
     assert title == "pinched: 1 right-stance step"
     assert lines[0][1] == pytest.approx(0.49, abs=0.011)

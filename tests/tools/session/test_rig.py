@@ -1,4 +1,4 @@
-"""The rig: one HAL on any bus, taken apart in order, and how a run ends."""
+"""Rig: one HAL on any bus, closed in order, and the ends of a run."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Tap:
 
 
 def embedded(network: Network, robot: Robot, **options: Any) -> AbstractContextManager[Rig]:
-    """A rig for `PoseHold`."""
+    """Open a rig for `PoseHold`."""
     return open_hal(EMBEDDED, network=network, robot=robot, controller_fields=PoseHold.telemetry_fields, **options)
 
 
@@ -63,7 +63,7 @@ def watched(
     each: Callable[[State], None] = lambda state: None,
     stop: StopRequest | None = None,
 ) -> Watch:
-    """A finished run of a pose hold: `seconds` of ACTIVE, `each` asked before every judgement."""
+    """Run a pose hold for `seconds` in ACTIVE and return its watch; `each` is called before every check of the end condition."""
     controller = PoseHold(rig.hal.robot)
     watch = Watch(rig, stop or StopRequest(), lambda state: controller.elapsed >= seconds, lambda state: "moving")
 
@@ -87,7 +87,7 @@ def test_the_embedded_rig_becomes_active_and_ends_in_hold(network: Network, robo
         bus.receive(new_frames(1))
 
 
-def test_one_seed_is_one_sequence_of_bytes(network: Network, robot: Robot) -> None:
+def test_equal_seeds_give_equal_bytes_on_the_bus(network: Network, robot: Robot) -> None:
     def run(seed: int) -> bytes:
         tap = Tap()
         with embedded(network, robot, seed=seed, tap=tap) as rig:
@@ -99,7 +99,7 @@ def test_one_seed_is_one_sequence_of_bytes(network: Network, robot: Robot) -> No
     assert run(4) != first
 
 
-def test_pose_operator_and_record_are_the_callers(network: Network, robot: Robot) -> None:
+def test_pose_operator_and_record_of_the_caller_are_used(network: Network, robot: Robot) -> None:
     pose = [0.0] * 12
     pose[JOINTS.index("left_SK")] = 0.5
     mine = Operator(0.25, starts=False)
@@ -140,12 +140,12 @@ def test_several_channels_become_one_bus_and_one_stays_itself(network: Network) 
     buses["left_leg"].close()
 
 
-def test_a_bus_that_is_not_there_is_refused(network: Network, robot: Robot) -> None:
+def test_a_missing_bus_is_rejected(network: Network, robot: Robot) -> None:
     with pytest.raises(BusAbsent, match="pigeon"), open_hal(Target("pigeon", "x", False), network=network, robot=robot):
         raise AssertionError("opened")
 
 
-def test_without_pybullet_it_says_what_to_install(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_pybullet_fails_with_the_installation_command(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pybullet", None)
     monkeypatch.delitem(sys.modules, "atalante_emulator.body", raising=False)
     with pytest.raises(Failed, match=r"pip install 'atalante-hal\[emulator\]'"), open_body(robot):
@@ -167,7 +167,7 @@ def test_a_signal_ends_the_run_in_hold_with_its_code(network: Network, robot: Ro
     assert end.value.code == 143
 
 
-def test_an_operator_who_stops_ends_the_run_as_failed(network: Network, robot: Robot) -> None:
+def test_stop_of_the_operator_ends_the_run_as_failed(network: Network, robot: Robot) -> None:
     with embedded(network, robot) as rig:
         assert rig.operator is not None
         watch = watched(rig, seconds=1.0, each=lambda state: rig.operator.stop() if state.cycle == 400 else None)  # type: ignore[union-attr]
@@ -208,7 +208,7 @@ def test_a_controller_that_raises_ends_as_failed_with_its_error(network: Network
         watch.conclude()
 
 
-def test_what_a_run_waits_for_is_said_with_what_to_type(network: Network, robot: Robot) -> None:
+def test_a_waiting_run_prints_the_command_to_type(network: Network, robot: Robot) -> None:
     target = Target("virtual", "rig-alone", lockstep=False)
     with open_hal(target, network=network, robot=robot) as rig:
         rig.hal.read()
@@ -239,7 +239,7 @@ def test_what_a_run_waits_for_is_said_with_what_to_type(network: Network, robot:
         ),
     ],
 )
-def test_why_a_start_is_refused_is_said(network: Network, robot: Robot, fault: Fault, said: str) -> None:
+def test_the_reason_of_a_refused_start_is_printed(network: Network, robot: Robot, fault: Fault, said: str) -> None:
     with embedded(network, robot, operator=Operator(), faults=[fault]) as rig:
         for _ in range(400):
             rig.hal.read()
@@ -247,7 +247,7 @@ def test_why_a_start_is_refused_is_said(network: Network, robot: Robot, fault: F
         assert waiting_for(rig).startswith(said)
 
 
-def test_the_wall_clock_asks_for_real_time_rights_and_runs(
+def test_a_run_on_the_wall_clock_requests_real_time_priority(
     network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("atalante_tools.session.rig.realtime", lambda: ["memory is not locked"])
@@ -261,7 +261,7 @@ def test_the_wall_clock_asks_for_real_time_rights_and_runs(
 # -- the controller --------------------------------------------------------------------------------------------------
 
 
-def test_pose_hold_catches_every_joint_where_it_was(network: Network, robot: Robot) -> None:
+def test_pose_hold_keeps_every_joint_at_its_measured_angle(network: Network, robot: Robot) -> None:
     with embedded(network, robot) as rig:
         # Limp until ACTIVE, the legs are still falling when they are caught.
         watched(rig, seconds=0.5).conclude()

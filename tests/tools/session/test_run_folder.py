@@ -1,4 +1,4 @@
-"""The folder of a run: one run at a time, nothing left of a run that did not begin, no figure of half a recording."""
+"""Run folder: one run at a time, removed if empty, no figure of an incomplete recording."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from atalante_tools.session.run_folder import Result, leave, run_folder
 WALKED = Result("pinched", True, 1.97, 1.18, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0)
 
 
-def test_two_runs_do_not_write_into_one_folder(tmp_path: Path) -> None:
+def test_a_second_run_in_the_same_folder_is_rejected(tmp_path: Path) -> None:
     out = tmp_path / "runs" / "demo"
     with run_folder(out):
         (out / "recording.mcap").touch()
@@ -27,7 +27,7 @@ def test_two_runs_do_not_write_into_one_folder(tmp_path: Path) -> None:
     assert [file.name for file in out.iterdir()] == ["recording.mcap"]
 
 
-def test_a_folder_made_for_a_run_that_did_not_begin_goes_again_and_one_that_was_there_stays(tmp_path: Path) -> None:
+def test_a_new_empty_folder_is_removed_and_an_existing_one_kept(tmp_path: Path) -> None:
     for out in (tmp_path / "new", tmp_path / "old"):
         if out.name == "old":
             out.mkdir()
@@ -36,7 +36,7 @@ def test_a_folder_made_for_a_run_that_did_not_begin_goes_again_and_one_that_was_
     assert [folder.name for folder in tmp_path.iterdir()] == ["old"]
 
 
-def test_a_folder_that_cannot_be_made_names_itself(tmp_path: Path) -> None:
+def test_the_error_of_an_invalid_folder_contains_its_path(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match="file") as refused, run_folder(tmp_path / "file" / "run"):
         raise AssertionError("there is no such folder")
@@ -44,7 +44,7 @@ def test_a_folder_that_cannot_be_made_names_itself(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("recording", [b"", b"\x89MCAP0\r\n" + b"\x07" * 100])
-def test_of_half_a_recording_there_is_a_summary_and_no_figure(
+def test_an_incomplete_recording_gives_a_summary_but_no_figure(
     recording: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "recording.mcap").write_bytes(recording)

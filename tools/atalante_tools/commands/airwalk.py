@@ -19,7 +19,7 @@ from atalante_tools.session.airwalk import SHAPE_NAMES, Options, run_trial, tria
 @target_options(embedded=True)
 @trial_options(steps=30, out="runs/airwalk")
 def command(shape: str, target: Target, options: Options, as_json: bool) -> None:
-    """Walk in the air inside one virtual guide, on a robot or an emulator on a bus.
+    """Walk in the air inside one virtual guide, with a real or an emulated robot.
 
     The robot starts when the operator presses START (`atalante pendant start`). The operator may change the assistance
     factor at any time. The robot ends in HOLD: after the steps, on Ctrl-C, or on an error.

@@ -33,7 +33,7 @@ LOOK_UP: Final = 0.1
     "--operator/--no-operator",
     default=True,
     show_default=True,
-    help="Emulate the pendant too, and press START when the HAL is ready. Without it, run `atalante pendant`.",
+    help="Emulate the pendant too, and press START when the HAL is READY. With --no-operator, use `atalante pendant`.",
 )
 @click.option(
     "--xi",

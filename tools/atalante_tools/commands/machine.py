@@ -46,7 +46,7 @@ class Machine(Protocol):
         """Return the highest SCHED_FIFO priority that this user may request, 0 for none."""
 
     def locked_memory(self) -> int | None:
-        """Return the memory that this user may lock in bytes, or None for unlimited."""
+        """Return how much memory this user may lock, in bytes, or None without a limit."""
 
     def package(self, name: str) -> bool:
         """Return whether a Python package is installed.

@@ -56,7 +56,7 @@ class Report:
     cycle: int | None
     assistance_factor: float | None
     overruns: int | None
-    diagnostic: str | None  # most severe active diagnostic; None: none is active
+    diagnostic: str | None  # most severe active diagnostic; None: no diagnostic
     dead_man: bool | None
     nodes: tuple[NodeReport, ...]
     joints: tuple[JointReport, ...]
@@ -150,7 +150,7 @@ class Observer:
     def _fast(self, node: Node) -> list[Message]:
         cyclic = [m for m in self._network.sent_by(node.name) if m.cycle_ms]
         fastest = min(m.cycle_ms for m in cyclic)
-        if node.kind == "master":  # commands are sent only while ACTIVE, SYNC always
+        if node.kind == "master":  # only SYNC shows that the HAL runs; commands may be missing for other reasons
             return [m for m in cyclic if m.name.startswith("SYNC_")]
         return [m for m in cyclic if m.cycle_ms == fastest]
 

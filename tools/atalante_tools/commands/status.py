@@ -110,7 +110,7 @@ def judge(report: Report, target: Target) -> None:
         )
     faults = [joint.joint for joint in report.joints if joint.drive_state == "FAULT"]
     if report.supervisor == "FAULT" or faults:
-        raise FaultLatched(f"a fault is latched: {', '.join(faults) or 'in the supervisor'}")
+        raise FaultLatched(f"a fault is latched: {', '.join(faults) or 'supervisor'}")
 
 
 def render(report: Report, target: Target) -> str:

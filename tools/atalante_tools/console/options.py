@@ -238,7 +238,6 @@ def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command]
         embedded: Whether to allow the embedded robot, which is then the default.
         clock: Whether to add `--lockstep/--wall`.
     """
-    interfaces = "socketcan, pcan, kvaser, ..."
     options = [
         click.option(
             "-i",
@@ -246,15 +245,16 @@ def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command]
             default=EMBEDDED if embedded else "socketcan",
             show_default=True,
             metavar="NAME",
-            help=f"CAN interface: {interfaces}{', or embedded (starts an emulated robot)' if embedded else ''}.",
+            help="CAN interface, for example socketcan, pcan or kvaser"
+            + ("; embedded starts an emulated robot." if embedded else "."),
         ),
         click.option(
             "-c",
             "--channel",
             default="",
             metavar="CHANNEL",
-            help="Channel of all four buses (vcan0), or one per bus: "
-            "left_leg=can0,right_leg=can1,left_sense=can2,right_sense=can3.",
+            help="Channel of all four buses (vcan0), or one per bus (left_leg=can0,right_leg=can1,...) for left_leg, "
+            "right_leg, left_sense and right_sense.",
         ),
     ]
     if clock:

@@ -69,7 +69,7 @@ KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_tools.canlog.validate.project", "ProjectError", InvalidUsage),
 )
 
-#: Largest number of further lines (problems) that are joined to the first line; more are only counted.
+#: A message with more further lines than this is shortened to its first line and the number of the others.
 MOST: Final = 2
 #: Error numbers of a disk that cannot be written: full, over quota, read-only, I/O error. They may come without a file name.
 DISK: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
@@ -93,5 +93,5 @@ def failure_of(error: BaseException) -> Failed | None:
             code = getattr(error, "code", "")
             return failure(f"{code}: {sentence}" if code else sentence)
     if isinstance(error, OSError) and (error.filename is not None or error.errno in DISK):
-        return Failed(f"{error.filename or 'what was to be written'} cannot be used: {error.strerror}")
+        return Failed(f"{error.filename or 'the output file'} cannot be used: {error.strerror}")
     return None

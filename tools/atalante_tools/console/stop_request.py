@@ -18,7 +18,7 @@ TYPE_CHECKING = False  # same as `typing.TYPE_CHECKING`; importing `typing` woul
 if TYPE_CHECKING:
     from types import FrameType
 
-#: Exit code of a process that a signal ended, minus the signal number (shell convention).
+#: Base of the exit code after a signal: the exit code is this base plus the signal number (shell convention).
 SIGNALLED = 128
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -54,7 +54,7 @@ class StopRequest:
             raise Stopped(self.exit_code)
 
     def settle(self) -> None:
-        """Clear the request of a command for which a signal is the normal end."""
+        """Clear the request, for a command that a signal ends normally."""
         self.wanted = False
         self.exit_code = 0
 
@@ -64,7 +64,7 @@ _request: StopRequest | None = None
 
 
 def check_stop() -> None:
-    """End the command if a signal arrived and its exception was lost. Call it between two parts of long work.
+    """End the command if a signal arrived. Call it between two parts of long work, which may have lost the exception.
 
     Raises:
         Stopped: If a signal arrived, with its exit code.

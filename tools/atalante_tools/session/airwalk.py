@@ -283,7 +283,7 @@ class _Walk:
 
     def _describe(self, state: State) -> str:
         statistics = self._controller.statistics
-        # The statistics start after the first completed step, which starts from rest.
+        # The statistics start after the first completed step.
         largest = f"   largest |e|/q_bound {statistics.max_ratio:.2f}" if statistics.cycles else ""
         return (
             f"{self._name:<11} step {statistics.steps:3d}/{self._steps}   t {state.time:6.1f} s   "

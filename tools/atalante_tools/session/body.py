@@ -79,7 +79,7 @@ def open_described(urdf: str, pose: Sequence[float] | None = None) -> Iterator[P
 
 @contextmanager
 def no_banner() -> Iterator[None]:
-    """Discard everything written to file descriptor 2 inside the block, e.g. the import banner of PyBullet."""
+    """Discard all output to stderr inside the block, including that of C code, e.g. the import banner of PyBullet."""
     sys.stderr.flush()
     terminal, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:

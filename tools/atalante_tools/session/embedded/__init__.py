@@ -75,7 +75,7 @@ class EmbeddedRobot(Closing):
             process_group=0,
         )
         self._begun = False
-        os.close(child_bell)  # an open copy would hide the end of the child
+        os.close(child_bell)  # with a copy left open here, the end of the child could not be detected
         self.bus = SharedBus("embedded", memory, parent_bell, 0)
         self.bus.patience = _PATIENCE
         self._part_from_child()
