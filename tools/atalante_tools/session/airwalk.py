@@ -58,9 +58,7 @@ class Options:
     record_rate: int  # recording rate, Hz
     can_log: Path | None  # file for all frames; None: frames are not logged
     telemetry: Path | None  # telemetry file (endpoint, TLS, users); None: loopback only
-    subject: Subject | None = (
-        None  # subject of a gait from the gait network; None: the default gait for walking in the air
-    )
+    subject: Subject | None = None  # subject of the gait network; None: the default gait for walking in the air
 
 
 @dataclass
@@ -193,9 +191,7 @@ def _walk_all(
     from atalante_hal.robot import load_robot
 
     with ExitStack() as stack:
-        robot_process = _start_robot(
-            target, stack
-        )  # the subprocess imports its modules while the controllers are created
+        robot_process = _start_robot(target, stack)  # its imports run while the controllers are created
         network, robot = atalante_dbc.load(), load_robot()
         exoskeleton, gait, controllers = _controllers(options.subject, robot, shapes)
         certificates: dict[str, Certificate] = {}

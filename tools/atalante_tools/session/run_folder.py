@@ -27,9 +27,7 @@ class Result:
 
     shape: str
     certified: bool  # whether the guide is certified on the model at every assistance factor of the run
-    bound_hip_nm: (
-        float | None
-    )  # disturbance torque at the hip that the filter tolerates together with the one at the knee; None: not certified
+    bound_hip_nm: float | None  # torque tolerated at the hip together with bound_knee_nm; None: not certified
     bound_knee_nm: float | None  # the same at the knee
     steps: int  # number of completed right-stance steps
     max_ratio: float  # largest |e| / q_bound after the first completed step
