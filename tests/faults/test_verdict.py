@@ -119,6 +119,27 @@ def test_what_must_never_be_is_told(seen: Any, quantity: str, value: float, says
     assert verdict(seen(**{quantity: array})).failures == (says,)
 
 
+@pytest.mark.parametrize(
+    ("quantity", "limit", "factor", "margin"),
+    [
+        ("torque", "torque_max", 1.0, 0.0),
+        ("position", "position_max", 1.0, 0.05),
+        ("position", "position_min", 1.0, -0.05),
+        ("velocity", "velocity_max", 1.2, 0.0),
+    ],
+)
+def test_a_run_fails_just_beyond_the_bound_of_each_quantity(
+    seen: Any, robot: Robot, quantity: str, limit: str, factor: float, margin: float
+) -> None:
+    for joint in range(12):
+        bound = factor * getattr(robot, limit)[joint] + margin
+        outward = -1.0 if limit == "position_min" else 1.0
+        for beyond in (-1e-6, 1e-6):
+            values = np.zeros((len(HELD), 12))
+            values[2, joint] = bound + outward * beyond * max(1.0, abs(bound))
+            assert bool(verdict(seen(**{quantity: values})).failures) is (beyond > 0.0), (joint, beyond)
+
+
 def test_a_check_of_the_case_is_asked(seen: Any) -> None:
     assert verdict(seen(), checks=(lambda observation: f"{observation.first} it is",)).failures == ("11 it is",)
 
