@@ -1,1 +1,1 @@
-"""The other end of the bus: nodes, PyBullet body and the faults they can have."""
+"""Emulated robot at the other end of the bus: nodes, PyBullet body and injected faults."""

@@ -1,7 +1,7 @@
-"""The mechanics under the nodes: torques in, one millisecond of motion, arrays out.
+"""Mechanics of the emulated robot: joint torques in, one millisecond of motion, sensor arrays out.
 
-`Body` is all the nodes know of an engine; `PyBulletBody` implements it from a URDF text. The pelvis is held fixed: the
-exoskeleton hangs in the air. (With a floating base the interface stays; only `PyBulletBody` learns to free it.)
+`Body` is the interface between the nodes and a physics engine; `PyBulletBody` implements it from a URDF text. The pelvis is
+fixed: the exoskeleton is suspended in the air. A floating base would change `PyBulletBody` alone, not the interface.
 """
 
 from __future__ import annotations
@@ -21,53 +21,66 @@ from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS
 Vector = npt.NDArray[np.float64]
 Vector3 = tuple[float, float, float]
 
-#: Step of the mechanics and of the bus cycle [s].
+#: Time step of the mechanics and period of the bus cycle [s].
 PERIOD = 1e-3
 GRAVITY = 9.81  # m/s2
-#: Solver iterations are part of the model, not a speed setting: the standing pose depends on them.
+#: Solver iterations of a time step. They are part of the model, not a speed setting: the standing pose depends on them.
 SOLVER_ITERATIONS = 50
-#: Numbers of a link's state, in the world: quaternion xyzw, velocity [m/s], angular velocity [rad/s].
+#: Count of numbers in a link state, in world axes: quaternion xyzw, velocity [m/s], angular velocity [rad/s].
 LINK_STATE: Final = 10
-#: Entries of a PyBullet link state.
+#: Indices into the tuple that PyBullet returns as link state.
 _ATTITUDE, _LINEAR, _ANGULAR = 5, 6, 7
 _PACK_JOINTS, _PACK_LINK = Struct(f"{2 * len(JOINTS)}d").pack_into, Struct(f"{LINK_STATE}d").pack_into
 
 
 class Body(Protocol):
-    """What the nodes need of the mechanics. Arrays keep their identity; they change in `reset` and `step` alone."""
+    """Interface of the mechanics to the nodes.
+
+    The array objects stay the same; only `reset` and `step` change their contents.
+    """
 
     @property
     def position(self) -> Vector:
-        """Shape (12,) [rad], order of JOINTS."""
+        """Joint positions, shape (12,) [rad], order of JOINTS."""
 
     @property
     def velocity(self) -> Vector:
-        """Shape (12,) [rad/s]."""
+        """Joint velocities, shape (12,) [rad/s], order of JOINTS."""
 
     @property
     def imu(self) -> Vector:
-        """Attitude and velocities of each of IMUS, whose axes they are. Shape (4, LINK_STATE)."""
+        """Attitude and velocities of the IMU links, order of IMUS, shape (4, LINK_STATE)."""
 
     @property
     def contact(self) -> Sequence[tuple[int, int, Vector3]]:
-        """Foot of FEET, cell of CELLS, world force on it [N], of the last step."""
+        """Contacts of the last step: index into FEET, index into CELLS, force on the cell in world axes [N]."""
 
     @property
     def foot_rotation(self) -> Sequence[tuple[float, ...]]:
-        """Quaternion xyzw of each of FEET; renewed while it is in contact."""
+        """Attitude of each foot, quaternion xyzw, order of FEET; updated only while a foot is in contact."""
 
     def reset(self, position: Sequence[float]) -> None:
-        """Put the joints at rest at `position`. Shape (12,) [rad]."""
+        """Set the joint positions and zero the velocities.
+
+        Args:
+            position: joint positions, shape (12,) [rad].
+        """
 
     def step(self, torque: Sequence[float]) -> None:
-        """Apply joint torques for one `PERIOD` and read everything. Shape (12,) [Nm]."""
+        """Apply joint torques for one `PERIOD` and update all arrays.
+
+        Args:
+            torque: joint torques, shape (12,) [Nm].
+        """
 
     def close(self) -> None:
-        """Free the engine."""
+        """Release the physics engine."""
 
 
 class PyBulletBody:
-    """The exoskeleton in PyBullet, pelvis fixed. Two bodies made alike and driven alike agree to the last bit.
+    """Exoskeleton in PyBullet with a fixed pelvis.
+
+    Two bodies with the same URDF and the same torques give identical results, bit by bit.
 
     Joints and links are found by name: joints are `JOINTS`, IMU links `imu_<IMU>`, feet `<foot>_foot` and contact pads
     `<foot>_foot_<cell>`, with their joint frames as sensor frames.
@@ -77,13 +90,13 @@ class PyBulletBody:
         """Load the URDF.
 
         Args:
-            urdf: the text, not a path.
-            ground: height of a floor in the pelvis frame [m], negative; None: no floor.
+            urdf: text of the URDF, not a path.
+            ground: height of the floor in the pelvis frame [m], negative. None means no floor.
 
         Raises:
-            ValueError: the text is no URDF, or lacks a joint or a link that is looked for.
+            ValueError: If the text is not a URDF, or a required joint or link is missing.
         """
-        # A fresh client a body: that is what makes two runs identical; saved and restored states do not.
+        # Every body gets a new client, which makes two runs identical; restoring a saved state does not.
         self._client = pybullet.connect(pybullet.DIRECT)
         client = {"physicsClientId": self._client}
         pybullet.setPhysicsEngineParameter(
@@ -102,11 +115,11 @@ class PyBulletBody:
             raise
         for link in range(-1, self._links):
             pybullet.changeDynamics(self._body, link, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, **client)
-        # The engine's own velocity motors would hold every joint.
+        # PyBullet's default velocity motors would brake every joint.
         pybullet.setJointMotorControlArray(
             self._body, self._joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * len(JOINTS), **client
         )
-        self._touches = ground is not None  # its own parts do not collide
+        self._touches = ground is not None  # the links do not collide with each other
         if self._touches:
             plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, **client)
             pybullet.createMultiBody(0.0, plane, basePosition=[0.0, 0.0, ground], **client)
@@ -115,7 +128,7 @@ class PyBulletBody:
         self._joint_memory = joints.reshape(-1).data
         for row, state in zip(self.imu, self._link_states(self._imus), strict=True):
             row[:4] = state[_ATTITUDE]
-        self._imu_memory = [self.imu[place].data for place in self._moving]
+        self._imu_memory = [self.imu[row].data for row in self._moving]
         self.foot_rotation: list[tuple[float, ...]] = [state[_ATTITUDE] for state in self._link_states(self._feet)]
         self.contact: Sequence[tuple[int, int, Vector3]] = ()
         self.reset([0.0] * len(JOINTS))
@@ -130,38 +143,53 @@ class PyBulletBody:
         joints = {info[1].decode(): i for i, info in enumerate(infos)}
         links = {info[12].decode(): i for i, info in enumerate(infos)}
 
-        def find(names: Sequence[str], there: dict[str, int], what: str) -> list[int]:
-            if missing := [name for name in names if name not in there]:
-                raise ValueError(f"the URDF lacks {what} {missing[0]}; it needs {', '.join(names)}")
-            return [there[name] for name in names]
+        def find(names: Sequence[str], available: dict[str, int], noun: str) -> list[int]:
+            if missing := [name for name in names if name not in available]:
+                raise ValueError(f"the URDF must have the {noun}s {', '.join(names)}, but {missing[0]} is missing")
+            return [available[name] for name in names]
 
         self._joints = find(JOINTS, joints, "joint")
         self._imus = find([f"imu_{imu}" for imu in IMUS], links, "link")
         self._feet = find([f"{foot}_foot" for foot in FEET], links, "link")
         pads = find([f"{foot}_foot_{cell}" for foot in FEET for cell in CELLS], links, "link")
-        self._cell_of = {pad: divmod(place, len(CELLS)) for place, pad in enumerate(pads)}
-        #: IMUs behind a joint of the fixed pelvis; the others never move.
-        self._moving = [place for place, link in enumerate(self._imus) if _behind(link, set(self._joints), infos)]
-        self._moving_links = [self._imus[place] for place in self._moving]
+        self._cell_of = {pad: divmod(index, len(CELLS)) for index, pad in enumerate(pads)}
+        #: Rows of the IMUs that a joint can move; the others are fixed to the pelvis.
+        self._moving = [row for row, link in enumerate(self._imus) if _is_movable(link, set(self._joints), infos)]
+        self._moving_links = [self._imus[row] for row in self._moving]
 
     def _link_states(self, links: Sequence[int]) -> Any:
-        # Without the forward kinematics flag poses are one step old.
+        # Without the forward kinematics flag, PyBullet returns the poses of the previous step.
         return pybullet.getLinkStates(self._body, links, 1, 1, physicsClientId=self._client)
 
     def reset(self, position: Sequence[float]) -> None:
-        """Put the joints at rest at `position`. Shape (12,) [rad]."""
+        """Set the joint positions and zero the velocities.
+
+        Args:
+            position: joint positions, shape (12,) [rad].
+        """
         for joint, angle in zip(self._joints, position, strict=True):
             pybullet.resetJointState(self._body, joint, angle, 0.0, physicsClientId=self._client)
         self._unpack(*self._read())
-        self.contact = ()  # of the last step, and there was none
+        self.contact = ()  # contacts belong to a step, and there was no step since the reset
 
     def step(self, torque: Sequence[float]) -> None:
-        """Apply joint torques for one `PERIOD` and read everything. Shape (12,) [Nm], a list is fastest."""
+        """Apply joint torques for one `PERIOD` and update all arrays.
+
+        Args:
+            torque: joint torques, shape (12,) [Nm]. A list is fastest.
+        """
         self._unpack(*self.exchange(torque))
 
     def exchange(self, torque: Sequence[float]) -> tuple[Any, Any, Any]:
-        """The engine's share of `step`: torques in, step, the same reads, not unpacked; the benchmarks' baseline."""
-        # Torque control lasts one step: it is said again every time.
+        """Run the PyBullet calls of `step` without unpacking the results; benchmarks use it as baseline.
+
+        Args:
+            torque: joint torques, shape (12,) [Nm].
+
+        Returns:
+            Joint states, link states and contacts, as PyBullet returns them.
+        """
+        # PyBullet forgets the torques after one step, so they are set before each.
         pybullet.setJointMotorControlArray(
             self._body, self._joints, pybullet.TORQUE_CONTROL, forces=torque, physicsClientId=self._client
         )
@@ -176,7 +204,7 @@ class PyBulletBody:
         )
 
     def _unpack(self, joints: Any, links: Any, contacts: Any) -> None:
-        # Spelled out: any loop over the joints takes twice as long.
+        # Written out because a loop over the joints takes twice as long.
         a, b, c, d, e, f, g, h, i, j, k, m = joints
         position = a[0], b[0], c[0], d[0], e[0], f[0], g[0], h[0], i[0], j[0], k[0], m[0]
         velocity = a[1], b[1], c[1], d[1], e[1], f[1], g[1], h[1], i[1], j[1], k[1], m[1]
@@ -201,22 +229,30 @@ class PyBulletBody:
         return forces
 
     def close(self) -> None:
-        """Disconnect from the engine."""
+        """Disconnect from PyBullet."""
         if pybullet.isConnected(self._client):
             pybullet.disconnect(self._client)
 
 
 def load_urdf(urdf: str, client: int, *, fixed: bool = True) -> int:
-    """Number of the body that PyBullet makes of a URDF text, its base fixed or free.
+    """Load a URDF text into PyBullet.
+
+    Args:
+        urdf: text of the URDF.
+        client: PyBullet client to load it into.
+        fixed: whether the base is fixed to the world.
+
+    Returns:
+        PyBullet's number of the new body.
 
     Raises:
-        ValueError: the text is no URDF.
+        ValueError: If the text is not a URDF.
     """
     with tempfile.TemporaryDirectory(prefix="atalante-") as folder:
         path = Path(folder, "exoskeleton.urdf")
         path.write_text(urdf)
         try:
-            # Fixed links stay apart (no merging): IMUs and pads are found by their names.
+            # Fixed links are not merged, because IMUs and pads are found by their link names.
             return int(
                 pybullet.loadURDF(
                     str(path), useFixedBase=fixed, flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client
@@ -226,7 +262,8 @@ def load_urdf(urdf: str, client: int, *, fixed: bool = True) -> int:
             raise ValueError(f"PyBullet cannot load the URDF: {error}") from error
 
 
-def _behind(link: int, joints: set[int], infos: Sequence[Any]) -> bool:
+def _is_movable(link: int, joints: set[int], infos: Sequence[Any]) -> bool:
+    """Return whether one of the joints lies between a link and the base."""
     while link >= 0:
         if link in joints:
             return True

@@ -1,8 +1,8 @@
-"""Two senders of one message: what a receiver can tell from the frames it gets, each of them right.
+"""Detection of two senders of one message, from frames that are all valid by themselves.
 
-One sender counts on by one from frame to frame. Frames may be lost and CAN may repeat one, but it puts no frame of a sender
-before an earlier one: whoever hears two different frames with one counter, or two in one cycle that do not follow each other,
-hears two senders.
+A sender increments its counter by one with each frame. CAN may lose or repeat a frame, but it keeps the order of a sender's
+frames. Two different frames with the same counter, or two frames of one cycle whose counters are not consecutive, therefore
+come from two senders.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from atalante_hal.wire.frame import Frames
 
 
 class Senders:
-    """The frames of one message, watched in every cycle in which something is not as expected."""
+    """Detector for two senders of one message; the emulator runs it in every imperfect cycle."""
 
     def __init__(self, message: Message) -> None:
         self._message = message
         self._data_id = data_id_bytes(message.data_id)
-        self._last: bytes | None = None  # heard last
+        self._last: bytes | None = None  # payload received last
         self._last_cycle = -1
 
     def are_two(self, frames: Frames, cycle: int) -> bool:
-        """Whether the frames of a cycle are of two senders.
+        """Return whether the frames of a cycle come from two senders.
 
         Args:
-            frames: everything that came, in that order. Shape (n,).
-            cycle: a number that goes on by one.
+            frames: all frames received in the cycle, in the order of reception, shape (n,).
+            cycle: number of the cycle; it increases by one per cycle.
         """
         if self._last_cycle != cycle - 1:
             self._last = None
@@ -40,8 +40,8 @@ class Senders:
         return two
 
     def _intact(self, frames: Frames) -> list[bytes]:
-        """Payloads of the message's frames whose length and CRC are right."""
+        """Return the payloads of the message's frames whose length and CRC are correct."""
         message = self._message
-        mine = frames[(frames["can_id"] == message.frame_id) & (frames["len"] == message.length)]
-        payloads = [frame["data"][: message.length].tobytes() for frame in mine]
+        candidates = frames[(frames["can_id"] == message.frame_id) & (frames["len"] == message.length)]
+        payloads = [frame["data"][: message.length].tobytes() for frame in candidates]
         return [p for p in payloads if crc(p[CRC_BYTES:], self._data_id) == int.from_bytes(p[:CRC_BYTES], "little")]

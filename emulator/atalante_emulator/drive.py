@@ -1,12 +1,13 @@
-"""The firmware of the twelve drives: CiA 402, command watchdog, limits, and what a drive does by itself when something is wrong.
+"""Firmware of the twelve emulated drives: CiA 402 state machine, command watchdog, limits and local error reactions.
 
-One cycle is `sample` (what the state frames will say), then `command` (latch what the HAL wants), then `drive` (torques
-for the next millisecond). The drive is the last line of safety, HAL or no HAL:
+One cycle is `sample` (fill the signals of the state frames), then `command` (latch the command of the HAL), then `drive`
+(compute the torques of the next millisecond). The drives are the last safety layer and need no HAL:
 
-- no valid new command for `WATCHDOG` cycles, no SYNC for as many, two senders of one command, a supply that fails: latched
-  local hold, QUICK STOP ACTIVE, its motor holding the position of its own encoder;
-- too hot, over-current, encoder lost: it cannot hold. FAULT REACTION ACTIVE and then FAULT, power stage off, and the brake lets
-  the joint down slowly. The same brake is on whenever a drive has no power: DISABLE_VOLTAGE is how a HAL lowers a joint.
+- Local hold: no valid new command or no SYNC for `WATCHDOG` cycles, two senders of one command, or low supply voltage. The
+  drive latches QUICK STOP ACTIVE and its motor holds the position of its own encoder.
+- Lowering: over-temperature, over-current or encoder error, in which the drive cannot hold. The drive enters FAULT REACTION
+  ACTIVE and then FAULT. The power stage is off, and the brake lets the joint sink slowly. The same brake acts in every drive
+  without power, so the HAL lowers a joint with DISABLE_VOLTAGE.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from atalante_hal.wire.cia402 import AUTOMATIC, Controlword, DriveState, next_st
 
 Vector = npt.NDArray[np.float64]
 
-#: Cycles without a valid new command, or without SYNC, after which an enabled drive holds by itself.
+#: Cycles without a valid new command, or without SYNC, after which an enabled drive starts its local hold.
 WATCHDOG: Final = 5
-#: Cycles between two looks at what is slow: heat, and whether a joint that was let down has come to rest.
+#: Cycles between two updates of the slow quantities: temperatures, and rest of the joints being lowered.
 SLOW_CYCLES: Final = 100
-#: Node names, in the order of the drives.
+#: Names of the drive nodes, in the order of JOINTS.
 NODES: Final = tuple(joint.upper() for joint in JOINTS)
 _LEG: Final = len(LEG_JOINTS)
 _POWERED: Final = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
@@ -41,21 +42,21 @@ _FAULTY: Final = (DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT)
 
 @dataclass(frozen=True)
 class DriveParameters:
-    """What the emulated drives are really like."""
+    """True parameters of the emulated drives, unknown to the HAL."""
 
     motor: MotorParameters = field(default_factory=MotorParameters)
     velocity_bandwidth: float = 80.0  # Hz, low-pass of the velocity estimate
     torque_noise: float = 0.05  # Nm rms, of the torque measurement
-    trip_temperature: float = 120.0  # degC: the drive switches itself off
-    cool_enough: float = 100.0  # degC: and may be switched on again
+    trip_temperature: float = 120.0  # degC, at and above which the drive switches its power stage off
+    cool_enough: float = 100.0  # degC, at and below which it may be enabled again
     supply: float = 48.0  # V
-    hold_below: float = 40.0  # V: the drive holds with what is left
-    off_below: float = 20.0  # V: the power stage works no more
-    rest_speed: float = 0.05  # rad/s: a joint this slow has been let down
+    hold_below: float = 40.0  # V, below which the drive starts its local hold
+    off_below: float = 20.0  # V, below which the power stage cannot work
+    rest_speed: float = 0.05  # rad/s, below which a joint being lowered is at rest
 
 
 class DriveSignals(NamedTuple):
-    """What the state frames will say, shape (12,) each."""
+    """Signals of the drives' state frames, shape (12,) each; `Drives` rewrites them."""
 
     position: Vector  # rad at the motor
     velocity: Vector  # rad/s at the motor
@@ -65,7 +66,7 @@ class DriveSignals(NamedTuple):
 
 
 def _within(target: Vector, limit: Vector, own_limit: Vector, wanted: Vector) -> None:
-    """The target within what HAL and drive allow. Shape (12,) each [Nm]."""
+    """Clip the target torque to the limits of HAL and drive, into `wanted`. Shape (12,) each [Nm]."""
     for i in range(len(wanted)):
         most = min(limit[i], own_limit[i])
         wanted[i] = max(-most, min(target[i], most))
@@ -75,52 +76,65 @@ _ENABLED = np.full(len(JOINTS), float(DriveState.OPERATION_ENABLED)).tobytes()
 
 
 class Drives:
-    """Twelve drives; one command frame serves the six of a leg, leg 0 is left: drives 0 to 5, leg 1 drives 6 to 11."""
+    """Twelve drives, commanded by one frame a leg: leg 0 (left) has drives 0 to 5, leg 1 (right) drives 6 to 11."""
 
     def __init__(
         self, robot: Robot, parameters: DriveParameters, signals: DriveSignals, outbox: list[Emergency] | None = None
     ) -> None:
-        """Switch the drives on; `outbox` takes the emergencies they want told."""
+        """Power up the drives in SWITCH_ON_DISABLED.
+
+        Args:
+            robot: joint properties that the firmware uses: torque limits, gear ratios and hold gains.
+            parameters: true parameters of the drives.
+            signals: arrays that receive the signals of the state frames.
+            outbox: list that receives the emergencies to send. None creates one.
+        """
         self._robot = robot
         self.parameters = parameters
         self.signals = signals
         self.state = [DriveState.SWITCH_ON_DISABLED] * len(JOINTS)
-        #: Drives that stopped by themselves and were not acknowledged with QUICK_STOP since.
+        #: Whether each drive is in local hold and not yet acknowledged with QUICK_STOP.
         self.latched = [False] * len(JOINTS)
         self.emergencies = [] if outbox is None else outbox
         self.errors = Errors(NODES, self.emergencies)
         #: Supply voltage of each drive [V].
         self.voltage = [parameters.supply] * len(JOINTS)
-        #: Cycles in a row without a new command, a leg.
+        #: Consecutive cycles without a new command, per leg.
         self.missed = [0] * len(SIDES)
-        self._unsynced = [0] * len(SIDES)  # cycles in a row without SYNC, a leg
-        self._unsynced_at = [-1] * len(SIDES)  # the last of them
+        self._unsynced = [0] * len(SIDES)  # consecutive cycles without SYNC, per leg
+        self._unsynced_at = [-1] * len(SIDES)  # number of the last cycle without SYNC, per leg
         self.encoders = Encoders(robot, parameters.velocity_bandwidth, signals.position, signals.velocity)
         self.motors = Motors(robot, parameters.motor, signals.torque, signals.temperature)
         self._slow_phase = 0
-        self._steady = b""  # controlwords that left every drive as it was the last time
-        self._hold_at = np.zeros(len(JOINTS))  # rad, where a stopped drive holds
+        self._steady = b""  # controlwords that changed no drive state when last applied
+        self._hold_at = np.zeros(len(JOINTS))  # rad, position that a drive in local hold keeps
         self._target, self._limit = np.zeros((2, len(JOINTS)))
-        self._own_limit = robot.torque_max.copy()  # Nm, of a drive this hot
+        self._own_limit = robot.torque_max.copy()  # Nm, torque limit at the present temperature
         self._within = compiled(_within)
-        self._within(self._target, self._limit, self._own_limit, self.motors.wanted)  # compiled now, not in a cycle
+        # The first call compiles the kernel, which would be too slow within a cycle.
+        self._within(self._target, self._limit, self._own_limit, self.motors.wanted)
         self._states_changed()
 
     # -- every cycle -------------------------------------------------------------------------------------------------
 
     def sample(self, position: Vector) -> None:
-        """Read the encoders: joint position [rad], shape (12,), to the signals of the state frames."""
+        """Read the encoders into the signals of the state frames.
+
+        Args:
+            position: joint positions, shape (12,) [rad].
+        """
         self.encoders.sample(position)
 
     def command(self, fresh: tuple[bool, bool], controlword: Vector, target: Vector, limit: Vector) -> None:
-        """Latch the last valid command and run watchdog and state machine.
+        """Latch the last valid command and run the watchdog and the state machines.
+
+        The arrays `target` and `limit` are read again in every `drive` until the next command.
 
         Args:
-            fresh: per leg, whether a valid new command came since the last cycle.
-            controlword: shape (12,), `Controlword` values.
-            target: shape (12,) [Nm at the joint].
-            limit: shape (12,) [Nm], the HAL's MaxTorque; the drive's own limit holds anyway. Both are read again in every
-                `drive` until the next command.
+            fresh: per leg, whether a valid new command arrived since the last cycle.
+            controlword: `Controlword` values, shape (12,).
+            target: target torques, shape (12,) [Nm at the joint].
+            limit: torque limits from the MaxTorque of the HAL, shape (12,) [Nm]. The drive's own limit applies as well.
         """
         missed = self.missed
         for leg in (0, 1):
@@ -136,10 +150,13 @@ class Drives:
         self._target, self._limit = target, limit
 
     def drive(self, velocity: Vector) -> list[float]:
-        """Joint torques for the next `PERIOD`: what the motors make of the command. Shape (12,) [Nm].
+        """Return the joint torques of the next `PERIOD`.
 
         Args:
-            velocity: true joint velocity [rad/s], shape (12,): what friction acts on.
+            velocity: true joint velocities, which friction depends on, shape (12,) [rad/s].
+
+        Returns:
+            Joint torques, shape (12,) [Nm].
         """
         self._slow_phase += 1
         if self._slow_phase == SLOW_CYCLES:
@@ -151,27 +168,42 @@ class Drives:
         return self.motors.turn(velocity)
 
     def draw_noise(self, generator: np.random.Generator, out: Vector) -> None:
-        """Measurement noise of the torque signal for many cycles. Shape (cycles, 12) [Nm]."""
+        """Draw the measurement noise of the torque signals for many cycles.
+
+        Args:
+            generator: source of the random numbers.
+            out: array that receives the noise, shape (cycles, 12) [Nm].
+        """
         np.multiply(generator.standard_normal(out.shape), self.parameters.torque_noise, out=out)
 
     def _without_command(self, wanted: Vector) -> None:
-        """Replace the command of drives that are not enabled: position hold, or nothing."""
+        """Replace the torque of drives that are not enabled: position hold in local hold, else zero."""
         robot, limit = self._robot, self._own_limit
-        # The drive's own loop uses the bare encoder difference: the filtered estimate is for the frame, and too late.
+        # The filtered velocity of the state frame has too much delay for this loop, so it uses the raw encoder difference.
         hold = robot.hold_kp * (self._hold_at - self.encoders.angle) - robot.hold_kd * self.encoders.speed
         np.clip(hold, -limit, limit, out=hold)
         wanted[:] = np.where(self._is_enabled, wanted, np.where(self._is_holding, hold, 0.0))
 
-    # -- what is wrong -----------------------------------------------------------------------------------------------
+    # -- errors ------------------------------------------------------------------------------------------------------
 
     def hold(self, leg: int, code: int) -> None:
-        """Local hold, latched, of every enabled drive of a leg, for an error of the wire: its HAL is not heard."""
+        """Latch a local hold in every enabled drive of a leg, after a communication error.
+
+        Args:
+            leg: index of the leg, 0 is left.
+            code: emergency error code.
+        """
         for drive in range(leg * _LEG, (leg + 1) * _LEG):
             if self.state[drive] is DriveState.OPERATION_ENABLED:
                 self.fail(drive, code)
 
     def miss_sync(self, leg: int, cycle: int) -> None:
-        """A leg had no SYNC in this cycle."""
+        """Count a cycle without SYNC for a leg, and start its local hold after `WATCHDOG` of them.
+
+        Args:
+            leg: index of the leg, 0 is left.
+            cycle: number of the cycle.
+        """
         in_a_row = self._unsynced_at[leg] == cycle - 1
         self._unsynced[leg] = self._unsynced[leg] + 1 if in_a_row else 1
         self._unsynced_at[leg] = cycle
@@ -179,16 +211,31 @@ class Drives:
             self.hold(leg, emergency.LIFE_GUARD)
 
     def find_sync(self, leg: int) -> None:
-        """The SYNC of a leg came after all."""
+        """Clear the SYNC watchdog of a leg whose SYNC arrived late in its cycle.
+
+        Args:
+            leg: index of the leg, 0 is left.
+        """
         self._unsynced[leg] = 0
 
     def notice(self, leg: int, code: int) -> None:
-        """Something was wrong with a command of a leg that asks for no reaction."""
+        """Report a command error of a leg that causes no reaction of its drives.
+
+        Args:
+            leg: index of the leg, 0 is left.
+            code: emergency error code.
+        """
         for drive in range(leg * _LEG, (leg + 1) * _LEG):
             self.errors.notice(drive, code)
 
     def fail(self, drive: int, code: int, *, stands: bool = False) -> None:
-        """A drive has an error: it tells it and does what it can do by itself. `stands`: until `recover`."""
+        """Report an error of a drive and start its local reaction.
+
+        Args:
+            drive: index of the drive.
+            code: emergency error code.
+            stands: whether the cause persists until `recover`, so that the error cannot be acknowledged before.
+        """
         self.errors.begin(drive, code, stands=stands)
         state = self.state[drive]
         match reaction_to(code):
@@ -202,31 +249,55 @@ class Drives:
         self._states_changed()
 
     def recover(self, drive: int, code: int) -> None:
-        """The cause of an error is gone; what it led to stays until the HAL acknowledges it."""
+        """Mark the cause of an error as gone; the reaction stays until the HAL acknowledges it.
+
+        Args:
+            drive: index of the drive.
+            code: emergency error code.
+        """
         self.errors.end(drive, code)
         if not self.latched[drive] and self.state[drive] not in _FAULTY:
             self.errors.acknowledge(drive)
-        self._steady = b""  # the HAL may be acknowledging already
+        self._steady = b""  # the present controlword may now acknowledge the error
 
     def leave(self, drive: int, state: DriveState) -> None:
-        """Go to a state unasked, as broken firmware would."""
+        """Force a state change without a command, as defective firmware would.
+
+        Args:
+            drive: index of the drive.
+            state: state to enter.
+        """
         self._enter(drive, state)
         self._states_changed()
 
     def reset(self, drive: int) -> None:
-        """Begin anew, as after a loss of power."""
+        """Restart a drive, as after a loss of power.
+
+        Args:
+            drive: index of the drive.
+        """
         self._enter(drive, DriveState.SWITCH_ON_DISABLED)
         self.latched[drive] = False
         self.errors.forget(drive)
         self._states_changed()
 
     def heat(self, drive: int, temperature: float) -> None:
-        """The winding of a drive has this temperature [degC]."""
+        """Set the winding temperature of a drive.
+
+        Args:
+            drive: index of the drive.
+            temperature: winding temperature [degC].
+        """
         self.motors.temperature[drive] = temperature
         self._judge_heat()
 
     def supply(self, drive: int, voltage: float) -> None:
-        """A drive has this supply voltage [V]."""
+        """Set the supply voltage of a drive, and start or end its voltage errors.
+
+        Args:
+            drive: index of the drive.
+            voltage: supply voltage [V].
+        """
         self.voltage[drive] = voltage
         for code, least in (
             (emergency.UNDER_VOLTAGE, self.parameters.hold_below),
@@ -250,11 +321,11 @@ class Drives:
             self._steady = words
 
     def _obey(self, drive: int, word: int) -> bool:
-        """One controlword to one drive; whether anything changed."""
+        """Apply one controlword to one drive and return whether its state or its latch changed."""
         state, latched = self.state[drive], self.latched[drive]
         after = next_state(state, word, latched=latched)
         if self.errors.stand(drive) and (state is DriveState.FAULT or after is DriveState.OPERATION_ENABLED):
-            return False  # not before the cause is gone
+            return False  # an error cannot be acknowledged before its cause is gone
         acknowledged = after is not state and state is DriveState.FAULT
         if latched and (after is not DriveState.QUICK_STOP_ACTIVE or word == Controlword.QUICK_STOP):
             acknowledged = not self.errors.stand(drive) or after is not DriveState.QUICK_STOP_ACTIVE
@@ -279,7 +350,7 @@ class Drives:
         self._is_holding = state == DriveState.QUICK_STOP_ACTIVE
         self.motors.power(self._is_enabled | self._is_holding)
 
-    # -- what is slow ------------------------------------------------------------------------------------------------
+    # -- slow quantities ---------------------------------------------------------------------------------------------
 
     def _slow_turn(self) -> None:
         self._slow_phase = 0
@@ -290,9 +361,9 @@ class Drives:
         self.errors.turn()
 
     def _judge_heat(self) -> None:
-        """Less torque for a hot drive, none for one that is too hot."""
+        """Reduce the torque limit of hot drives and switch off drives above the trip temperature."""
         temperature, parameters = self.motors.temperature, self.parameters
-        # As it is told: the HAL computes the same limit from the frame.
+        # Rounded as in the state frame, so that the HAL computes the same limit.
         self._own_limit[:] = self._robot.torque_limit(np.rint(temperature))
         for drive, degrees in enumerate(temperature.tolist()):
             if degrees >= parameters.trip_temperature:
@@ -301,7 +372,7 @@ class Drives:
                 self.recover(drive, emergency.OVER_TEMPERATURE)
 
     def _judge_rest(self) -> None:
-        """A joint that was let down and moves no more: FAULT."""
+        """Move drives from FAULT REACTION ACTIVE to FAULT when their lowered joints are at rest."""
         speed = np.abs(self.encoders.speed)
         for drive in np.flatnonzero(speed < self.parameters.rest_speed).tolist():
             if self.state[drive] is DriveState.FAULT_REACTION_ACTIVE:

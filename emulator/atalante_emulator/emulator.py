@@ -1,11 +1,11 @@
-"""The emulated robot at the other end of the bus.
+"""Emulated robot at the other end of the bus.
 
     bus -> process image -> E2E + validity -> nodes -> body (PyBullet) -> nodes -> process image -> bus
 
-A cycle begins with SYNC: every node latches the command of the cycle before and sends what it sampled, then the body moves on
-by one millisecond. Then the next answer is sampled and sealed ahead: a HAL that waits for it in another process waits for a
-copy, and works while the body moves. The same object answers an embedded HAL in lock-step (`poll` as the `step` of a `PairBus`)
-and a HAL in another process (`run`). One seed gives one sequence of bytes.
+A cycle begins with SYNC: every node latches the command of the previous cycle and sends its samples, then the body moves for
+one millisecond. After that, the next answer is sampled and sealed in advance. A HAL in another process therefore waits for a
+copy only, and computes while the body moves. The same object answers an embedded HAL in lock-step (`poll` as the `step` of a
+`PairBus`) and a HAL in another process (`run`). The same seed gives the same sequence of bytes.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 
 Vector = npt.NDArray[np.float64]
 
-#: Frames one `receive` can take; a cycle is seven and now and then one more.
+#: Capacity of the receive buffer, in frames; a cycle has seven frames, some cycles one more.
 _RECEIVE_BUDGET = 128
-#: Frames of one cycle at most: nineteen, now and then a slow one, and what goes wrong.
+#: Largest number of frames sent in a cycle: nineteen cyclic frames, some slow ones, emergencies and faults.
 _BATCH = 128
-#: What a command frame is when it came, and is not to be followed.
+#: Check results of a command frame that was received but must not be executed.
 _REFUSED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
 #: Longest wait [s] for the other SYNCs of a cycle once the first is there.
 _SYNC_SKEW = 200e-6
@@ -52,7 +52,7 @@ _SYNC_SKEW = 200e-6
 
 @dataclass(frozen=True)
 class EmulatorParameters:
-    """What the emulated nodes are like."""
+    """True parameters of the emulated nodes, unknown to the HAL."""
 
     drive: DriveParameters = field(default_factory=DriveParameters)
     imu: ImuParameters = field(default_factory=ImuParameters)
@@ -61,10 +61,10 @@ class EmulatorParameters:
 
 
 class Emulator:
-    """All nodes of the network but the HAL, on one body.
+    """All nodes of the network except the HAL, connected to one body.
 
-    `before_send` holds callables `(cycle, values)` that may rewrite what the nodes are about to say, called when the SYNC of that
-    cycle has come: `values` is in the order of `signals`.
+    `before_send` is a list of callables `(cycle, values)` that may change the values the nodes are about to send. They are called
+    when the SYNC of the cycle was received; `values` is in the order of `signals`.
     """
 
     def __init__(
@@ -79,17 +79,20 @@ class Emulator:
         parameters: EmulatorParameters | None = None,
         faults: Sequence[Fault] = (),
     ) -> None:
-        """Put the nodes on the bus.
+        """Connect the nodes to the bus.
 
         Args:
-            body: the mechanics; the emulator steps it, the caller closes it.
-            bus: that carries all of the network's buses; several channels come as a `JoinedBus`.
-            seed: of every random number: sensor noise and biases.
-            operator: holds the pendant; None: the pendant is somebody else's node.
-            faults: what goes wrong, and when; cycle 0 is the first.
+            network: nodes and messages of the DBC.
+            robot: joint properties that the nodes use.
+            body: mechanics of the robot; the emulator steps it, the caller closes it.
+            bus: bus that carries all buses of the network; several channels are combined by a `JoinedBus`.
+            seed: seed of all random numbers: sensor noise, biases and random faults.
+            operator: emulated operator of the pendant. None if another process runs the pendant node.
+            parameters: true parameters of the nodes. None means the default ones.
+            faults: faults to inject; their cycles count from 0.
 
         Raises:
-            FaultError: the network has no such target or signal.
+            FaultError: If the network has no such target or signal.
         """
         parameters = parameters or EmulatorParameters()
         self.network, self.body, self.bus, self.operator = network, body, bus, operator
@@ -97,7 +100,7 @@ class Emulator:
         if any(fault.kind in LINK_KINDS for fault in faults):
             self.bus = self._link = FaultyBus(bus, network, faults, lambda: self.cycle, seed=seed)
         self.cycle = 0
-        self.frames_lost = 0  # nodes' frames that the bus had no room for
+        self.frames_lost = 0  # frames of the nodes that did not fit into the transmit queue of the bus
         self.before_send: list[Callable[[int, Vector], None]] = []
         self._build_images()
         self._bind_commands()
@@ -114,7 +117,7 @@ class Emulator:
 
     @property
     def signals(self) -> Codec:
-        """Order of the values of the 1 ms messages."""
+        """Codec of the 1 ms messages, which defines the order of their values."""
         return self._tx.codec
 
     # -- construction ------------------------------------------------------------------------------------------------
@@ -126,32 +129,32 @@ class Emulator:
         sent = [m for m in network.messages if m.sender in ours]
         cyclic = [m for bus in network.buses for m in sent if m.bus == bus and m.cycle_ms == 1]
         self._tx = TransmitImage(cyclic)
-        self._sealed = False  # the frames wait for their SYNC
-        self._tag = 0  # low byte of the number of the cycle they are for: their alive counter
+        self._sealed = False  # whether the frames are sealed and wait for their SYNC
+        self._tag = 0  # alive counter of these frames: low byte of their cycle number
         self._haptics_tx = TransmitImage([network.message("HAPTICS_STATE")])
         self._heartbeats = Heartbeats(network, [m for m in sent if m.name.endswith("_STATUS")])
-        self._emergencies: list[Emergency] = []  # to be told in this cycle
+        self._emergencies: list[Emergency] = []  # to be sent in this cycle
         self._emergency_tx = TransmitImage([m for m in sent if m.name.endswith("_EMCY")])
 
-        heard = [m for m in network.sent_by("HAL") if m.cycle_ms == 1]
-        syncs = [m for m in heard if m.name.startswith("SYNC_")]
-        # As they come on an embedded bus: the commands of the last cycle, then SYNC.
-        self._rx = ReceiveImage([m for m in heard if m not in syncs] + syncs)
-        self._rx.values.fill(0.0)  # until something is commanded: no torque, motors still, a HAL that is OFF
+        received = [m for m in network.sent_by("HAL") if m.cycle_ms == 1]
+        syncs = [m for m in received if m.name.startswith("SYNC_")]
+        # In the order of an embedded bus: the commands of the previous cycle, then SYNC.
+        self._rx = ReceiveImage([m for m in received if m not in syncs] + syncs)
+        self._rx.values.fill(0.0)  # values before the first command: no torque, no vibration, HAL OFF
         self._scratch = new_frames(_RECEIVE_BUDGET)
-        self._scratch_from = [self._scratch[place:] for place in range(_RECEIVE_BUDGET)]
-        self._waiting = 0  # frames at the head of the scratch that no SYNC has followed yet
+        self._scratch_from = [self._scratch[offset:] for offset in range(_RECEIVE_BUDGET)]
+        self._waiting = 0  # frames at the start of the scratch buffer that still wait for their SYNC
 
         self._sync_rows = [self._rx.codec.rows[m.name] for m in syncs]
         self._sync_ids = {m.frame_id for m in syncs}
-        self._shares: list[Frames] = []  # what the nodes of the bus of each SYNC send
+        self._shares: list[Frames] = []  # per SYNC, the frames that the nodes of its bus send
         for sync in syncs:
             rows = [row for row, m in enumerate(cyclic) if m.bus == sync.bus]
             self._shares.append(self._tx.frames[rows[0] : rows[-1] + 1])
         self._whole = [self._tx.frames]
-        #: Of each leg, the place of its SYNC among the SYNCs.
+        #: Index of the SYNC of each leg in the list of SYNCs.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        self._answered = self._shares  # shares of the last imperfect cycle
+        self._answered = self._shares  # frames per SYNC of the last imperfect cycle
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data
         self._batch_up_to = [batch[:count] for count in range(_BATCH + 1)]
@@ -162,7 +165,7 @@ class Emulator:
         self._target = values[codec.slice("TargetTorque")]
         self._limit = values[codec.slice("MaxTorque")]
         self._level = values[codec.slice("Level")]
-        self._pendant_hears = codec.index("SYNC_RIGHT_SENSE", "HalState")
+        self._hal_state_index = codec.index("SYNC_RIGHT_SENSE", "HalState")
         self._sync_cycles = values[codec.slice("Cycle")]
         self._command_rows = [codec.rows[f"COMMAND_{side.upper()}_LEG"] for side in SIDES]
         self._senders = [Senders(self._rx.codec.messages[row]) for row in self._command_rows]
@@ -172,7 +175,7 @@ class Emulator:
 
     def _build_nodes(self, robot: Robot, parameters: EmulatorParameters) -> None:
         codec = self._tx.codec
-        #: What the signals are before noise; the nodes write into it.
+        #: Values of the signals before noise; the nodes write into this array.
         self._truth = np.zeros(codec.size)
         truth = self._truth
 
@@ -207,7 +210,7 @@ class Emulator:
     # -- bus ---------------------------------------------------------------------------------------------------------
 
     def poll(self, timeout: float = 0.0) -> bool:
-        """Take what the buses delivered and, if SYNC was in it, run one cycle.
+        """Receive frames and, if they contain SYNC, run one cycle.
 
         Args:
             timeout: longest wait for the first frame [s].
@@ -230,7 +233,14 @@ class Emulator:
         return self._imperfect_cycle(count)
 
     def _receive_rest(self, count: int) -> int:
-        """Wait until every SYNC of the cycle is there; returns 0 while there is none, and keeps what came for later."""
+        """Receive until all SYNCs of the cycle arrived or the wait timed out.
+
+        Args:
+            count: frames already in the scratch buffer.
+
+        Returns:
+            Frames in the scratch buffer. 0 if there is no SYNC among them; they are then kept for the next call.
+        """
         ids = self._scratch["can_id"]
         deadline = None
         while count < _RECEIVE_BUDGET:
@@ -249,32 +259,41 @@ class Emulator:
         return count
 
     def _imperfect_cycle(self, count: int) -> bool:
-        """Something is missing or refused: run the cycle with what is there."""
+        """Run a cycle with missing or rejected frames, and return whether one was run.
+
+        Args:
+            count: frames in the scratch buffer.
+        """
         checks = self._rx.check.tolist()
         self._judge_commands(checks, count)
-        synced = [place for place, row in enumerate(self._sync_rows) if checks[row] <= Check.SOME_LOST]
+        synced = [sync for sync, row in enumerate(self._sync_rows) if checks[row] <= Check.SOME_LOST]
         if not synced:
             return self._cycle_without_sync()
         number = int(max(self._sync_cycles[synced]))
-        if number == self._last_sync:  # the rest of a cycle that has already run
-            for leg, place in enumerate(self._leg_syncs):
-                if place in synced:
+        if number == self._last_sync:  # a late SYNC of a cycle that was already run
+            for leg, sync in enumerate(self._leg_syncs):
+                if sync in synced:
                     self.drives.find_sync(leg)
-            self._send([self._answered[place] for place in synced])
+            self._send([self._answered[sync] for sync in synced])
             return False
         self._last_sync = number
         fresh = self._commanded[0], self._commanded[1]
         self._commanded = [False] * len(SIDES)
         self._complete_answer(number)
         self._answered = [share.copy() for share in self._shares]
-        for leg, place in enumerate(self._leg_syncs):
-            if place not in synced:
+        for leg, sync in enumerate(self._leg_syncs):
+            if sync not in synced:
                 self.drives.miss_sync(leg, self.cycle)
-        self._cycle(fresh, [self._answered[place] for place in synced])
+        self._cycle(fresh, [self._answered[sync] for sync in synced])
         return True
 
     def _judge_commands(self, checks: list[int], count: int) -> None:
-        """What the drives of each leg make of their command message."""
+        """Report lost, rejected and duplicate command frames to the drives of each leg.
+
+        Args:
+            checks: check result of each received message, by row of the process image.
+            count: frames in the scratch buffer.
+        """
         for leg, row in enumerate(self._command_rows):
             check = checks[row]
             self._commanded[leg] |= check <= Check.SOME_LOST
@@ -286,7 +305,7 @@ class Emulator:
                 self.drives.hold(leg, TWO_SENDERS)
 
     def _cycle_without_sync(self) -> bool:
-        """Whether the wire lost or spoilt this cycle's SYNC: then the millisecond goes by all the same."""
+        """Run a cycle without an answer if a fault removed its SYNC, and return whether it did."""
         lost = self._link is not None and self._link.synced
         if lost:
             for leg in range(len(SIDES)):
@@ -295,7 +314,7 @@ class Emulator:
         return lost
 
     def _send(self, parts: Sequence[Frames]) -> None:
-        """All that a cycle has to say in one batch: who waits for it takes it up at once or not at all."""
+        """Send all frames of a cycle in one batch, so that the HAL receives all of them or none."""
         frames = parts[0] if len(parts) == 1 else self._gather(parts)
         try:
             self.bus.send(frames)
@@ -310,7 +329,7 @@ class Emulator:
     # -- one cycle ---------------------------------------------------------------------------------------------------
 
     def _look_ahead(self) -> None:
-        """What the sensors say in the coming cycle: known as soon as the body has moved."""
+        """Sample the sensors for the next cycle, as soon as the body has moved."""
         body = self.body
         position = body.position
         if self._node_faults is not None:
@@ -331,8 +350,12 @@ class Emulator:
         self._sealed = True
 
     def _complete_answer(self, number: int) -> None:
-        """SYNC of this cycle is there: what could not be said ahead of it."""
-        changed = self._pendant is not None and self._pendant.hear(int(self._rx.values[self._pendant_hears]))
+        """Seal the answer again if the SYNC of this cycle changed its content.
+
+        Args:
+            number: cycle number received in SYNC.
+        """
+        changed = self._pendant is not None and self._pendant.hear(int(self._rx.values[self._hal_state_index]))
         if changed or self.before_send or not self._sealed or number & 0xFF != self._tag:
             self._tag = number & 0xFF
             self._seal()
@@ -340,7 +363,14 @@ class Emulator:
         self._sealed = False
 
     def _cycle(self, fresh: tuple[bool, bool], answer: list[Frames]) -> None:
-        """Latch, send, move, look ahead: [k, k+1] is driven by the command of cycle k-1."""
+        """Latch the command, send the answer, step the body and sample the sensors.
+
+        The command of cycle k-1 acts in the interval [k, k+1].
+
+        Args:
+            fresh: per leg, whether a valid new command arrived.
+            answer: frames to send.
+        """
         drives = self.drives
         drives.command(fresh, self._controlword, self._target, self._limit)
         self._send(self._with_slow(answer))
@@ -349,7 +379,7 @@ class Emulator:
         self._look_ahead()
 
     def _with_slow(self, parts: list[Frames]) -> list[Frames]:
-        """`parts`, and the messages slower than the cycle that are due."""
+        """Return `parts` and the slow messages that are due in this cycle."""
         if self.cycle % self._haptics_cycles == 0:
             self._haptics.advance(self._level, int(self._rx.age[self._level_row]), self._haptics_cycles)
             parts = [*parts, self._haptics_tx.seal()]
@@ -373,9 +403,12 @@ class Emulator:
     # -- wall clock --------------------------------------------------------------------------------------------------
 
     def run(self, stop: Callable[[], bool]) -> None:
-        """Be the robot for another process until `stop()`, asked every millisecond or so.
+        """Run the robot for a HAL in another process.
 
-        Without SYNC for `WATCHDOG` milliseconds the drives hold by themselves, and body and heartbeats go on in real time.
+        After `WATCHDOG` milliseconds without SYNC, the drives start their local hold. Body and heartbeats continue in real time.
+
+        Args:
+            stop: returns True to end the run; called about once per millisecond.
         """
         alone_from = time.monotonic() + WATCHDOG * PERIOD
         while not stop():
@@ -389,13 +422,13 @@ class Emulator:
                 alone_from += PERIOD
 
     def idle(self) -> None:
-        """One millisecond without a HAL: the nodes say nothing but their heartbeat, and enabled drives hold."""
+        """Run one millisecond without a HAL: enabled drives hold, and the nodes send only heartbeats and emergencies."""
         for leg in range(len(SIDES)):
             self.drives.hold(leg, LIFE_GUARD)
         self._alone()
 
     def _alone(self) -> None:
-        """One millisecond in which no node can answer."""
+        """Run one millisecond in which no node receives SYNC, and so no node answers."""
         drives = self.drives
         self._rx.new_cycle()
         drives.command((False, False), self._controlword, self._target, self._limit)

@@ -1,4 +1,4 @@
-"""The twelve motor encoders: joint positions in, counts, and what the state frames say of position and velocity."""
+"""Twelve emulated motor encoders: joint positions in, counts and the position and velocity of the state frames out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from atalante_hal.robot import JOINTS, Robot
 
 Vector = npt.NDArray[np.float64]
 
-COUNTS = 131072  # encoder counts a motor turn, 17 bits
+COUNTS = 131072  # encoder counts per motor turn, 17 bits
 LSB = 2.0 * math.pi / COUNTS  # rad at the motor
 
 
@@ -26,7 +26,7 @@ def _sample(
     position: Vector,
     velocity: Vector,
 ) -> None:
-    """Counts of all encoders, and position and velocity as the state frames say them. Shape (12,) each."""
+    """Compute the counts of all encoders and the position and velocity of the state frames. Shape (12,) each."""
     for i in range(len(joint)):
         count = np.rint(joint[i] * counts_per_rad[i])
         before[i] = count if math.isnan(counts[i]) else counts[i]
@@ -36,32 +36,43 @@ def _sample(
 
 
 class Encoders:
-    """Encoders of all joints; `position` [rad] and `velocity` [rad/s] at the motor, shape (12,), rewritten by `sample`."""
+    """Encoders of all joints; `sample` rewrites the given arrays of position and velocity."""
 
     def __init__(self, robot: Robot, bandwidth: float, position: Vector, velocity: Vector) -> None:
-        """`bandwidth` of the velocity estimate [Hz]."""
+        """Connect the encoders to the signals of the state frames.
+
+        Args:
+            robot: gear ratio and polarity of each joint.
+            bandwidth: cut-off frequency of the velocity low-pass [Hz].
+            position: array that receives the motor positions, shape (12,) [rad].
+            velocity: array that receives the motor velocities, shape (12,) [rad/s].
+        """
         self._counts_per_rad = robot.gear * robot.polarity * (COUNTS / (2.0 * math.pi))
         self._keep = math.exp(-2.0 * math.pi * bandwidth * PERIOD)
         self._counts, self._before = np.zeros((2, len(JOINTS)))
         self._position, self._velocity = position, velocity
         self._sample = compiled(_sample)
-        self.sample(np.zeros(len(JOINTS)))  # is compiled now, not in the first cycle
-        self._counts.fill(math.nan)  # there was no sample yet
+        self.sample(np.zeros(len(JOINTS)))  # the first call compiles the kernel, which would be too slow within a cycle
+        self._counts.fill(math.nan)  # no sample yet
 
     def sample(self, position: Vector) -> None:
-        """Read the encoders. Joint position [rad], shape (12,)."""
+        """Read the encoders; call once per `PERIOD`.
+
+        Args:
+            position: true joint positions, shape (12,) [rad].
+        """
         self._sample(
             position, self._counts_per_rad, self._keep, self._counts, self._before, self._position, self._velocity
         )
 
     @property
     def angle(self) -> Vector:
-        """Joint position as counted, shape (12,) [rad]."""
+        """Joint position with the resolution of the counts, shape (12,) [rad]."""
         angle: Vector = self._counts / self._counts_per_rad
         return angle
 
     @property
     def speed(self) -> Vector:
-        """Joint velocity, the bare difference of counts: for a loop inside the drive, which the filter would be too late for."""
+        """Joint velocity as unfiltered difference of counts, shape (12,) [rad/s]; for the control loop inside the drive."""
         speed: Vector = (self._counts - self._before) / (self._counts_per_rad * PERIOD)
         return speed

@@ -1,6 +1,6 @@
-"""PyBullet's own dynamics of a URDF: the second witness for the model that Pinocchio and the gaits are made with.
+"""Rigid-body dynamics of a URDF as PyBullet computes them, an independent check of the Pinocchio model of the gaits.
 
-`URDF -> mass matrix, gravity, inverse dynamics, centre of mass`. Nothing of the emulator runs on it.
+`URDF -> mass matrix, gravity, inverse dynamics, centre of mass`. The emulator itself does not use it.
 """
 
 from __future__ import annotations
@@ -20,18 +20,21 @@ Pose = tuple[Sequence[float], Sequence[float]]  # position [m], quaternion xyzw
 
 
 class EngineDynamics(Closing):
-    """One robot in PyBullet, hanging by its pelvis; a context manager. Joints are in the order of `JOINTS`."""
+    """Robot in PyBullet with a fixed pelvis, as a context manager. Joints are in the order of `JOINTS`."""
 
     def __init__(self, urdf: str) -> None:
-        """Load the text.
+        """Load the URDF.
+
+        Args:
+            urdf: text of the URDF, not a path.
 
         Raises:
-            ValueError: the text is no URDF, or lacks a joint.
+            ValueError: If the text is not a URDF, or a joint is missing.
         """
         self._client = pybullet.connect(pybullet.DIRECT)
         try:
             self._body = load_urdf(urdf, self._client)
-            self._free = load_urdf(urdf, self._client, fixed=False)  # a base held fixed reports no mass
+            self._free = load_urdf(urdf, self._client, fixed=False)  # PyBullet reports no mass for a fixed base
         except ValueError:
             self.close()
             raise
@@ -43,54 +46,84 @@ class EngineDynamics(Closing):
         moving = [info[1].decode() for info in infos if info[2] == pybullet.JOINT_REVOLUTE]
         if missing := [name for name in JOINTS if name not in moving]:
             self.close()
-            raise ValueError(f"the URDF lacks joint {missing[0]}; it needs {', '.join(JOINTS)}")
-        self._order = [moving.index(name) for name in JOINTS]  # of the engine's vectors
-        self._rows = [[info[1].decode() for info in infos].index(name) for name in JOINTS]  # of its joints
+            raise ValueError(f"the URDF must have the joints {', '.join(JOINTS)}, but {missing[0]} is missing")
+        self._order = [moving.index(name) for name in JOINTS]  # indices into PyBullet's joint vectors
+        self._rows = [[info[1].decode() for info in infos].index(name) for name in JOINTS]  # PyBullet joint numbers
         self._links = range(len(infos))
         dynamics = [
             pybullet.getDynamicsInfo(self._free, row, physicsClientId=self._client) for row in (-1, *self._links)
         ]
         self._base_from_inertial: Pose = dynamics[0][3], dynamics[0][4]
         root = pybullet.getBodyInfo(self._body, physicsClientId=self._client)[0].decode()
-        #: Mass of every link [kg].
+        #: Mass of every link by its name [kg].
         self.masses = {
             name: float(info[0])
             for name, info in zip((root, *(info[12].decode() for info in infos)), dynamics, strict=True)
         }
 
     def close(self) -> None:
-        """Disconnect from the engine."""
+        """Disconnect from PyBullet."""
         if pybullet.isConnected(self._client):
             pybullet.disconnect(self._client)
 
     def inverse_dynamics(self, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-        """Joint torques of a motion with the pelvis held. Shapes (12,) [rad, rad/s, rad/s2] to (12,) [Nm]."""
+        """Return the joint torques of a motion with a fixed pelvis.
+
+        Args:
+            q: joint positions, shape (12,) [rad].
+            qd: joint velocities, shape (12,) [rad/s].
+            qdd: joint accelerations, shape (12,) [rad/s2].
+
+        Returns:
+            Joint torques, shape (12,) [Nm].
+        """
         state = np.zeros((3, len(JOINTS)))
         state[:, self._order] = q, qd, qdd
         torque = pybullet.calculateInverseDynamics(self._body, *state.tolist(), physicsClientId=self._client)
         return np.array(torque)[self._order]
 
     def gravity(self, q: Vector) -> Vector:
-        """Torques that hold a pose still. Shape (12,) [rad] to (12,) [Nm]."""
+        """Return the joint torques that keep a pose at rest.
+
+        Args:
+            q: joint positions, shape (12,) [rad].
+
+        Returns:
+            Joint torques, shape (12,) [Nm].
+        """
         still = np.zeros_like(q)
         return self.inverse_dynamics(q, still, still)
 
     def mass_matrix(self, q: Vector) -> Vector:
-        """Shape (12,) [rad] to (12, 12) [kg m2]."""
+        """Return the joint-space mass matrix of a pose.
+
+        Args:
+            q: joint positions, shape (12,) [rad].
+
+        Returns:
+            Mass matrix, shape (12, 12) [kg m2].
+        """
         pose = np.zeros_like(q)
         pose[self._order] = q
         matrix = np.array(pybullet.calculateMassMatrix(self._body, pose.tolist(), physicsClientId=self._client))
         return np.asarray(matrix[np.ix_(self._order, self._order)])
 
     def centre_of_mass(self, q: Vector) -> Vector:
-        """In the frame of the pelvis. Shape (12,) [rad] to (3,) [m]."""
+        """Return the centre of mass of a pose in the pelvis frame.
+
+        Args:
+            q: joint positions, shape (12,) [rad].
+
+        Returns:
+            Centre of mass, shape (3,) [m].
+        """
         for row, angle in zip(self._rows, q.tolist(), strict=True):
             pybullet.resetJointState(self._free, row, angle, physicsClientId=self._client)
         root = pybullet.getBasePositionAndOrientation(self._free, physicsClientId=self._client)
         states = pybullet.getLinkStates(self._free, self._links, 0, 1, physicsClientId=self._client)
         masses = np.array(list(self.masses.values()))
         centre = masses @ np.array([root[0], *(state[0] for state in states)]) / masses.sum()
-        # The engine's frame of a base is that of its principal axes of inertia.
+        # PyBullet gives the base pose in the frame of its principal axes of inertia, not in the link frame.
         unturned = [0.0, 0.0, 0.0, 1.0]
         in_root = pybullet.multiplyTransforms(*pybullet.invertTransform(*root), centre.tolist(), unturned)[0]
         return np.array(pybullet.multiplyTransforms(*self._base_from_inertial, in_root, unturned)[0])

@@ -1,9 +1,9 @@
-"""What can go wrong, as data: a `Fault` is a kind, a target, when, and a few numbers.
+"""Injectable faults as data: a `Fault` has a kind, a target, a start, a duration and parameters.
 
-    Fault -> link (frames on the wire) or nodes (what is inside them) -> emulator
+    Fault -> link (frames on the wire) or node_faults (inside the nodes) -> emulator
 
-A fault is checked when it is made, against what its kind takes, and again when it is put on a network, against the names there
-are. All are the emulator's: the HAL never knows that a fault is a staged one.
+The constructor checks a fault against the parameters of its kind; the emulator checks it against the names of the network.
+All faults act inside the emulator, so the HAL cannot distinguish them from real ones.
 """
 
 from __future__ import annotations
@@ -22,43 +22,43 @@ Value = float | int | str
 
 
 class FaultError(ValueError):
-    """No such fault; one sentence that says what is valid."""
+    """Invalid fault; the message lists the valid values."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number or name a kind of fault takes; `default` None: it has to be given."""
+    """Parameter of a kind of fault."""
 
-    valid: str  # what a message says is valid
-    holds: Callable[[Any], bool]
-    default: Value | None = None
+    valid: str  # description of the valid values, for error messages
+    holds: Callable[[Any], bool]  # returns whether a value is valid
+    default: Value | None = None  # None: the parameter is required
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What faults of one kind have in common."""
+    """Definition of a kind of fault."""
 
-    does: str  # one line for a list of kinds
-    targets: str  # message, node, bus, or a kind of node: what a target may name
-    parameters: Mapping[str, Parameter] = field(default_factory=dict)
-    signals: bool = False  # takes signals of the target's message as further parameters
+    does: str  # description in one line
+    targets: str  # types of valid targets: message, node, bus, or a type of node
+    parameters: Mapping[str, Parameter] = field(default_factory=dict)  # by name
+    signals: bool = False  # whether signals of the target message are further parameters
 
 
 def _number(low: float, high: float, unit: str = "", *, default: float | None = None) -> Parameter:
-    """A number in [low, high]."""
+    """Return a parameter that is a number in [low, high]."""
     text = f"a number from {low:g} to {high:g}" + (f" {unit}" if unit else "")
     return Parameter(text, lambda value: _is_number(value) and low <= value <= high, default)
 
 
 def _whole(low: int, high: int, *, default: int | None = None) -> Parameter:
-    """A whole number in [low, high]."""
+    """Return a parameter that is an integer in [low, high]."""
     return Parameter(
-        f"a whole number from {low} to {high}", lambda value: type(value) is int and low <= value <= high, default
+        f"an integer from {low} to {high}", lambda value: type(value) is int and low <= value <= high, default
     )
 
 
 def _fd_length(*, default: int | None = None) -> Parameter:
-    text = f"a length CAN FD can carry, {', '.join(map(str, FD_LENGTHS))}"
+    text = f"a CAN FD payload length in bytes: {', '.join(map(str, FD_LENGTHS))}"
     return Parameter(text, lambda value: type(value) is int and value in FD_LENGTHS, default)
 
 
@@ -72,34 +72,40 @@ def _choice(names: Sequence[str]) -> Parameter:
 
 _P = _number(0.0, 1.0, default=1.0)
 _MESSAGE = Parameter("the name of a message", lambda value: isinstance(value, str))
-#: Target that is no node: what feeds all drives.
+#: Target of the supply faults of all drives; it is not a node.
 BATTERY: Final = "battery"
 _SUPPLIED: Final = f"drive or {BATTERY}"
-_PLACES: Final = "message, node or bus"
+_ANY_TARGET: Final = "message, node or bus"
 
-#: Faults of the wire. `p` is the chance of each frame to be hit.
+#: Communication faults. `p` is the probability that a frame is affected.
 LINK_KINDS: Final[Mapping[str, Kind]] = {
-    "drop": Kind("frames are lost", _PLACES, {"p": _P}),
-    "duplicate": Kind("frames come more than once", _PLACES, {"p": _P, "copies": _whole(1, 16, default=1)}),
-    "delay": Kind("frames come `by` cycles late", _PLACES, {"p": _P, "by": _whole(1, 1000, default=1)}),
-    "reorder": Kind("of two frames of a message the later comes first, both in the later's cycle", _PLACES),
-    "flip": Kind("random bits of the payload are turned over", _PLACES, {"p": _P, "bits": _whole(1, 512, default=1)}),
-    "freeze_counter": Kind("the alive counter stands still under a right CRC", _PLACES),
-    "masquerade": Kind("sealed with the Data ID of the message `like`", _PLACES, {"p": _P, "like": _MESSAGE}),
-    "length": Kind(
-        "another length, cut or filled with 0, under a right CRC", _PLACES, {"p": _P, "bytes": _fd_length()}
+    "drop": Kind("frames are lost", _ANY_TARGET, {"p": _P}),
+    "duplicate": Kind("frames are repeated", _ANY_TARGET, {"p": _P, "copies": _whole(1, 16, default=1)}),
+    "delay": Kind("frames arrive `by` cycles late", _ANY_TARGET, {"p": _P, "by": _whole(1, 1000, default=1)}),
+    "reorder": Kind("pairs of frames of a message arrive in reverse order, in the cycle of the second", _ANY_TARGET),
+    "flip": Kind("random bits of the payload are inverted", _ANY_TARGET, {"p": _P, "bits": _whole(1, 512, default=1)}),
+    "freeze_counter": Kind("the alive counter does not change, the CRC is correct", _ANY_TARGET),
+    "masquerade": Kind(
+        "frames have a CRC with the Data ID of the message `like`", _ANY_TARGET, {"p": _P, "like": _MESSAGE}
     ),
-    "flags": Kind("other frame flags; without FDF cut to 8 bytes", _PLACES, {"p": _P, "flags": _whole(0, 7)}),
-    "value": Kind("signals have other values, under a right CRC", "message", {"p": _P}, signals=True),
-    "raw": Kind("signals have other raw codes, under a right CRC", "message", {"p": _P}, signals=True),
+    "length": Kind(
+        "frames have another length, cut or padded with 0, with a correct CRC",
+        _ANY_TARGET,
+        {"p": _P, "bytes": _fd_length()},
+    ),
+    "flags": Kind(
+        "frames have other flags; without FDF they are cut to 8 bytes", _ANY_TARGET, {"p": _P, "flags": _whole(0, 7)}
+    ),
+    "value": Kind("signals have other values, with a correct CRC", "message", {"p": _P}, signals=True),
+    "raw": Kind("signals have other raw codes, with a correct CRC", "message", {"p": _P}, signals=True),
     "inject": Kind(
-        "a second sender: the last frame with other signals, its counter `ahead`, `count` a cycle, before the true one",
+        "a second sender sends the last frame with other signals and its counter plus `ahead`, `count` times per cycle",
         "message",
         {"count": _whole(1, 64, default=1), "ahead": _whole(0, 255, default=1)},
         signals=True,
     ),
     "foreign": Kind(
-        "frames that are no message of the network, `count` a cycle, before all others",
+        "frames with an identifier outside the network arrive, `count` per cycle, before all others",
         "bus",
         {
             "can_id": _whole(0, 0x1FFF_FFFF),
@@ -107,11 +113,13 @@ LINK_KINDS: Final[Mapping[str, Kind]] = {
             "count": _whole(1, 64, default=1),
         },
     ),
-    "silence": Kind("a node says nothing", "node"),
-    "heartbeat_lost": Kind("a node sends its state, but no status", "node"),
-    "reset": Kind("a node is off, then begins anew with a boot-up heartbeat; a drive brakes meanwhile", "node"),
+    "silence": Kind("a node sends nothing", "node"),
+    "heartbeat_lost": Kind("a node sends no status message, but its other messages", "node"),
+    "reset": Kind(
+        "a node is off, then restarts with a boot-up heartbeat; a drive that is off brakes its joint", "node"
+    ),
     "flood": Kind(
-        "somebody babbles: frames of one identifier take a share of the bus's time from all that are less urgent",
+        "frames of one identifier flood a bus and take a share of its time from all lower priorities",
         "bus",
         {
             "can_id": _whole(0, 0x7FF, default=0),
@@ -122,49 +130,57 @@ LINK_KINDS: Final[Mapping[str, Kind]] = {
     "error_frame": Kind(
         "the HAL's controller reports errors (class bits of linux/can/error.h)", "bus", {"error": _whole(1, 0x1FF)}
     ),
-    "bus_off": Kind("the HAL's controller goes bus-off: one error frame, then neither sends nor receives", "bus"),
+    "bus_off": Kind(
+        "the HAL's controller goes bus-off: it reports one error frame, then neither sends nor receives", "bus"
+    ),
 }
 
 #: Faults inside the nodes.
 NODE_KINDS: Final[Mapping[str, Kind]] = {
     "reset": LINK_KINDS["reset"],
     "emergency": Kind(
-        "a node tells an error and, being a drive, does what it does about its class",
+        "a node reports an error; a drive also starts the reaction to that class of error",
         "node",
         {"code": _whole(1, 0xFFFF)},
     ),
     "leave_operation": Kind(
-        "a drive goes to a state unasked, every cycle",
+        "a drive enters a state without a command, in every cycle",
         "drive",
         {"state": _choice([state.name for state in DriveState])},
     ),
-    "push": Kind("somebody pushes: an external torque on a joint", "drive", {"torque": _number(-500.0, 500.0, "Nm")}),
-    "torque_weak": Kind("a motor makes a share of the torque it measures", "drive", {"share": _number(0.0, 1.0)}),
-    "over_temperature": Kind("a drive is this hot", "drive", {"degrees": _number(-40.0, 214.0, "degC")}),
+    "push": Kind("an external torque acts on a joint", "drive", {"torque": _number(-500.0, 500.0, "Nm")}),
+    "torque_weak": Kind(
+        "a motor produces only a share of the torque it measures", "drive", {"share": _number(0.0, 1.0)}
+    ),
+    "over_temperature": Kind("a drive has a given temperature", "drive", {"degrees": _number(-40.0, 214.0, "degC")}),
     "heat_ramp": Kind(
-        "a drive grows hotter",
+        "the temperature of a drive rises at a given rate up to a limit",
         "drive",
         {"rate": _number(0.0, 1e5, "K/s"), "up_to": _number(-40.0, 214.0, "degC", default=214.0)},
     ),
     "under_voltage": Kind(
-        "the supply of one drive or of all is this low", _SUPPLIED, {"volts": _number(0.0, 60.0, "V")}
+        "one drive or all drives have a given supply voltage", _SUPPLIED, {"volts": _number(0.0, 60.0, "V")}
     ),
     "battery_removed": Kind(
-        "the drives live on the charge of the DC link", BATTERY, {"capacity": _number(1e-3, 10.0, "F", default=0.1)}
+        "the drives run on the charge of the DC link", BATTERY, {"capacity": _number(1e-3, 10.0, "F", default=0.1)}
     ),
-    "encoder_stuck": Kind("an encoder shows the joint where it was", "drive"),
-    "encoder_jump": Kind("an encoder is off by an angle of the joint", "drive", {"by": _number(-7.0, 7.0, "rad")}),
-    "encoder_drift": Kind("an encoder goes off", "drive", {"rate": _number(-10.0, 10.0, "rad/s of the joint")}),
-    "dbc_hash": Kind("a node reports another network", "node", {"hash": _whole(0, 0xFFFF_FFFF, default=0xDEADBEEF)}),
+    "encoder_stuck": Kind("an encoder keeps reporting the position at the start of the fault", "drive"),
+    "encoder_jump": Kind("an encoder has a constant error", "drive", {"by": _number(-7.0, 7.0, "rad")}),
+    "encoder_drift": Kind(
+        "the error of an encoder grows", "drive", {"rate": _number(-10.0, 10.0, "rad/s of the joint")}
+    ),
+    "dbc_hash": Kind(
+        "a node reports the hash of another DBC", "node", {"hash": _whole(0, 0xFFFF_FFFF, default=0xDEADBEEF)}
+    ),
 }
 
-#: Faults of what sensors say, noise and all.
+#: Faults of the values that sensors send; they replace noise as well.
 SENSOR_KINDS: Final[Mapping[str, Kind]] = {
-    "imu_invalid": Kind("an IMU sends the invalid code for all it measures", "imu"),
-    "imu_saturated": Kind("gyroscope and accelerometer stand at the end of their range", "imu"),
-    "imu_frozen": Kind("an IMU says the same again and again, with a live counter", "imu"),
+    "imu_invalid": Kind("an IMU sends the invalid code in all measured signals", "imu"),
+    "imu_saturated": Kind("gyroscope and accelerometer report the end of their range", "imu"),
+    "imu_frozen": Kind("an IMU repeats its last values, with a running counter", "imu"),
     "cell_stuck": Kind(
-        "a force cell reads this vertically; 0 is a dead one",
+        "a force cell reports a constant vertical force; 0 is a dead cell",
         "foot",
         {"cell": _choice(CELLS), "force": _number(-3000.0, 3000.0, "N", default=0.0)},
     ),
@@ -175,9 +191,9 @@ KINDS: Final[Mapping[str, Kind]] = {**LINK_KINDS, **NODE_KINDS, **SENSOR_KINDS}
 
 @dataclass(frozen=True, init=False)
 class Fault:
-    """A fault of one kind, from cycle `start` of the emulator on, for `cycles` cycles; None: for good.
+    """Fault of one kind, from cycle `start` of the emulator, for `cycles` cycles; None: permanent.
 
-    Parameters of its kind, and for kinds that take signals those of the message, are given by name:
+    Parameters of the kind, and signals of the message for kinds that take them, are keyword arguments:
     `Fault("drop", "LEFT_SK_STATE", 1000, 5)`, `Fault("value", "LEFT_SK_STATE", 1000, 1, Position=0.3)`.
     """
 
@@ -185,20 +201,27 @@ class Fault:
     target: str
     start: int
     cycles: int | None
-    parameters: tuple[tuple[str, Value], ...]  # all there are, by name
+    parameters: tuple[tuple[str, Value], ...]  # (name, value), with defaults
 
     def __init__(self, kind: str, target: str, start: int = 0, cycles: int | None = None, **parameters: Value) -> None:
         """Make a fault.
 
+        Args:
+            kind: name of the kind, a key of `KINDS`.
+            target: name of a message, node or bus.
+            start: first cycle of the fault.
+            cycles: duration in cycles. None means permanent.
+            **parameters: parameters of the kind and signals of the message.
+
         Raises:
-            FaultError: unknown kind or parameter, or a value that is not valid; says what is.
+            FaultError: If the kind or a parameter is unknown, or a value is invalid.
         """
         if kind not in KINDS:
-            raise FaultError(f"no fault {kind!r}; there are {', '.join(KINDS)}")
+            raise FaultError(f"the kind of fault must be one of {', '.join(KINDS)}, got {kind!r}")
         if type(start) is not int or start < 0:
-            raise FaultError(f"a fault starts in cycle 0 or later, not {start!r}")
+            raise FaultError(f"the start of a fault must be an integer from 0 [cycles], got {start!r}")
         if cycles is not None and (type(cycles) is not int or cycles < 1):
-            raise FaultError(f"a fault lasts 1 cycle or longer, or None for good, not {cycles!r}")
+            raise FaultError(f"the duration of a fault must be an integer from 1 [cycles], or None, got {cycles!r}")
         for name, value in (
             ("kind", kind),
             ("target", target),
@@ -209,96 +232,114 @@ class Fault:
             object.__setattr__(self, name, value)
 
     def __getitem__(self, name: str) -> Any:
-        """A parameter, as given or its default."""
+        """Return the value of a parameter."""
         return dict(self.parameters)[name]
 
     @property
     def end(self) -> float:
-        """First cycle after it."""
+        """First cycle after the fault, infinity for a permanent one."""
         return math.inf if self.cycles is None else self.start + self.cycles
 
     @property
     def signals(self) -> dict[str, float]:
-        """Signals it sets, by name."""
+        """Values of the signals the fault sets, by signal name."""
         known = KINDS[self.kind].parameters
         return {name: float(value) for name, value in self.parameters if name not in known}
 
     def starting(self, cycle: int) -> Fault:
-        """The same fault from another cycle on."""
+        """Return the same fault with another first cycle.
+
+        Args:
+            cycle: first cycle of the new fault.
+        """
         parameters: Any = dict(self.parameters)
         return Fault(self.kind, self.target, cycle, self.cycles, **parameters)
 
     def __str__(self) -> str:
-        """As one would type it."""
+        """Return kind, target and parameters as text."""
         return " ".join([self.kind, self.target, *(f"{name}={value}" for name, value in self.parameters)])
 
 
 def _checked(kind: str, given: Mapping[str, Value]) -> tuple[tuple[str, Value], ...]:
-    """The parameters of a fault, defaults filled in."""
+    """Check the parameters of a fault and return them with the defaults filled in."""
     rule = KINDS[kind]
     known = rule.parameters
     for name, value in given.items():
         if name in known:
             if not known[name].holds(value):
-                raise FaultError(f"{kind}: {name} is {known[name].valid}, not {value!r}")
+                raise FaultError(f"{kind}: {name} must be {known[name].valid}, got {value!r}")
         elif not rule.signals:
-            raise FaultError(f"{kind}: no parameter {name!r}; there are {', '.join(known) or 'none'}")
+            raise FaultError(f"{kind}: unknown parameter {name!r}; valid parameters: {', '.join(known) or 'none'}")
         elif not _is_number(value):
-            raise FaultError(f"{kind}: signal {name} is a finite number, not {value!r}")
+            raise FaultError(f"{kind}: signal {name} must be a finite number, got {value!r}")
     for name, parameter in known.items():
         if name not in given and parameter.default is None:
-            raise FaultError(f"{kind}: {name} has to be given, {parameter.valid}")
+            raise FaultError(f"{kind}: {name} is required, and must be {parameter.valid}")
     defaults = {name: parameter.default for name, parameter in known.items() if parameter.default is not None}
     if kind in ("value", "raw") and not given.keys() - known.keys():
-        raise FaultError(f"{kind}: name a signal of the message and what it is, as Position=0.3")
+        raise FaultError(f"{kind}: at least one signal of the message must be given, such as Position=0.3")
     return tuple({**defaults, **given}.items())
 
 
 def messages_of(fault: Fault, network: Network) -> tuple[Message, ...]:
-    """The messages a fault of the wire is about: itself, what a node sends, or all of a bus.
+    """Return the messages that a communication fault affects.
+
+    Args:
+        fault: communication fault. Its target is a message, a node (all messages it sends) or a bus (all its messages).
+        network: nodes and messages of the DBC.
 
     Raises:
-        FaultError: the network has no such message, node, bus or signal; names those there are.
+        FaultError: If the network has no such message, node, bus or signal.
     """
     wanted = LINK_KINDS[fault.kind].targets
-    places: dict[str, tuple[Message, ...]] = {}
+    targets: dict[str, tuple[Message, ...]] = {}
     if "message" in wanted:
-        places |= {message.name: (message,) for message in network.messages}
+        targets |= {message.name: (message,) for message in network.messages}
     if fault.kind == "heartbeat_lost":
-        places = {m.sender: (m,) for m in network.messages if m.name.endswith("_STATUS")}
+        targets = {m.sender: (m,) for m in network.messages if m.name.endswith("_STATUS")}
     elif "node" in wanted:
-        places |= {node.name: network.sent_by(node.name) for node in network.nodes}
+        targets |= {node.name: network.sent_by(node.name) for node in network.nodes}
     if "bus" in wanted:
-        places |= {bus: tuple(m for m in network.messages if m.bus == bus) for bus in network.buses}
-    _check_target(fault, wanted, list(places))
-    messages = places[fault.target]
+        targets |= {bus: tuple(m for m in network.messages if m.bus == bus) for bus in network.buses}
+    _check_target(fault, wanted, list(targets))
+    messages = targets[fault.target]
     if "like" in dict(fault.parameters) and fault["like"] not in (known := [m.name for m in network.messages]):
-        raise FaultError(f"{fault.kind}: like is a message, not {fault['like']!r}; there are {', '.join(known)}")
+        raise FaultError(
+            f"{fault.kind}: like must be a message, got {fault['like']!r}; valid messages: {', '.join(known)}"
+        )
     for signal in fault.signals:
         if signal not in (known := [s.name for s in messages[0].signals]):
-            raise FaultError(f"{fault.kind}: no signal {signal!r} in {fault.target}; there are {', '.join(known)}")
+            raise FaultError(
+                f"{fault.kind}: unknown signal {signal!r} of {fault.target}; valid signals: {', '.join(known)}"
+            )
     return messages
 
 
 def nodes_of(fault: Fault, network: Network) -> tuple[str, ...]:
-    """The nodes a fault inside nodes is about; of the battery: all drives.
+    """Return the nodes that a node or sensor fault affects; a fault of the battery affects all drives.
+
+    Args:
+        fault: node or sensor fault.
+        network: nodes and messages of the DBC.
 
     Raises:
-        FaultError: the network has no such node of the kind it takes; names those there are.
+        FaultError: If the network has no such node of the type that the fault needs.
     """
     wanted = KINDS[fault.kind].targets
     drives = tuple(node.name for node in network.of_kind("drive"))
-    places: dict[str, tuple[str, ...]] = {
+    targets: dict[str, tuple[str, ...]] = {
         node.name: (node.name,)
         for node in network.nodes
         if node.kind in wanted or (wanted == "node" and node.kind != "master")
     }
     if BATTERY in wanted:
-        places[BATTERY] = drives
-    _check_target(fault, wanted, list(places))
-    return places[fault.target]
+        targets[BATTERY] = drives
+    _check_target(fault, wanted, list(targets))
+    return targets[fault.target]
 
 
-def _check_target(fault: Fault, wanted: str, places: Sequence[str]) -> None:
-    if fault.target not in places:
-        raise FaultError(f"{fault.kind}: {fault.target!r} is no {wanted}; there are {', '.join(places)}")
+def _check_target(fault: Fault, wanted: str, targets: Sequence[str]) -> None:
+    if fault.target not in targets:
+        raise FaultError(
+            f"{fault.kind}: target must be of type {wanted}, got {fault.target!r}; valid targets: {', '.join(targets)}"
+        )

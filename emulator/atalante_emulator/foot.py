@@ -1,4 +1,4 @@
-"""The two feet: what each of their four three-axis force cells feels, in the foot's own frame, with noise."""
+"""Two emulated feet with four three-axis force cells each: contact forces in, noisy cell forces in the foot frame out."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ Vector = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FootParameters:
-    """Noise of the emulated force cells at 1 kHz."""
+    """Noise and temperature of the emulated force cells at 1 kHz."""
 
     noise: tuple[float, float, float] = (3.0, 3.0, 10.0)  # N rms along x, y, z of a cell
     temperature: float = 28.0  # degC
 
 
 class Feet:
-    """Eight force cells. `force` is shape (2, 4, 3) [N], on the foot, and rewritten by `sample`."""
+    """Eight force cells; `sample` rewrites their forces on the foot, shape (2, 4, 3) [N]."""
 
     def __init__(self, parameters: FootParameters, force: Vector) -> None:
         self._force = force
@@ -30,11 +30,11 @@ class Feet:
         self._loaded = True
 
     def sample(self, contact: Sequence[tuple[int, int, Vector3]], rotation: Sequence[tuple[float, ...]]) -> None:
-        """Read the cells.
+        """Read the cells; call once per `PERIOD`.
 
         Args:
-            contact: foot, cell and world force on the foot [N] of every contact of the last step.
-            rotation: quaternion xyzw of each foot, foot frame to world.
+            contact: per contact of the last step: index of the foot, index of the cell, force on the foot in world axes [N].
+            rotation: attitude of each foot, quaternion xyzw from the foot frame to the world.
         """
         if not contact:
             if self._loaded:
@@ -47,15 +47,25 @@ class Feet:
             self._force[foot, cell] += into_frame(rotation[foot], force)
 
     def draw_noise(self, generator: np.random.Generator, out: Vector) -> None:
-        """Noise of many cycles. Shape (cycles, 24) [N], order of `force`."""
+        """Draw the noise of many cycles.
+
+        Args:
+            generator: source of the random numbers.
+            out: array that receives the noise, shape (cycles, 24) [N], in the order of the forces.
+        """
         np.multiply(generator.standard_normal(out.shape), self._scale, out=out)
 
 
 def into_frame(rotation: tuple[float, ...], vector: Vector3) -> Vector3:
-    """A world vector in the axes of a frame whose quaternion xyzw (frame to world) is `rotation`."""
+    """Return a vector in the axes of a frame.
+
+    Args:
+        rotation: attitude of the frame, quaternion xyzw from the frame to the world.
+        vector: vector in world axes.
+    """
     x, y, z, w = rotation
     vx, vy, vz = vector
-    # v' = v - 2 w (u x v) + 2 u x (u x v), the inverse rotation.
+    # Inverse rotation: v' = v - 2 w (u x v) + 2 u x (u x v).
     cx, cy, cz = y * vz - z * vy, z * vx - x * vz, x * vy - y * vx
     return (
         vx - 2.0 * (w * cx - (y * cz - z * cy)),

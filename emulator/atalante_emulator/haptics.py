@@ -1,4 +1,4 @@
-"""The haptics node: eight vibration motors that follow the commanded level with a first-order lag."""
+"""Emulated haptics node: eight vibration motors that follow the commanded level with a first-order lag."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ WATCHDOG = 50
 
 @dataclass(frozen=True)
 class HapticsParameters:
-    """Response of the emulated vibration motors."""
+    """Time response of the emulated vibration motors."""
 
     rise_time: float = 0.04  # s, time constant of a small eccentric-mass motor
 
 
 class Haptics:
-    """Eight motors. `amplitude` is shape (8,), 0 to 1."""
+    """Eight vibration motors; `advance` rewrites `amplitude`, shape (8,), 0 to 1."""
 
     def __init__(self, parameters: HapticsParameters, amplitude: Vector) -> None:
         self.amplitude = amplitude
         self._parameters = parameters
 
     def advance(self, level: Vector, silence: int, cycles: int) -> None:
-        """Let the motors follow a level held for some `PERIOD`s: a' = (level - a) / rise_time, solved exactly.
+        """Advance the amplitudes towards a constant level: a' = (level - a) / rise_time, solved exactly.
 
         Args:
-            level: last valid command, shape (8,).
-            silence: cycles since that command came.
-            cycles: how many `PERIOD`s to advance.
+            level: last valid command, shape (8,), 0 to 1.
+            silence: age of that command, in cycles.
+            cycles: time to advance, in units of `PERIOD`.
         """
         lag = math.exp(-cycles * PERIOD / self._parameters.rise_time)
         self.amplitude *= lag

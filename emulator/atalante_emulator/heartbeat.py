@@ -1,4 +1,4 @@
-"""The slow status of every node: one BOOTUP when it begins, then OPERATIONAL, each node in its own cycle of the period."""
+"""Heartbeats of the emulated nodes: a status message with BOOTUP after a start, then with OPERATIONAL in every period."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from atalante_emulator.body import PERIOD
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import TransmitImage
 
-#: Node states, as CiA 301 heartbeat values.
+#: Node states of the CiA 301 heartbeat.
 BOOTUP: Final = 0
 OPERATIONAL: Final = 5
 _FIRMWARE_VERSION: Final = 0x0100
@@ -20,11 +20,11 @@ _SUPPLY_VOLTAGE: Final = 48.0  # V
 
 @dataclass
 class _Status:
-    """The status of one node, and where its signals are."""
+    """Status message of one node and the indices of its signals."""
 
     tx: TransmitImage
     at: dict[str, int]
-    booted: int = 0  # cycle in which the node began
+    booted: int = 0  # cycle in which the node started
 
 
 class Heartbeats:
@@ -32,27 +32,38 @@ class Heartbeats:
 
     def __init__(self, network: Network, messages: Sequence[Message]) -> None:
         self._period = max(m.cycle_ms for m in messages)
-        # Spread over the period: no two nodes send their status in the same cycle.
+        # The messages are spread over the period, so that no two nodes send their status in the same cycle.
         gap = self._period // len(messages)
         self._due: dict[int, _Status] = {}
         self._of: dict[str, _Status] = {}
         self._booting: list[_Status] = []
-        for place, message in enumerate(messages):
+        for index, message in enumerate(messages):
             tx = TransmitImage([message])
             status = _Status(tx, {signal.name: tx.codec.index(message.name, signal.name) for signal in message.signals})
-            self._due[gap * place] = self._of[message.sender] = status
+            self._due[gap * index] = self._of[message.sender] = status
             self.set(message.sender, "NodeState", BOOTUP)
             self.set(message.sender, "DbcHash", network.hash32)
             self.set(message.sender, "FirmwareVersion", _FIRMWARE_VERSION)
             self.set(message.sender, "SupplyVoltage", _SUPPLY_VOLTAGE)
 
     def set(self, node: str, signal: str, value: float) -> None:
-        """What a node says of itself from now on, DBC units."""
+        """Set a status signal of a node, from its next status message on.
+
+        Args:
+            node: name of the node.
+            signal: name of the signal.
+            value: value in the unit of the DBC.
+        """
         status = self._of[node]
         status.tx.values[status.at[signal]] = value
 
     def boot(self, node: str, cycle: int) -> None:
-        """A node begins anew in this cycle: it says so at once, uptime and alive counter count from 0."""
+        """Restart a node: it sends BOOTUP in this cycle, and its uptime and alive counter restart at 0.
+
+        Args:
+            node: name of the node.
+            cycle: number of this cycle.
+        """
         status = self._of[node]
         status.booted = cycle
         status.tx.resume(0, 0xFF)
@@ -61,7 +72,11 @@ class Heartbeats:
         self._booting.append(status)
 
     def due(self, cycle: int) -> Sequence[Frames]:
-        """The frames of this cycle, most often none. Shape (1,) each."""
+        """Return the status frames of a cycle, shape (1,) each; most cycles have none.
+
+        Args:
+            cycle: number of the cycle.
+        """
         due = self._due.get(cycle % self._period)
         if due is None and not self._booting:
             return ()

@@ -1,8 +1,9 @@
-"""Faults of the wire: a bus at the emulator's end that loses, changes, delays and adds frames, in both directions.
+"""Communication faults: a bus at the emulator's end that loses, changes, delays and adds frames in both directions.
 
-    HAL <- bus <- FaultyBus <- nodes          what the nodes say passes `send`, what they hear `receive`
+    HAL <- bus <- FaultyBus.send <- nodes
+    HAL -> bus -> FaultyBus.receive -> nodes
 
-One seed gives one sequence of frames. Frames of no active fault pass untouched.
+The same seed gives the same sequence of frames. Frames without an active fault pass unchanged.
 """
 
 from __future__ import annotations
@@ -28,26 +29,26 @@ _CLASSIC_LENGTH: Final = 8
 
 
 class _Late(NamedTuple):
-    """A frame on its way."""
+    """Delayed frame and the cycle in which it is due."""
 
     due: int
     frame: Frames
 
 
 class _Disturbance:
-    """One fault of the wire at work: what becomes of a frame, and what it adds."""
+    """One communication fault in operation: it changes, loses, delays and adds frames."""
 
     def __init__(self, fault: Fault, network: Network, seed: str) -> None:
         self.fault = fault
-        # A second sender needs a frame to begin with.
+        # The injected frames are copies of a received one, so the fault must receive frames one cycle earlier.
         self.from_cycle = fault.start - (fault.kind == "inject")
         self.messages = {message.frame_id: message for message in messages_of(fault, network)}
         self.random = random.Random(seed)
         self.late: list[_Late] = []
         self._network = network
-        self._counters: dict[int, int] = {}  # where the counter of a message stood still
-        self._held: dict[int, Frames] = {}  # waits for the next frame of its message
-        self._last: Frames | None = None  # frame of the message that is injected
+        self._counters: dict[int, int] = {}  # frozen counter, by identifier
+        self._held: dict[int, Frames] = {}  # frame that waits for the next frame of its message, by identifier
+        self._last: Frames | None = None  # last frame of the message to inject
         self._effect = _EFFECTS[fault.kind]
         self.babble: Babble | None = None
         if fault.kind == "flood":
@@ -55,7 +56,12 @@ class _Disturbance:
         self._chance = float(dict(fault.parameters).get("p", 1.0))
 
     def frames(self, frame: Frames, cycle: int) -> Sequence[Frames]:
-        """What arrives instead of a frame. Shape (1,) each."""
+        """Return the frames that replace a frame, shape (1,) each.
+
+        Args:
+            frame: frame as sent, shape (1,).
+            cycle: number of the cycle.
+        """
         message = self.messages.get(_id(frame))
         if message is None:
             return (frame,)
@@ -64,13 +70,21 @@ class _Disturbance:
         return self._effect(self, frame, message, cycle)
 
     def due(self, cycle: int) -> list[Frames]:
-        """Frames that were late until this cycle. Shape (1,) each."""
-        due = [one.frame for one in self.late if one.due <= cycle]
+        """Remove the delayed frames that are due and return them, shape (1,) each.
+
+        Args:
+            cycle: number of the cycle.
+        """
+        due = [late.frame for late in self.late if late.due <= cycle]
         self.late = self.late[len(due) :]
         return due
 
     def added(self, cycle: int) -> Iterable[Frames]:
-        """Frames nobody sent, of this cycle. Shape (1,) each."""
+        """Return the frames that the fault adds in a cycle, shape (1,) each.
+
+        Args:
+            cycle: number of the cycle.
+        """
         fault = self.fault
         if not fault.start <= cycle < fault.end:
             return ()
@@ -104,7 +118,7 @@ class _Disturbance:
         earlier = self._held.pop(message.frame_id, None)
         if earlier is not None:
             return frame, earlier
-        if cycle + 1 < self.fault.end:  # there will be a later one
+        if cycle + 1 < self.fault.end:  # the fault lasts until a later frame can pass this one
             self._held[message.frame_id] = frame
             return ()
         return (frame,)
@@ -159,10 +173,10 @@ class _Disturbance:
             self._last["can_id"], self._last["len"] = message.frame_id, message.length
             self._last["flags"] = FLAG_FDF | FLAG_BRS
         counter = int(self._last["data"][0, COUNTER_BYTE])
-        for place in range(int(self.fault["count"])):
+        for number in range(int(self.fault["count"])):
             frame = self._last.copy()
             self._set_signals(frame, message)
-            yield _sealed(frame, message, counter=counter + int(self.fault["ahead"]) + place & 0xFF)
+            yield _sealed(frame, message, counter=counter + int(self.fault["ahead"]) + number & 0xFF)
 
 
 _EFFECTS: Final[dict[str, Callable[[_Disturbance, Frames, Message, int], Sequence[Frames]]]] = {
@@ -189,94 +203,113 @@ _EFFECTS: Final[dict[str, Callable[[_Disturbance, Frames, Message, int], Sequenc
 
 
 class FaultyBus(WrappedBus):
-    """The emulator's end of a bus, with faults on the wire.
+    """Emulator's end of a bus, with communication faults.
 
-    Frames that come late or from nobody are on the wire when the SYNC of their cycle is: before what the HAL sent for the
-    nodes, and before the nodes' answers for the HAL. What nobody sent is heard at both ends.
+    Delayed and added frames are on the wire at the SYNC of their cycle: for the nodes before the frames of the HAL, and for the
+    HAL before the answers of the nodes. Added frames reach both ends.
     """
 
     def __init__(
         self, bus: Bus, network: Network, faults: Sequence[Fault], clock: Callable[[], int], *, seed: int = 0
     ) -> None:
-        """Put faults on a bus.
+        """Wrap a bus with faults.
 
         Args:
-            bus: the wire.
-            faults: those of `LINK_KINDS` among them are its.
-            clock: the emulator's cycle.
-            seed: of what is left to chance.
+            bus: bus to the HAL.
+            network: nodes and messages of the DBC.
+            faults: faults to inject; those outside `LINK_KINDS` are ignored.
+            clock: returns the emulator's cycle.
+            seed: seed of the random faults.
 
         Raises:
-            FaultError: the network has no such target or signal.
+            FaultError: If the network has no such target or signal.
         """
         super().__init__(bus)
-        #: The HAL sent a SYNC in the last `receive`, whatever became of it.
+        #: Whether the HAL sent a SYNC in the last `receive`, even if a fault removed it.
         self.synced = False
         self._clock, self._cycle, self._begun = clock, -1, -1
         self._all = [
-            _Disturbance(fault, network, f"{seed} {place}")
-            for place, fault in enumerate(faults)
+            _Disturbance(fault, network, f"{seed} {number}")
+            for number, fault in enumerate(faults)
             if fault.kind in LINK_KINDS
         ]
         self._active: list[_Disturbance] = []
         self._syncs = {m.frame_id for m in network.messages if m.name.startswith("SYNC_")}
         self._from_hal = {m.frame_id for m in network.sent_by("HAL")}
-        self._for_nodes: list[Frames] = []  # what they have not taken yet
-        #: The time the frames take on the buses, while there is a flood.
+        self._for_nodes: list[Frames] = []  # frames that the nodes did not receive yet
+        #: Wire time of the frames on each bus, used during a flood.
         self.wire = Wire(network)
 
     def send(self, frames: Frames) -> None:
-        """What the nodes say, on its way to the HAL. Raises as the bus does."""
+        """Send frames of the nodes to the HAL through the active faults.
+
+        Args:
+            frames: frames of the nodes, shape (n,).
+
+        Raises:
+            BusError: If the wrapped bus raises it.
+        """
         if self._now() or not self.wire.idle:
             frames = joined(self._passed(frames, from_hal=False))
         if len(frames):
             self.bus.send(frames)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """What the HAL says, as the nodes hear it. Raises as the bus does."""
+        """Receive frames of the HAL for the nodes through the active faults.
+
+        Args:
+            frames: receive buffer, shape (n,).
+            timeout: longest wait for the first frame [s].
+
+        Returns:
+            Number of frames in the buffer.
+
+        Raises:
+            BusError: If the wrapped bus raises it.
+        """
         count = self.bus.receive(frames, timeout)
         self.synced = not self._syncs.isdisjoint(frames["can_id"][:count].tolist())
         if self.synced:
             self._begin_cycle()
-        # Commands may come ahead of their SYNC: they, too, are this cycle's.
+        # Commands may arrive before their SYNC and belong to this cycle, too.
         if self._now() or not self.wire.idle:
             self._for_nodes += self._passed(frames[:count], from_hal=True)
         elif self._for_nodes:
             self._for_nodes.append(frames[:count].copy())
         else:
             return count
-        heard = joined(self._for_nodes)
-        count = min(len(heard), len(frames))
-        frames[:count] = heard[:count]
-        self._for_nodes = [heard[count:]] if count < len(heard) else []
+        received = joined(self._for_nodes)
+        count = min(len(received), len(frames))
+        frames[:count] = received[:count]
+        self._for_nodes = [received[count:]] if count < len(received) else []
         return count
 
     def _now(self) -> list[_Disturbance]:
-        """The faults of this cycle."""
+        """Return the faults that are active in this cycle."""
         cycle = self._clock()
         if cycle != self._cycle:
             self._cycle = cycle
-            self._active = [one for one in self._all if one.from_cycle <= cycle < one.fault.end]
+            self._active = [d for d in self._all if d.from_cycle <= cycle < d.fault.end]
         return self._active
 
     def _passed(self, frames: Frames, *, from_hal: bool) -> list[Frames]:
-        """Frames one by one through every fault in turn, as far as they find time on the wire. Shape (1,) each."""
-        passing = [frames[place : place + 1].copy() for place in range(len(frames))]
-        for one in self._active:
-            passing = [after for frame in passing for after in one.frames(frame, self._cycle)]
+        """Pass each frame through all active faults and return those that fit on the wire, shape (1,) each."""
+        passing = [frames[row : row + 1].copy() for row in range(len(frames))]
+        for disturbance in self._active:
+            passing = [after for frame in passing for after in disturbance.frames(frame, self._cycle)]
         return passing if self.wire.idle else self.wire.carry(passing, from_hal=from_hal)
 
     def _begin_cycle(self) -> None:
-        """Frames that are due, and those of nobody, once a cycle."""
+        """Put the delayed and the added frames on the wire, once per cycle."""
         self._now()
         if self._begun == self._cycle:
             return
         self._begun = self._cycle
-        due = [frame for one in self._all if one.late for frame in one.due(self._cycle)]
-        added = [frame for one in self._active for frame in one.added(self._cycle)]
-        added += self.wire.begin([one.babble for one in self._active if one.babble is not None])
+        due = [frame for d in self._all if d.late for frame in d.due(self._cycle)]
+        added = [frame for d in self._active for frame in d.added(self._cycle)]
+        added += self.wire.begin([d.babble for d in self._active if d.babble is not None])
         self._for_nodes += [frame for frame in due if _id(frame) in self._from_hal]
-        self._for_nodes += [frame for frame in added if not _id(frame) & ID_ERROR]  # which are no frames of the wire
+        self._for_nodes += [frame for frame in added if not _id(frame) & ID_ERROR]  # error frames are local to the HAL
         if for_hal := [frame for frame in due if _id(frame) not in self._from_hal] + added:
             self.bus.send(joined(for_hal))
 
@@ -291,7 +324,7 @@ def _cut(frame: Frames, length: int) -> None:
 
 
 def _sealed(frame: Frames, message: Message, *, counter: int | None = None) -> Frames:
-    """With the CRC right for the length it has and the Data ID of a message; too short for a CRC: as it is."""
+    """Write the CRC for the frame's length and a message's Data ID, and return the frame; skip frames without room for it."""
     payload = frame["data"][0]
     length = int(frame["len"][0])
     if length > COUNTER_BYTE:

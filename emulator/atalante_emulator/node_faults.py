@@ -1,4 +1,4 @@
-"""Faults inside the nodes: what goes wrong before the sensors of a cycle are read, and in what they say.
+"""Faults inside the nodes: changes before the sensors of a cycle are read, and changes of the values they send.
 
 body -> NodeFaults.begin -> encoders, drives -> truth + noise -> NodeFaults.rewrite -> frames
 """
@@ -25,12 +25,12 @@ from atalante_hal.wire.codec import Codec
 Vector = npt.NDArray[np.float64]
 Nodes = Sequence[str]
 
-#: Quantities of an IMU that a fault of it spoils.
+#: IMU signals that an IMU fault changes.
 _MEASURED: Final = ("Quaternion", "Gyro", "Accel")
 
 
 class NodeFaults:
-    """The faults of `NODE_KINDS` at work in one emulator."""
+    """Active faults of `NODE_KINDS` and `SENSOR_KINDS` in one emulator."""
 
     def __init__(
         self,
@@ -42,33 +42,39 @@ class NodeFaults:
         heartbeats: Heartbeats,
         outbox: list[Emergency],
     ) -> None:
-        """Put faults into nodes.
+        """Connect the faults to the nodes.
 
         Args:
-            codec: of the values of the 1 ms messages.
-            outbox: takes emergencies of nodes that are no drives.
+            faults: faults to inject; those of other kinds are ignored.
+            network: nodes and messages of the DBC.
+            robot: joint properties, for the energy that the drives draw.
+            codec: codec of the 1 ms messages.
+            drives: emulated drives.
+            heartbeats: status messages of all nodes.
+            outbox: list that receives the emergencies of nodes other than drives.
 
         Raises:
-            FaultError: no such node, or one of another kind.
+            FaultError: If a target does not exist or has another type than the fault needs.
         """
         self._network, self._robot, self._codec = network, robot, codec
         self._drives, self._heartbeats, self._outbox = drives, heartbeats, outbox
         self._faults = [(fault, nodes_of(fault, network)) for fault in faults if fault.kind in NODE_KINDS]
         self._sensors = [(fault, nodes_of(fault, network)[0]) for fault in faults if fault.kind in SENSOR_KINDS]
         self.rewrites = bool(self._sensors)
-        self._position: Vector = np.zeros(len(NODES))  # rad, as the encoders see the joints
+        self._position: Vector = np.zeros(len(NODES))  # rad, joint positions at the encoders
         self._stuck_at: dict[Fault, float] = {}
         self._frozen: dict[Fault, Vector] = {}
         self._hold_up: dict[Fault, HoldUp] = {}
 
     def begin(self, cycle: int, position: Vector) -> Vector:
-        """Let go wrong what does in this cycle, and let end what is over.
+        """Apply the node faults of this cycle, and end those that are over.
 
         Args:
-            position: of the joints, shape (12,) [rad].
+            cycle: number of the cycle.
+            position: true joint positions, shape (12,) [rad].
 
         Returns:
-            What the encoders see of it, shape (12,) [rad].
+            Joint positions at the encoders, shape (12,) [rad].
         """
         self._position = position.copy()
         for fault, nodes in self._faults:
@@ -77,7 +83,12 @@ class NodeFaults:
         return self._position
 
     def rewrite(self, cycle: int, values: Vector) -> None:
-        """Spoil what sensors say in this cycle: values of the 1 ms messages, DBC units."""
+        """Apply the sensor faults of this cycle to the values about to be sent.
+
+        Args:
+            cycle: number of the cycle.
+            values: values of the 1 ms messages in DBC units, shape (codec.size,); updated.
+        """
         for fault, node in self._sensors:
             if fault.start <= cycle < fault.end:
                 _SENSOR_EFFECTS[fault.kind](self, fault, node, values)
@@ -105,7 +116,7 @@ class NodeFaults:
             self._drives.leave(drive, AUTOMATIC[self._drives.state[drive]])
 
     def _reset(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
-        """Nothing is heard of the node meanwhile: `link` sees to that."""
+        """Keep the node in reset, and boot it at the end; the fault of the same kind in `link` blocks its frames."""
         (node,) = nodes
         if cycle == fault.end:
             self._heartbeats.boot(node, cycle)
@@ -161,7 +172,7 @@ class NodeFaults:
         if cycle < fault.end:
             self._position[_drive(nodes)] += fault["rate"] * (cycle - fault.start) * PERIOD
 
-    # -- what a node says of itself ----------------------------------------------------------------------------------
+    # -- status of a node --------------------------------------------------------------------------------------------
 
     def _dbc_hash(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
         (node,) = nodes
@@ -170,10 +181,10 @@ class NodeFaults:
     # -- sensors -----------------------------------------------------------------------------------------------------
 
     def _measured(self, node: str) -> list[int]:
-        """Places of what an IMU measures."""
+        """Return the indices of the measured values of an IMU."""
         return [
-            place
-            for place, (message, signal) in enumerate(self._codec.signals)
+            index
+            for index, (message, signal) in enumerate(self._codec.signals)
             if message.sender == node and signal.name.rstrip("WXYZ") in _MEASURED
         ]
 
@@ -181,14 +192,14 @@ class NodeFaults:
         values[self._measured(node)] = np.nan
 
     def _imu_saturated(self, fault: Fault, node: str, values: Vector) -> None:
-        for place in self._measured(node):
-            signal = self._codec.signals[place][1]
+        for index in self._measured(node):
+            signal = self._codec.signals[index][1]
             if not signal.name.startswith("Quaternion"):
-                values[place] = signal.maximum
+                values[index] = signal.maximum
 
     def _imu_frozen(self, fault: Fault, node: str, values: Vector) -> None:
-        places = self._measured(node)
-        values[places] = self._frozen.setdefault(fault, values[places])
+        indices = self._measured(node)
+        values[indices] = self._frozen.setdefault(fault, values[indices])
 
     def _cell_stuck(self, fault: Fault, node: str, values: Vector) -> None:
         values[self._codec.index(f"{node}_STATE", f"{fault['cell']}_ForceZ")] = fault["force"]

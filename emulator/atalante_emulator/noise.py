@@ -1,4 +1,4 @@
-"""What every sensor adds to the truth, drawn many cycles at a time."""
+"""Sensor noise of the emulated nodes, drawn for many cycles at a time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from atalante_hal.wire.codec import Codec
 
 Vector = npt.NDArray[np.float64]
 
-#: Cycles drawn at once.
+#: Number of cycles that one `draw` covers.
 NOISE_CYCLES: Final = 128
 
 
@@ -27,18 +27,24 @@ class SensorNoise:
         self._torque, self._gyro, self._accel, self._force = (
             noise[:, codec.slice(quantity)] for quantity in ("Torque", "Gyro", "Accel", "Force")
         )
-        # One generator a family: another IMU model does not change what the feet feel.
+        # Each sensor family has its own generator, so that another IMU model does not change the noise of the feet.
         self._of_drives, self._of_imus, self._of_feet = (
             np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3)
         )
         self._bias = imus.draw_bias(self._of_imus)
 
     def add(self, cycle: int, truth: Vector, values: Vector) -> None:
-        """What the sensors say in a cycle, in `values`: the truth and its noise. Shape (codec.size,)."""
+        """Add the noise of a cycle to the true values.
+
+        Args:
+            cycle: number of the cycle.
+            truth: values without noise, shape (codec.size,).
+            values: array that receives the values with noise, shape (codec.size,).
+        """
         np.add(truth, self._noise[cycle % NOISE_CYCLES], values)
 
     def draw(self) -> None:
-        """The next `NOISE_CYCLES` cycles."""
+        """Draw the noise of the next `NOISE_CYCLES` cycles."""
         self._drives.draw_noise(self._of_drives, self._torque)
         self._imus.draw_noise(self._of_imus, self._bias, self._gyro, self._accel)
         self._feet.draw_noise(self._of_feet, self._force)

@@ -1,6 +1,6 @@
-"""The pendant node held by an emulated operator: what a person does with the dead-man, the buttons and the assistance dial.
+"""Emulated pendant node and its operator, with dead-man switch, buttons and assistance dial.
 
-Speaks the same frame as a real pendant, and hears what a pendant hears: the HAL's state in SYNC.
+The node sends the same frame as a real pendant and receives the HAL state from SYNC, as a real pendant does.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from atalante_hal.wire.codec import Codec
 
 Vector = npt.NDArray[np.float64]
 
-#: `HalState` on the wire in which an operator presses START.
+#: Value of the signal `HalState` in which the operator presses START.
 HAL_READY = 1
 
 
 class Request(IntEnum):
-    """What the operator asks for; values of `PENDANT_STATE.Request`."""
+    """Request of the operator; values of the signal `PENDANT_STATE.Request`."""
 
     NONE = 0
     START = 1
@@ -29,7 +29,7 @@ class Request(IntEnum):
 
 
 class PendantSignals(NamedTuple):
-    """`PENDANT_STATE` as the node sends it; `assistance_factor` None leaves the factor as it is."""
+    """Signals of `PENDANT_STATE`; an `assistance_factor` of None leaves the factor unchanged."""
 
     dead_man: bool = True
     request: Request = Request.NONE
@@ -38,34 +38,41 @@ class PendantSignals(NamedTuple):
 
 
 class Operator:
-    """A patient operator: keeps the dead-man pressed, and presses START whenever the HAL says it is READY.
+    """Emulated operator who keeps the dead-man switch pressed and presses START while the HAL is READY.
 
-    A robot in HOLD is left alone until somebody calls `start()`: recovery is a decision.
+    A robot in HOLD stays there until `start()` is called, because recovery must be a decision of the operator.
     """
 
-    #: Cycles of READY before START, and between two presses while nothing happens.
+    #: Cycles in READY before START, and between two presses while the HAL stays READY.
     REACTION = 200
 
     def __init__(self, assistance_factor: float | None = None, *, starts: bool = True) -> None:
-        """Take the pendant.
+        """Press the dead-man switch and set the dial.
 
         Args:
-            assistance_factor: Xi in [0, 1] to set on the dial, None leaves it to the HAL.
-            starts: presses START by itself when the HAL is READY.
+            assistance_factor: assistance factor Xi on the dial, 0 to 1. None leaves it to the HAL.
+            starts: whether the operator presses START when the HAL is READY.
 
         Raises:
-            ValueError: the factor is outside [0, 1].
+            ValueError: If the factor is outside [0, 1].
         """
         self._starts = starts
         self._ready_for = 0
-        #: What the node sends now: another object whenever it changes.
+        #: Signals that the node sends; replaced by a new object at every change.
         self.signals = PendantSignals()
         self.assist(assistance_factor)
 
     def assist(self, factor: float | None) -> None:
-        """Turn the dial: Xi in [0, 1]; None leaves the factor to the HAL. Raises `ValueError` outside."""
+        """Turn the assistance dial.
+
+        Args:
+            factor: assistance factor Xi, 0 to 1. None leaves it to the HAL.
+
+        Raises:
+            ValueError: If the factor is outside [0, 1].
+        """
         if factor is not None and not 0.0 <= factor <= 1.0:
-            raise ValueError(f"the assistance factor is between 0 and 1, not {factor!r}")
+            raise ValueError(f"the assistance factor must be from 0 to 1, got {factor!r}")
         self.signals = self.signals._replace(assistance_factor=factor)
 
     def start(self) -> None:
@@ -73,25 +80,29 @@ class Operator:
         self._press(Request.START)
 
     def stop(self) -> None:
-        """Press STOP; START is not pressed again by itself."""
+        """Press STOP; the operator presses START again only on `start()`."""
         self._starts = False
         self._press(Request.STOP)
 
     def hold(self) -> None:
-        """Press HOLD; START is not pressed again by itself."""
+        """Press HOLD; the operator presses START again only on `start()`."""
         self._starts = False
         self._press(Request.HOLD)
 
     def release(self) -> None:
-        """Let the dead-man go."""
+        """Release the dead-man switch."""
         self.signals = self.signals._replace(dead_man=False)
 
     def squeeze(self) -> None:
-        """Press the dead-man again."""
+        """Press the dead-man switch again."""
         self.signals = self.signals._replace(dead_man=True)
 
     def hear(self, hal_state: int) -> None:
-        """One cycle: the HAL's state, as SYNC carries it."""
+        """Receive the HAL state of one cycle, and press START if it is time.
+
+        Args:
+            hal_state: value of the signal `HalState` in SYNC.
+        """
         if hal_state != HAL_READY or not self._starts:
             self._ready_for = 0
             return
@@ -105,28 +116,41 @@ class Operator:
 
 
 class PendantNode:
-    """The pendant in an operator's hand: hears what SYNC says, and says `PENDANT_STATE`."""
+    """Pendant node of an operator: receives the HAL state from SYNC and sends `PENDANT_STATE`."""
 
     def __init__(self, operator: Operator, codec: Codec, values: Vector) -> None:
-        """Take the pendant; `values`, shape (codec.size,), are what the nodes say."""
+        """Connect the node to its signals.
+
+        Args:
+            operator: operator of the pendant.
+            codec: codec of the 1 ms messages.
+            values: array that receives the signals, shape (codec.size,).
+        """
         self._operator = operator
         self._values = values
-        self._said: PendantSignals | None = None
+        self._sent: PendantSignals | None = None
         names = ("DeadMan", "Request", "RequestCounter", "AssistanceSet", "AssistanceFactor")
-        self._places = [codec.index("PENDANT_STATE", name) for name in names]
+        self._indices = [codec.index("PENDANT_STATE", name) for name in names]
 
     def hear(self, hal_state: int) -> bool:
-        """One cycle, with the HAL's state as SYNC carries it; whether the pendant now says something else."""
+        """Receive the HAL state of one cycle and update the signals.
+
+        Args:
+            hal_state: value of the signal `HalState` in SYNC.
+
+        Returns:
+            Whether a signal changed.
+        """
         self._operator.hear(hal_state)
-        said = self._operator.signals
-        if said is self._said:
+        signals = self._operator.signals
+        if signals is self._sent:
             return False
-        self._said = said
-        factor = said.assistance_factor
-        self._values[self._places] = (
-            said.dead_man,
-            said.request,
-            said.request_counter,
+        self._sent = signals
+        factor = signals.assistance_factor
+        self._values[self._indices] = (
+            signals.dead_man,
+            signals.request,
+            signals.request_counter,
             factor is not None,
             factor or 0.0,
         )

@@ -1,4 +1,4 @@
-"""What is left in the DC link when the battery is gone: capacitors that feed the drives until they are empty."""
+"""Supply of the drives without battery: the capacitors of the DC link feed them until they are empty."""
 
 from __future__ import annotations
 
@@ -12,26 +12,32 @@ from atalante_hal.robot import Robot
 
 Vector = npt.NDArray[np.float64]
 
-IDLE = 40.0  # W, electronics of twelve drives
+IDLE = 40.0  # W, power of the electronics of all twelve drives
 #: Copper loss of a motor at its torque limit [W].
 COPPER = 250.0
 
 
 class HoldUp:
-    """Energy of the DC link without a battery: E = C V^2 / 2, less what the drives take."""
+    """Energy of the DC link without a battery: E = C V^2 / 2, minus the energy that the drives draw."""
 
     def __init__(self, robot: Robot, capacity: float, voltage: float) -> None:
-        """A link of some capacity [F], charged to a voltage [V]."""
+        """Charge the DC link.
+
+        Args:
+            robot: torque limits, which scale the copper losses.
+            capacity: capacitance of the DC link [F].
+            voltage: voltage at the start [V].
+        """
         self._per_torque_squared = COPPER / robot.torque_max**2
         self._capacity = capacity
         self._energy = 0.5 * capacity * voltage**2
 
     def draw(self, torque: Vector, speed: Vector) -> float:
-        """Voltage [V] after one `PERIOD`; what a motor gives back while it brakes is not used.
+        """Draw the energy of one `PERIOD` and return the voltage after it [V]; braking motors feed nothing back.
 
         Args:
-            torque: of the motors, shape (12,) [Nm at the joint].
-            speed: of the joints, shape (12,) [rad/s].
+            torque: motor torques, shape (12,) [Nm at the joint].
+            speed: joint velocities, shape (12,) [rad/s].
         """
         work = float(np.maximum(torque * speed, 0.0).sum())
         heat = float(self._per_torque_squared @ torque**2)

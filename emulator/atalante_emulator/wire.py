@@ -1,7 +1,7 @@
-"""The time of the buses: who wins arbitration gets it, and what finds none waits for the next cycle or is overwritten.
+"""Wire time of the buses: frames are sent in the order of arbitration, and the others wait for the next cycle.
 
-Used while something babbles: without that every bus has more time than its cyclic set needs (`Network.bus_load`). A sender keeps
-one frame an identifier ready; a newer one takes its place.
+It is computed only during a flood, because each bus has enough time for its cyclic messages otherwise (`Network.bus_load`). A
+sender keeps one waiting frame per identifier; a newer frame replaces it.
 """
 
 from __future__ import annotations
@@ -17,17 +17,21 @@ from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, Frames, new_frames
 
 @dataclass
 class Babble:
-    """Somebody who sends one identifier as fast as a share of a bus allows."""
+    """Defective sender that floods a bus with frames of one identifier."""
 
     bus: str
     can_id: int
     length: int  # bytes
-    load: float  # share of the bus's time it asks for
-    taken: float = 0.0  # s of wire time it takes of this cycle
-    owed: float = 0.0  # s it took for a frame that is not over yet
+    load: float  # share of the bus time it requests, 0 to 1
+    taken: float = 0.0  # s, wire time it takes in this cycle
+    owed: float = 0.0  # s, wire time it took for a frame that is not complete yet
 
     def frames(self, network: Network) -> int:
-        """How many of its frames fit into a cycle: it yields to smaller identifiers alone."""
+        """Return how many of its frames fit into a cycle; it yields only to smaller identifiers.
+
+        Args:
+            network: messages and bit rates of the buses.
+        """
         before = sum(
             _time_of(network, m.length) * 1e3 / m.cycle_ms
             for m in network.messages
@@ -42,37 +46,45 @@ class Babble:
 
 
 class Wire:
-    """One cycle of every bus after the other."""
+    """Arbitration of all buses, cycle by cycle."""
 
     def __init__(self, network: Network) -> None:
         self._network = network
         self._bus_of = {m.frame_id: m.bus for m in network.messages}
-        self._used: dict[str, float] = {}  # s of this cycle, by those who do not babble
+        self._used: dict[str, float] = {}  # s, wire time of this cycle used by regular frames, by bus
         self._babbles: Sequence[Babble] = ()
-        self._from_hal: dict[int, Frames] = {}  # what waits, by identifier
-        self._from_nodes: dict[int, Frames] = {}
+        self._from_hal: dict[int, Frames] = {}  # waiting frames of the HAL, by identifier
+        self._from_nodes: dict[int, Frames] = {}  # waiting frames of the nodes, by identifier
 
     @property
     def idle(self) -> bool:
-        """Nobody babbles, and nobody waits."""
+        """Whether there is no flood and no waiting frame."""
         return not (self._babbles or self._from_hal or self._from_nodes)
 
     def load(self, bus: str) -> float:
-        """Share of the cycle that is taken so far."""
+        """Return the share of the cycle in which a bus is busy so far.
+
+        Args:
+            bus: name of the bus.
+        """
         return (self._used.get(bus, 0.0) + sum(one.taken for one in self._babbles if one.bus == bus)) / PERIOD
 
     def begin(self, babbles: Sequence[Babble]) -> list[Frames]:
-        """A new cycle: what those who babble bring onto the wire, shape (1,) each."""
+        """Begin a cycle and return the flood frames that get on the wire, shape (1,) each.
+
+        Args:
+            babbles: floods that are active in this cycle.
+        """
         self._babbles = babbles
         self._used = {}
         return [_babbled(one) for one in babbles for _ in range(one.frames(self._network))]
 
     def carry(self, frames: Sequence[Frames], *, from_hal: bool) -> list[Frames]:
-        """Frames that get through in this cycle, as arbitration orders them; the others wait.
+        """Return the frames that get on the wire in this cycle, in the order of arbitration; the others wait.
 
         Args:
-            frames: what is to be sent now, shape (1,) each.
-            from_hal: by the HAL, or else by the nodes.
+            frames: frames to send now, shape (1,) each.
+            from_hal: whether the HAL sends them. False for frames of the nodes.
         """
         waiting = self._from_hal if from_hal else self._from_nodes
         newer = {_id(frame) for frame in frames}

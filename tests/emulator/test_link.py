@@ -293,12 +293,30 @@ def test_says_whether_the_hal_sent_sync(line: Make) -> None:
 @pytest.mark.parametrize(
     ("fault", "says"),
     [
-        (Fault("drop", "LEFT_KNEE"), "drop: 'LEFT_KNEE' is no message, node or bus; there are SYNC_LEFT_LEG, "),
-        (Fault("value", "LEFT_SK", Position=0.0), "value: 'LEFT_SK' is no message; there are SYNC_LEFT_LEG, "),
-        (Fault("silence", KNEE), "silence: 'LEFT_SK_STATE' is no node; there are HAL, LEFT_FH, "),
-        (Fault("bus_off", "HAL"), "bus_off: 'HAL' is no bus; there are left_leg, right_leg, left_sense, right_sense$"),
-        (Fault("value", KNEE, Angle=0.0), "value: no signal 'Angle' in LEFT_SK_STATE; there are Crc, Counter, "),
-        (Fault("masquerade", KNEE, like="KNEE"), "masquerade: like is a message, not 'KNEE'; there are SYNC_LEFT_LEG"),
+        (
+            Fault("drop", "LEFT_KNEE"),
+            "drop: target must be of type message, node or bus, got 'LEFT_KNEE'; valid targets: SYNC_LEFT_LEG, ",
+        ),
+        (
+            Fault("value", "LEFT_SK", Position=0.0),
+            "value: target must be of type message, got 'LEFT_SK'; valid targets: SYNC_LEFT_LEG, ",
+        ),
+        (
+            Fault("silence", KNEE),
+            "silence: target must be of type node, got 'LEFT_SK_STATE'; valid targets: HAL, LEFT_FH, ",
+        ),
+        (
+            Fault("bus_off", "HAL"),
+            "bus_off: target must be of type bus, got 'HAL'; valid targets: left_leg, right_leg, left_sense, right_sense$",
+        ),
+        (
+            Fault("value", KNEE, Angle=0.0),
+            "value: unknown signal 'Angle' of LEFT_SK_STATE; valid signals: Crc, Counter, ",
+        ),
+        (
+            Fault("masquerade", KNEE, like="KNEE"),
+            "masquerade: like must be a message, got 'KNEE'; valid messages: SYNC_LEFT_LEG",
+        ),
     ],
     ids=str,
 )

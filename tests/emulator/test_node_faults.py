@@ -415,17 +415,32 @@ class TestWire:
     [
         (
             Fault("encoder_stuck", "IMU_TORSO"),
-            "encoder_stuck: 'IMU_TORSO' is no drive; there are LEFT_FH, .*, RIGHT_HA$",
+            "encoder_stuck: target must be of type drive, got 'IMU_TORSO'; valid targets: LEFT_FH, .*, RIGHT_HA$",
         ),
-        (Fault("imu_frozen", "LEFT_SK"), "imu_frozen: 'LEFT_SK' is no imu; there are IMU_TORSO, .*, IMU_RIGHT_TIBIA$"),
-        (Fault("cell_stuck", "IMU_TORSO", cell="FL"), "'IMU_TORSO' is no foot; there are FOOT_LEFT, FOOT_RIGHT$"),
-        (Fault("reset", "HAL", 0, 5), "reset: 'HAL' is no node; there are LEFT_FH, .*, PENDANT$"),
-        (Fault("battery_removed", "LEFT_SK"), "battery_removed: 'LEFT_SK' is no battery; there are battery$"),
+        (
+            Fault("imu_frozen", "LEFT_SK"),
+            "imu_frozen: target must be of type imu, got 'LEFT_SK'; valid targets: IMU_TORSO, .*, IMU_RIGHT_TIBIA$",
+        ),
+        (
+            Fault("cell_stuck", "IMU_TORSO", cell="FL"),
+            "type foot, got 'IMU_TORSO'; valid targets: FOOT_LEFT, FOOT_RIGHT$",
+        ),
+        (
+            Fault("reset", "HAL", 0, 5),
+            "reset: target must be of type node, got 'HAL'; valid targets: LEFT_FH, .*, PENDANT$",
+        ),
+        (
+            Fault("battery_removed", "LEFT_SK"),
+            "battery_removed: target must be of type battery, got 'LEFT_SK'; valid targets: battery$",
+        ),
         (
             Fault("under_voltage", "HAPTICS", volts=1.0),
-            "'HAPTICS' is no drive or battery; there are LEFT_FH, .*, battery$",
+            "target must be of type drive or battery, got 'HAPTICS'; valid targets: LEFT_FH, .*, battery$",
         ),
-        (Fault("heartbeat_lost", "left_leg"), "heartbeat_lost: 'left_leg' is no node; there are HAL, LEFT_FH, "),
+        (
+            Fault("heartbeat_lost", "left_leg"),
+            "heartbeat_lost: target must be of type node, got 'left_leg'; valid targets: HAL, LEFT_FH, ",
+        ),
     ],
     ids=str,
 )
@@ -440,12 +455,12 @@ def test_a_fault_that_fits_no_node(world: Make, fault: Fault, says: str) -> None
         (
             "leave_operation",
             {"state": "LIMP"},
-            "leave_operation: state is one of NOT_READY_TO_SWITCH_ON, .*, not 'LIMP'",
+            "leave_operation: state must be one of NOT_READY_TO_SWITCH_ON, .*, got 'LIMP'",
         ),
-        ("cell_stuck", {"cell": "FLL"}, "cell_stuck: cell is one of FL, FR, RL, RR, not 'FLL'"),
-        ("torque_weak", {}, "torque_weak: share has to be given, a number from 0 to 1"),
-        ("emergency", {"code": 0}, "emergency: code is a whole number from 1 to 65535, not 0"),
-        ("under_voltage", {"volts": -1.0}, re.escape("under_voltage: volts is a number from 0 to 60 V, not -1.0")),
+        ("cell_stuck", {"cell": "FLL"}, "cell_stuck: cell must be one of FL, FR, RL, RR, got 'FLL'"),
+        ("torque_weak", {}, "torque_weak: share is required, and must be a number from 0 to 1"),
+        ("emergency", {"code": 0}, "emergency: code must be an integer from 1 to 65535, got 0"),
+        ("under_voltage", {"volts": -1.0}, re.escape("under_voltage: volts must be a number from 0 to 60 V, got -1.0")),
     ],
 )
 def test_what_is_valid_is_said(kind: str, options: dict, says: str) -> None:

@@ -80,7 +80,7 @@ def test_dial() -> None:
     operator.assist(None)
     assert operator.signals.assistance_factor is None
     for wrong in (-0.1, 1.1, float("nan")):
-        with pytest.raises(ValueError, match="between 0 and 1"):
+        with pytest.raises(ValueError, match="must be from 0 to 1, got"):
             operator.assist(wrong)
 
 
