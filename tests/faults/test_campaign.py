@@ -152,8 +152,8 @@ def test_run_prints_a_table_or_one_object() -> None:
     ("arguments", "says"),
     [
         (("run", "F99"), "got 'F99'"),
-        (("run", "F52"), "type `pytest tests/faults/test_refusals.py"),
-        (("run", "F44", "--case", "nothing like it"), "there are 2 cycles, 3 cycles"),
+        (("run", "F52"), "run `pytest tests/faults/test_refusals.py"),
+        (("run", "F44", "--case", "nothing like it"), "valid cases: 2 cycles, 3 cycles"),
         (("campaign", "F52"), "F52 has no scenario"),
         (("campaign", "--jobs", "0"), "--jobs"),
     ],

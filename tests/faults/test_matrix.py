@@ -91,12 +91,12 @@ def test_what_is_not_a_table_is_refused(tmp_path) -> None:
     assert (row.noticed, row.reacted, row.state, row.dtc) == (1, 5, S.HOLD, "")
     assert row.tests == ("test_x.py::test_y",)
     for text, says in (
-        ("", "no table"),
-        (head + good + "\n" + good, "line 4: F01 has a row already"),
-        (head + good.replace("F01", "X1"), "'X1' is no ID"),
-        (head + good.replace("HOLD", "STOP"), "no state 'STOP'"),
-        (head + good.replace("| - ", ""), "7 columns"),
-        (head + good.replace("scenario", "sure"), "proof 'sure'"),
+        ("", "must have a table"),
+        (head + good + "\n" + good, "line 4: ID must be unique, got F01 twice"),
+        (head + good.replace("F01", "X1"), "got 'X1'"),
+        (head + good.replace("HOLD", "STOP"), "state must be one of .*, got 'STOP'"),
+        (head + good.replace("| - ", ""), "got 7 columns"),
+        (head + good.replace("scenario", "sure"), "got proof 'sure'"),
     ):
         with pytest.raises(MatrixError, match=says):
             load(text)

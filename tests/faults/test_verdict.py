@@ -72,14 +72,14 @@ def test_the_hold_frame_counts_before_the_state_does(seen: Any) -> None:
 @pytest.mark.parametrize(
     ("states", "case", "says"),
     [
-        ([S.ACTIVE] * 15 + [S.HOLD] * 27 + [S.ACTIVE], {}, ["HOLD after 6 cycles, and 5 are allowed"]),
+        ([S.ACTIVE] * 15 + [S.HOLD] * 27 + [S.ACTIVE], {}, ["HOLD must come within 5 cycles, got 6"]),
         ([S.ACTIVE] * 50, {}, ["no HOLD within 30 cycles"]),
-        ([S.HOLD] * 40 + [S.ACTIVE] * 10, {}, ["the robot was HOLD and did not walk when it began"]),
-        ([S.ACTIVE] * 14 + [S.FAULT] * 30 + [S.ACTIVE], {}, ["the robot ended in FAULT, not in HOLD"]),
-        (HELD, {"state": S.ACTIVE}, ["HOLD after 5 cycles, where it should walk on"]),
+        ([S.HOLD] * 40 + [S.ACTIVE] * 10, {}, ["the robot must be ACTIVE before the fault, got HOLD"]),
+        ([S.ACTIVE] * 14 + [S.FAULT] * 30 + [S.ACTIVE], {}, ["the final state must be HOLD, got FAULT"]),
+        (HELD, {"state": S.ACTIVE}, ["the robot must stay ACTIVE, got HOLD after 5 cycles"]),
         ([*HELD[:30], *[S.ACTIVE] * 5, *[S.HOLD] * 10, S.ACTIVE], {}, ["ACTIVE in cycle 31 without the operator"]),
-        (HELD[:42], {}, ["the operator's START led to HOLD, not to ACTIVE"]),
-        (HELD, {"recovers": False}, ["ACTIVE again after START, while the fault lasts"]),
+        (HELD[:42], {}, ["the operator's START must lead to ACTIVE, got HOLD"]),
+        (HELD, {"recovers": False}, ["the robot must not be ACTIVE after START, because the fault persists"]),
     ],
 )  # fmt: skip
 def test_a_wrong_state_is_told(seen: Any, states: list[S], case: dict[str, Any], says: list[str]) -> None:
@@ -89,10 +89,10 @@ def test_a_wrong_state_is_told(seen: Any, states: list[S], case: dict[str, Any],
 @pytest.mark.parametrize(
     ("event", "says"),
     [
-        (Event(12, "BUS_DOWN", "", node="LEFT_SK"), "no NODE_TIMEOUT; noted were BUS_DOWN"),
-        (Event(10, "NODE_TIMEOUT", "", node="LEFT_SK"), "no NODE_TIMEOUT; noted were none"),
-        (Event(13, "NODE_TIMEOUT", "", node="LEFT_SK"), "NODE_TIMEOUT after 3 cycles, and 2 are allowed"),
-        (Event(12, "NODE_TIMEOUT", "", node="LEFT_SH"), "NODE_TIMEOUT names LEFT_SH, not LEFT_SK"),
+        (Event(12, "BUS_DOWN", "", node="LEFT_SK"), "no NODE_TIMEOUT; reported codes: BUS_DOWN"),
+        (Event(10, "NODE_TIMEOUT", "", node="LEFT_SK"), "no NODE_TIMEOUT; reported codes: none"),
+        (Event(13, "NODE_TIMEOUT", "", node="LEFT_SK"), "NODE_TIMEOUT must come within 2 cycles, got 3"),
+        (Event(12, "NODE_TIMEOUT", "", node="LEFT_SH"), "NODE_TIMEOUT must name LEFT_SK, got LEFT_SH"),
     ],
 )
 def test_a_wrong_diagnostic_is_told(seen: Any, event: Event, says: str) -> None:
@@ -150,5 +150,7 @@ def test_ridden_through_is_measured_by_its_diagnostic(seen: Any) -> None:
 
 
 def test_a_bound_has_to_be_said_somewhere() -> None:
-    with pytest.raises(ValueError, match="F99 x: its row says '1 step', so the case has to say how many cycles"):
+    with pytest.raises(
+        ValueError, match="F99 x: `noticed` and `reacted` must be given, because the bound of the row is '1 step'"
+    ):
         Expectation.of(Case("x", ()), Row("F99", "", "", "1 step", "", S.HOLD, "", ()))

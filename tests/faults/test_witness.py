@@ -87,10 +87,10 @@ def test_a_torque_a_limit_a_step_and_a_torque_while_stopped_are_found(hal: Hal, 
     hal.word[HIP], hal.torque[HIP] = Controlword.QUICK_STOP, 0.1
     hal.send(4)
     assert hal.commands().outside(robot) == [
-        "a torque beyond the joint's limit left for left_SK in cycle 2",
-        "a torque step beyond the joint's rate left for left_SK in cycle 2",
-        "a torque limit beyond the joint's left for right_SH in cycle 3",
-        "a torque with QUICK STOP left for right_SH in cycle 4",
+        "a torque beyond the joint's limit was sent to left_SK in cycle 2",
+        "a torque step beyond the joint's rate was sent to left_SK in cycle 2",
+        "a torque limit beyond the joint's was sent to right_SH in cycle 3",
+        "a torque with QUICK STOP was sent to right_SH in cycle 4",
     ]
 
 
@@ -103,4 +103,4 @@ def test_a_step_over_a_cycle_without_a_frame_is_no_step(hal: Hal, robot: Robot) 
 
 def test_another_nodes_identifier_is_found(hal: Hal, network: Network, robot: Robot) -> None:
     hal.witness.sent(TransmitImage([network.message("LEFT_SK_STATE")]).seal())
-    assert hal.commands().outside(robot) == ["the HAL sent identifier 0x184, which is not its own"]
+    assert hal.commands().outside(robot) == ["the HAL must send only its own identifiers, got 0x184"]

@@ -144,5 +144,5 @@ def test_names_that_are_none_are_answered_with_near_ones(ends: Ends):
         ends.filter.drop("LEFT_SK_STAT")
     with pytest.raises(ValueError, match="probability"):
         ends.filter.drop("LEFT_SK", probability=0.0)
-    with pytest.raises(ValueError, match="one cycle or more"):
+    with pytest.raises(ValueError, match="cycles of a delay must be 1 or more, got 0"):
         ends.filter.delay("LEFT_SK", 0)

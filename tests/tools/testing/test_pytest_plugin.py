@@ -215,7 +215,7 @@ def test_a_hil_test_meets_the_robot_that_is_there(run, heartbeat: str):
 def test_no_emulated_robot_is_put_beside_a_real_one(run, heartbeat: str):
     result = run(EXAMPLE, *VIRTUAL, heartbeat, "--can-missing=skip")
     result.assert_outcomes(errors=1)
-    result.stdout.fnmatch_lines(["*somebody sends 0x701*pytest.mark.hil*"])
+    result.stdout.fnmatch_lines(["*must be free*got frame 0x701*pytest.mark.hil*"])
 
 
 def test_a_hil_test_has_no_emulator(run):

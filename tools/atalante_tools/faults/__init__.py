@@ -1,4 +1,4 @@
-"""`atalante faults`: the fault matrix, run against the robot that walks in the air.
+"""Command `atalante faults`: run the fault matrix against an emulated robot that walks suspended in the air.
 
 FAULTS.md -> matrix        link, node, sensor, drive, host, operator -> scenarios -> runner -> verdict -> campaign, report
 """
@@ -31,9 +31,9 @@ _BAR = 24  # characters
 
 @click.group()
 def command() -> None:
-    """What may go wrong, and the proof of what happens then.
+    """Run the fault matrix: inject faults into the emulated robot and check the reaction.
 
-    Every fault has an ID, a bound in cycles of 1 ms, a state it ends in and a diagnostic code; the table is FAULTS.md of this
+    Every fault has an ID, a bound in cycles of 1 ms, a final state and a diagnostic code. The table is the file FAULTS.md of this
     package.
 
     \b
@@ -43,10 +43,10 @@ def command() -> None:
     """
 
 
-@command.command("list", short_help="The matrix: each fault, its bound, code and proof.")
+@command.command("list", short_help="List all faults with bound, code and proof.")
 @json_option
 def list_(as_json: bool) -> None:
-    """The matrix: what each fault is, its bound and its code, and what proves it."""
+    """List all faults with their bound, final state, diagnostic code and proof."""
     from atalante_tools.faults.matrix import load_matrix
 
     rows = load_matrix().values()
@@ -60,12 +60,12 @@ def list_(as_json: bool) -> None:
     )
 
 
-@command.command("run", short_help="Run the cases of one fault and judge them.")
+@command.command("run", short_help="Run the cases of one fault and check them.")
 @click.argument("id_", metavar="ID")
-@click.option("--case", "name", metavar="TEXT", default="", help="Only the cases with this in their name.")
+@click.option("--case", "name", metavar="TEXT", default="", help="Run only the cases whose name contains this text.")
 @json_option
 def run(id_: str, name: str, as_json: bool) -> None:
-    """Run the cases of one fault, each on a robot of its own, and judge them."""
+    """Run the cases of one fault, each on a new robot, and check the reactions."""
     from atalante_tools.faults.catalogue import SCENARIOS
     from atalante_tools.faults.report import Summary, number
     from atalante_tools.faults.tasks import CaseTask
@@ -74,13 +74,14 @@ def run(id_: str, name: str, as_json: bool) -> None:
     row = _row(id_)
     if row.id not in SCENARIOS:
         raise InvalidUsage(
-            f"{row.id} is proved by tests alone; type `pytest {' '.join(f'tests/{t}' for t in row.tests)}`"
+            f"{row.id} must have a scenario, but has only tests: run `pytest {' '.join(f'tests/{t}' for t in row.tests)}`"
         )
     cases = SCENARIOS[row.id].cases
     tasks = [CaseTask(row.id, index) for index, case in enumerate(cases) if name in case.name]
     if not tasks:
         raise InvalidUsage(
-            f"no case of {row.id} has {name!r} in its name; there are {', '.join(c.name for c in cases)}"
+            f"--case must be part of the name of a case of {row.id}, got {name!r}; "
+            f"valid cases: {', '.join(c.name for c in cases)}"
         )
     summary = Summary.of(verdicts := [v for v in _done(tasks) if isinstance(v, Verdict)])
     if as_json:
@@ -92,43 +93,51 @@ def run(id_: str, name: str, as_json: bool) -> None:
     _conclude(summary)
 
 
-@command.command("campaign", short_help="Run every fault, alone and in pairs; write a report.")
+@command.command("campaign", short_help="Run all faults, alone and in pairs, and write a report.")
 @click.argument("ids", metavar="[ID]...", nargs=-1)
 @click.option(
     "--jobs",
     type=click.IntRange(1),
     default=os.cpu_count() or 1,
-    show_default="one a core",
+    show_default="number of cores",
     metavar="N",
-    help="Processes.",
+    help="Number of parallel processes.",
 )
 @click.option(
-    "--dask", default="", metavar="ADDRESS", help="Use the workers of this dask scheduler: tcp://127.0.0.1:8786."
+    "--dask",
+    default="",
+    metavar="ADDRESS",
+    help="Run on the workers of this dask scheduler, such as tcp://127.0.0.1:8786.",
 )
-@click.option("--pairs/--no-pairs", default=True, show_default=True, help="Two faults at a time.")
-@click.option("--endurance/--no-endurance", default=True, show_default=True, help="How long each fault is survived.")
+@click.option("--pairs/--no-pairs", default=True, show_default=True, help="Also run pairs of faults.")
+@click.option(
+    "--endurance/--no-endurance",
+    default=True,
+    show_default=True,
+    help="Also measure how long the walk survives each fault.",
+)
 @click.option(
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
     default="runs/faults",
     show_default=True,
     metavar="DIR",
-    help="For report.md and report.json.",
+    help="Folder for report.md and report.json.",
 )
 @json_option
 def campaign_(
     ids: tuple[str, ...], jobs: int, dask: str, pairs: bool, endurance: bool, out: Path, as_json: bool
 ) -> None:
-    """Run every fault (or those named), pairs of them, and how long each is survived; write a report."""
+    """Run all faults, or those with the given IDs, and write a report."""
     from atalante_tools.faults.catalogue import SCENARIOS
     from atalante_tools.faults.report import Summary
     from atalante_tools.faults.tasks import plan
 
     chosen = [_row(id_).id for id_ in ids] or list(SCENARIOS)
     if without := [id_ for id_ in chosen if id_ not in SCENARIOS]:
-        raise InvalidUsage(f"{without[0]} has no scenario; `atalante faults list` says what proves it")
+        raise InvalidUsage(f"{without[0]} has no scenario; `atalante faults list` shows its tests")
     tasks = plan(chosen, endurance=endurance, pairs=pairs and not ids)
-    out.mkdir(parents=True, exist_ok=True)  # what cannot be written is told before, not after some minutes
+    out.mkdir(parents=True, exist_ok=True)  # fails now, not after minutes of runs
     begun = time.monotonic()
     say(f"{len(tasks)} runs on {f'the workers of {dask}' if dask else f'{jobs} processes'}")
     found = list(_done(tasks, jobs=jobs, dask=dask))
@@ -151,7 +160,7 @@ def _row(id_: str) -> Row:
 
 
 def _done(tasks: Sequence[Task], *, jobs: int = 1, dask: str = "") -> Iterator[Result]:
-    """Results as they come, with a bar that says how far it is."""
+    """Yield the results in the order of completion, and show a progress bar."""
     from atalante_tools.faults.campaign import results
 
     progress, begun = Progress(), time.monotonic()
@@ -168,7 +177,7 @@ def _done(tasks: Sequence[Task], *, jobs: int = 1, dask: str = "") -> Iterator[R
 
 
 def _table(summary: Summary) -> str:
-    """A line a fault; behind it how long it is survived."""
+    """Return the table of results: one line per fault, with the cycles that the walk survives it."""
     from atalante_tools.faults.report import number, survived
 
     lasts = {one.id: survived(one) for one in summary.endurance}
@@ -182,10 +191,10 @@ def _table(summary: Summary) -> str:
 
 
 def _conclude(summary: Summary) -> None:
-    """Say what failed.
+    """Print all failures.
 
     Raises:
-        Failed: if something did.
+        Failed: If a fault or a pair failed.
     """
     for line in summary.lines:
         for failure in line.failures:

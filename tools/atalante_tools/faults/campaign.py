@@ -1,4 +1,4 @@
-"""Many tasks over processes or a cluster: tasks -> `fan_out` -> results as they come -> report."""
+"""Parallel runs of a campaign in processes or on a cluster: tasks -> `fan_out` -> results -> report."""
 
 from __future__ import annotations
 
@@ -9,15 +9,20 @@ from atalante_control.gait_optimization.parallel import FanOutError, fan_out
 from atalante_tools.console.outcome import Failed
 from atalante_tools.faults.tasks import Result, Task, run_task
 
-#: Seconds after which a campaign that got no result is said to hang.
+#: Time without a result after which a campaign fails as hanging [s].
 HANGS: Final = 300.0
 
 
 def results(tasks: Sequence[Task], *, jobs: int = 1, dask: str = "") -> Iterator[Result]:
-    """Results in the order in which they come; see `fan_out`.
+    """Run the tasks and yield the results in the order of completion; see `fan_out`.
+
+    Args:
+        tasks: tasks to run.
+        jobs: number of processes.
+        dask: address of a dask scheduler. Empty means processes on this computer.
 
     Raises:
-        Failed: joblib or dask is missing, the scheduler does not answer, or a task hangs.
+        Failed: If joblib or dask is missing, the scheduler does not answer, or a task hangs.
     """
     try:
         yield from fan_out(run_task, tasks, jobs=jobs, cluster=dask, patience=HANGS)

@@ -1,4 +1,4 @@
-"""All scenarios by ID, one a row of the matrix that is proved by a run."""
+"""All scenarios by ID, one for each row of the matrix whose proof is a run."""
 
 from __future__ import annotations
 

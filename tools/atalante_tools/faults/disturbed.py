@@ -1,4 +1,4 @@
-"""Faults of the host: a controller, a clock and a bus end that go wrong in chosen cycles, around the ones that do not."""
+"""Faults of the host: wrappers of controller, clock and bus that fail in chosen cycles."""
 
 from __future__ import annotations
 
@@ -16,21 +16,25 @@ from atalante_hal.types import Command, Controller, State, Vector
 from atalante_hal.wire.frame import Frames
 from atalante_tools.faults.scenario import Host
 
-#: The joint that is shaken: heavy enough to stay where it is.
+#: Selection of the joint that the fault `shake` acts on; the left hip is heavy enough to stay in place.
 _HIP: Final = np.array([joint == "left_SH" for joint in JOINTS], np.float64)
 
 
 class Moment:
-    """When the faults of a case are on, in cycles of the HAL."""
+    """Timing of the host faults of a case, in HAL cycles."""
 
     def __init__(self, faults: Sequence[Host], begins: int) -> None:
         self._faults, self._begins = faults, begins
-        self.cycle = 0  # now; set by the owner
-        #: First cycle in which one did something, None: not yet.
+        self.cycle = 0  # present cycle, set by the owner
+        #: First cycle in which a fault acted; None: not yet.
         self.struck: int | None = None
 
     def of(self, *kinds: str) -> Host | None:
-        """The fault of one of these kinds that is on now."""
+        """Return the active fault of one of these kinds, None if there is none.
+
+        Args:
+            *kinds: kinds of `Host` faults.
+        """
         since = self.cycle - self._begins
         for fault in self._faults:
             over = fault.cycles is not None and since >= fault.start + fault.cycles
@@ -42,7 +46,7 @@ class Moment:
 
 
 class DisturbedController:
-    """A controller whose faults are `raise`, `raise_in_reset`, `ask`, `shake` and `shape`."""
+    """Controller with the faults `raise`, `raise_in_reset`, `ask`, `shake` and `shape`."""
 
     def __init__(self, controller: Controller, now: Moment) -> None:
         self._controller, self._now = controller, now
@@ -50,16 +54,24 @@ class DisturbedController:
 
     @property
     def telemetry(self) -> Vector:
-        """The controller's."""
+        """Telemetry of the wrapped controller."""
         return self._controller.telemetry
 
     def reset(self, state: State) -> None:
-        """As the controller, or raise."""
+        """Reset the wrapped controller, or raise.
+
+        Args:
+            state: state of the HAL.
+        """
         self._controller.reset(state)
         self._raise(self._now.of("raise_in_reset"))
 
     def update(self, state: State) -> Command:
-        """As the controller, or raise, or ask for something else."""
+        """Return the command of the wrapped controller or a wrong one, or raise.
+
+        Args:
+            state: state of the HAL.
+        """
         command = self._controller.update(state)
         self._raise(self._now.of("raise"))
         wrong = self._now.of("ask", "shake", "shape")
@@ -74,15 +86,15 @@ class DisturbedController:
     @staticmethod
     def _raise(fault: Host | None) -> None:
         if fault is not None:
-            raise getattr(builtins, str(fault.value))("a fault that was asked for")
+            raise getattr(builtins, str(fault.value))("injected fault of the controller")
 
 
 class DisturbedClock:
-    """Lock-step, but late or slow when asked."""
+    """Lock-step clock with the faults `late` and `slow`."""
 
     def __init__(self, now: Moment) -> None:
         self._now = now
-        self._behind = 0.0  # s, of a slow loop against its deadlines
+        self._behind = 0.0  # s, delay of a slow loop against its deadlines
 
     def wait(self) -> float:
         """Return how late the cycle begins [s], as `WallClock.wait` would."""
@@ -100,18 +112,26 @@ class DisturbedClock:
 
 
 class DisturbedBus(WrappedBus):
-    """The HAL's end of the bus, refusing frames when asked."""
+    """HAL's end of the bus with the faults `bus_down` and `bus_full`."""
 
     def __init__(self, bus: Bus, now: Moment) -> None:
         super().__init__(bus)
         self._now = now
 
     def send(self, frames: Frames) -> None:
-        """Send, or raise `BusDown` or `BusFull`."""
+        """Send frames, or raise.
+
+        Args:
+            frames: frames to send, shape (n,).
+
+        Raises:
+            BusDown: If the fault `bus_down` is active.
+            BusFull: If the fault `bus_full` is active.
+        """
         refused = self._now.of("bus_down", "bus_full")
         if refused is None:
             super().send(frames)
         elif refused.kind == "bus_down":
-            raise BusDown("the interface is down, as asked for")
+            raise BusDown("injected fault: the interface is down")
         else:
-            raise BusFull("the transmit queue is full, as asked for")
+            raise BusFull("injected fault: the transmit queue is full")

@@ -1,4 +1,4 @@
-"""Faults of the drives and of what they are told: states, emergencies, heat, supply, commands that do not arrive."""
+"""Scenarios of faults of the drives and their commands: states, emergencies, heat, supply and lost commands."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from atalante_tools.faults.scenario import Case, Host, Scenario
 _S = SupervisorState
 _KNEE: Final = "LEFT_SK"
 _COMMAND: Final = "COMMAND_LEFT_LEG"
-#: Cycles in which a knee that its drive lets down has come to rest: not before can the drive be enabled again.
+#: Cycles until a lowered knee is at rest; before, its drive cannot be enabled again.
 _SUNK: Final = 4500
 
 SCENARIOS: Final = (
@@ -79,7 +79,7 @@ SCENARIOS: Final = (
         ),
         lasting=Case("of one leg", (Fault("drop", "SYNC_LEFT_LEG"),)),
     ),
-    # The next frame that comes tells that some are missing.
+    # The loss is detected by the counter of the next frame.
     Scenario("F24", tuple(Case(f"{n} frames", (Fault("drop", _COMMAND, 0, n),), noticed=n + 1) for n in range(1, 5))),
     Scenario(
         "F25",

@@ -1,4 +1,4 @@
-"""Faults of the computer the HAL runs on: its time, its bus, its controller."""
+"""Scenarios of faults of the computer that runs the HAL: timing, bus and controller."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from atalante_tools.faults.checks import full_queue_is_confirmed
 from atalante_tools.faults.scenario import Case, Host, Scenario
 
 _ACTIVE: Final = SupervisorState.ACTIVE
-#: Errors of every family: arithmetic, look-up, type, memory, and what numpy raises.
+#: Exceptions that the controller raises, one or more of every family.
 _ERRORS: Final = (
     "ValueError",
     "ZeroDivisionError",

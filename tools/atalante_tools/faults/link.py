@@ -1,4 +1,4 @@
-"""Faults of the wire: frames that are lost, come twice, late, damaged or from somebody else."""
+"""Scenarios of communication faults: lost, repeated, late, damaged and foreign frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _HOLD: Final = SupervisorState.HOLD
 _ACTIVE: Final = SupervisorState.ACTIVE
 _OFF: Final = SupervisorState.OFF
 _BUSES: Final = ("left_leg", "right_leg", "left_sense", "right_sense")
-#: The node and message at which faults of one message are shown.
+#: Node and message for the faults of a single message.
 _KNEE: Final = "LEFT_SK"
 _STATE: Final = "LEFT_SK_STATE"
 _COMMAND: Final = "COMMAND_LEFT_LEG"
@@ -81,7 +81,7 @@ SCENARIOS: Final = (
         "F04",
         (
             *(_lost(drive, f"{drive}_STATE", 5, node=drive) for drive in _DRIVES),
-            # On one leg: the other one is put down first.
+            # The right foot is on the ground, and the left leg must finish its step first.
             *(
                 Case(
                     f"{frames or 'all'} frames of a leg that swings",
@@ -95,7 +95,7 @@ SCENARIOS: Final = (
                     node=_KNEE,
                     reacted=reacted,
                     recovers=False,
-                    watched=40,  # cells without noise are found out after a hundred
+                    watched=40,  # force cells without noise would be detected after 100 cycles
                 )
                 for frames, state, dtc, reacted in (
                     (5, SupervisorState.FINISH_STEP, "SWING_TIMEOUT", 5),
@@ -114,7 +114,7 @@ SCENARIOS: Final = (
         "F06",
         (
             Case("0 cycles", (), dtc="", state=_ACTIVE, watched=200),
-            # Silence at first; the first frame that comes says that it is late.
+            # The delay is detected with the first late frame; before, there are no frames.
             *(
                 Case(f"{k} cycles", (Fault("delay", _STATE, 0, 200, by=k),), node=_KNEE, noticed=k + 1, state=_ACTIVE)
                 for k in range(1, 5)
@@ -123,7 +123,7 @@ SCENARIOS: Final = (
         ),
         lasting=Case("by 4 cycles, for good", (Fault("delay", _STATE, 0, None, by=4),)),
     ),
-    # The counter of the first of these frames is right.
+    # The counter of the first frame is still correct.
     Scenario(
         "F07",
         (
@@ -238,7 +238,7 @@ SCENARIOS: Final = (
         ),
         lasting=Case("for good", (Fault("inject", _COMMAND, SK_TargetTorque=200.0),)),
     ),
-    # `ahead` 1: ahead of the true frame of the cycle, under its counter; 0: behind the true frame of the cycle before.
+    # With `ahead` 1 the frame has the counter of the true frame that follows it, with 0 that of the true frame before it.
     Scenario(
         "F58",
         (

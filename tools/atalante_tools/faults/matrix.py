@@ -1,6 +1,6 @@
-"""The table of record: FAULTS.md as data. Scenarios, tests and the command line take bound, state and code of a fault from here.
+"""Fault matrix, read from FAULTS.md: bound, state and diagnostic code of each fault for scenarios, tests and commands.
 
-FAULTS.md -> rows -> scenarios are judged by them -> report
+FAULTS.md -> rows -> verdicts of the scenarios -> report
 """
 
 from __future__ import annotations
@@ -16,53 +16,56 @@ from atalante_hal.types import SupervisorState
 
 MATRIX_FILE: Final = Path(__file__).with_name("FAULTS.md")
 COLUMNS: Final = ("ID", "Fault", "Noticed by", "Cycles", "What happens", "State", "DTC", "Proof")
-#: Proof by a run of the scenario of the row's ID.
+#: Entry of the column Proof for a run of the scenario with the row's ID.
 SCENARIO: Final = "scenario"
 _ID = re.compile(r"F\d\d")
 _BOUND = re.compile(r"(\d+)(?: / (\d+))?")
 
 
 class MatrixError(ValueError):
-    """FAULTS.md is not the table it has to be; the message names the line and what is valid."""
+    """Invalid FAULTS.md; the message names the line and the valid content."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One fault."""
+    """One row of the fault matrix, that is one fault."""
 
     id: str
-    fault: str
-    noticed_by: str
-    cycles: str  # as written; `noticed` and `reacted` where it is a bound
-    behaviour: str
-    state: SupervisorState  # the supervisor's when it has reacted
-    dtc: str  # empty: nothing to notice
-    proof: tuple[str, ...]  # SCENARIO, `path::test` below tests/, * at its end: any
+    fault: str  # description of the fault
+    noticed_by: str  # check that detects it
+    cycles: str  # text of the bound; `noticed` and `reacted` are its numbers
+    behaviour: str  # reaction in words
+    state: SupervisorState  # state of the HAL after the reaction
+    dtc: str  # diagnostic code; empty: none
+    proof: tuple[str, ...]  # SCENARIO or `path::test` below tests/; a final * matches any ending
 
     @property
     def noticed(self) -> int | None:
-        """Cycles until the DTC, the first faulty one counted; None: not a number of cycles."""
+        """Cycles until the DTC, including the first faulty cycle; None if the bound is not a number."""
         bound = _BOUND.fullmatch(self.cycles)
         return int(bound[1]) if bound else None
 
     @property
     def reacted(self) -> int | None:
-        """Cycles until the reaction: the second number of `noticed / reacted`, or the only one."""
+        """Cycles until the reaction: the second number of `noticed / reacted`, or the only number."""
         bound = _BOUND.fullmatch(self.cycles)
         return int(bound[2] or bound[1]) if bound else None
 
     @property
     def tests(self) -> tuple[str, ...]:
-        """What proves it besides a scenario."""
+        """Tests that prove the row, besides a scenario."""
         return tuple(entry for entry in self.proof if entry != SCENARIO)
 
 
 @functools.cache
 def load_matrix(path: Path = MATRIX_FILE) -> Mapping[str, Row]:
-    """Rows by ID, in the order of the file.
+    """Load the rows by ID, in the order of the file.
+
+    Args:
+        path: Markdown file with the table.
 
     Raises:
-        MatrixError: a row with another number of columns, an ID twice or none, a state there is not, no proof.
+        MatrixError: If a row has a wrong number of columns, an invalid or repeated ID, an unknown state or an invalid proof.
     """
     rows: dict[str, Row] = {}
     inside = False
@@ -75,24 +78,26 @@ def load_matrix(path: Path = MATRIX_FILE) -> Mapping[str, Row]:
         elif inside and not set(line) <= set("|- "):
             row = _row(f"{path.name} line {number}", cells)
             if row.id in rows:
-                raise MatrixError(f"{path.name} line {number}: {row.id} has a row already")
+                raise MatrixError(f"{path.name} line {number}: ID must be unique, got {row.id} twice")
             rows[row.id] = row
     if not rows:
-        raise MatrixError(f"{path.name} has no table with the columns {', '.join(COLUMNS)}")
+        raise MatrixError(f"{path.name} must have a table with the columns {', '.join(COLUMNS)}, got none")
     return rows
 
 
 def _row(where: str, cells: list[str]) -> Row:
     if len(cells) != len(COLUMNS):
-        raise MatrixError(f"{where}: {len(cells)} columns; a row has {len(COLUMNS)}: {', '.join(COLUMNS)}")
+        raise MatrixError(
+            f"{where}: a row must have {len(COLUMNS)} columns ({', '.join(COLUMNS)}), got {len(cells)} columns"
+        )
     id_, fault, noticed_by, cycles, behaviour, state, dtc, proof = cells
     if not _ID.fullmatch(id_):
-        raise MatrixError(f"{where}: {id_!r} is no ID; one is F and two digits")
+        raise MatrixError(f"{where}: ID must be F and two digits, got {id_!r}")
     if state not in SupervisorState.__members__:
-        raise MatrixError(f"{where}: no state {state!r}; there are {', '.join(SupervisorState.__members__)}")
+        raise MatrixError(f"{where}: state must be one of {', '.join(SupervisorState.__members__)}, got {state!r}")
     entries = tuple(entry.strip().strip("`") for entry in proof.split(","))
     for entry in entries:
         if entry != SCENARIO and "::" not in entry:
-            raise MatrixError(f"{where}: proof {entry!r}; valid are {SCENARIO} and file::test below tests/")
+            raise MatrixError(f"{where}: proof must be {SCENARIO} or file::test below tests/, got proof {entry!r}")
     dtc = "" if dtc == "-" else dtc
     return Row(id_, fault, noticed_by, cycles, behaviour, SupervisorState[state], dtc, entries)

@@ -1,4 +1,4 @@
-"""Faults of whole nodes: off, silent, begun anew, with another DBC."""
+"""Scenarios of faults of whole nodes: restart, silence, lost heartbeat and wrong DBC."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _ACTIVE: Final = SupervisorState.ACTIVE
 _HOLD: Final = SupervisorState.HOLD
 _DRIVES: Final = tuple(joint.upper() for joint in JOINTS)
 _SENSORS: Final = (*(f"IMU_{name.upper()}" for name in IMUS), *(f"FOOT_{name.upper()}" for name in FEET))
-#: Cycles: timeout of IMUs and feet; status period and the heartbeat timeout.
+#: Timeout of IMUs and feet, and heartbeat timeout [cycles].
 _SENSOR_TIMEOUT: Final = 10
 _HEARTBEAT: Final = 250
 

@@ -1,4 +1,4 @@
-"""What the operator does, and the pendant that falls silent."""
+"""Scenarios of operator actions and of a lost pendant."""
 
 from __future__ import annotations
 

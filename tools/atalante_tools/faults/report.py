@@ -1,4 +1,4 @@
-"""The report of a campaign: one line a fault, how long each is survived, and what pairs of them do. Markdown and JSON.
+"""Report of a campaign in Markdown and JSON: result of each fault, endurance runs and pairs of faults.
 
 results -> Summary -> table on the terminal, report.md, report.json
 """
@@ -19,20 +19,24 @@ from atalante_tools.faults.verdict import Verdict
 
 @dataclass(frozen=True)
 class Line:
-    """One fault over all its cases: the keys of `--json`."""
+    """Result of one fault over all its cases; its fields are the keys of `--json`."""
 
     id: str
     passed: bool
     state: str
-    cycles: int | None  # of the worst case: the first that failed, else the one nearest to its bound
+    cycles: int | None  # of the worst case: a failed one, else the case closest to its bound
     bound: int
     dtc: str
     cases: int
-    failures: tuple[str, ...]  # each with the name of its case
+    failures: tuple[str, ...]  # sentences, each with the name of its case
 
 
 def line_of(verdicts: Sequence[Verdict]) -> Line:
-    """The cases of one fault."""
+    """Summarize the cases of one fault.
+
+    Args:
+        verdicts: verdicts of all its cases.
+    """
     worst = max(verdicts, key=lambda v: (not v.passed, (v.cycles or 0) / max(1, v.bound)))
     failures = tuple(f"{v.case}: {failure}" for v in verdicts for failure in v.failures)
     return Line(worst.id, not failures, worst.state, worst.cycles, worst.bound, worst.dtc, len(verdicts), failures)
@@ -40,16 +44,21 @@ def line_of(verdicts: Sequence[Verdict]) -> Line:
 
 @dataclass(frozen=True)
 class Summary:
-    """A campaign."""
+    """Results of a campaign."""
 
     lines: tuple[Line, ...]
     endurance: tuple[Endurance, ...]
     pairs: tuple[PairVerdict, ...]
-    seconds: float  # it took
+    seconds: float  # duration of the campaign [s]
 
     @classmethod
     def of(cls, results: Iterable[Result], seconds: float = 0.0) -> Summary:
-        """From results in any order."""
+        """Summarize results.
+
+        Args:
+            results: results in any order.
+            seconds: duration of the campaign [s].
+        """
         every = list(results)
         by_id: dict[str, list[Verdict]] = {}
         for verdict in every:
@@ -66,21 +75,25 @@ class Summary:
 
     @property
     def passed(self) -> bool:
-        """Every case and every pair."""
+        """Whether every case and every pair passed."""
         return all(line.passed for line in self.lines) and not any(pair.failures for pair in self.pairs)
 
     def write(self, folder: Path) -> None:
-        """report.md and report.json."""
+        """Write report.md and report.json.
+
+        Args:
+            folder: folder of the files, created if it is missing.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "report.md").write_text(self.markdown())
         (folder / "report.json").write_text(json.dumps(self.as_dict(), indent=2) + "\n")
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the summary as JSON types."""
         return {"version": version("atalante-hal"), "passed": self.passed, **asdict(self)}
 
     def markdown(self) -> str:
-        """For people."""
+        """Return the report as Markdown."""
         matrix = load_matrix()
         rows = [
             [
@@ -104,16 +117,19 @@ class Summary:
             _table([head, *rows]),
         ]
         if failed := [f"- {line.id} {failure}" for line in self.lines for failure in line.failures]:
-            parts += ["## What failed", "\n".join(failed)]
+            parts += ["## Failures", "\n".join(failed)]
         if self.endurance:
             lasting = [[e.id, matrix[e.id].fault, e.case, survived(e)] for e in self.endurance]
-            parts += ["## How long the walk survives it", _table([["ID", "Fault", "Case", "Cycles"], *lasting])]
+            parts += [
+                "## Cycles that the walk survives each fault",
+                _table([["ID", "Fault", "Case", "Cycles"], *lasting]),
+            ]
         if self.pairs:
-            parts += ["## Two at a time", self._pairs()]
+            parts += ["## Pairs of faults", self._pairs()]
         return "\n\n".join(parts) + "\n"
 
     def _pairs(self) -> str:
-        """The state in which each pair ends, the first fault of it down, the second across."""
+        """Return the table of final states: the first fault of a pair by row, the second by column."""
         names = [f"{id_} {name}" for id_, name in REPRESENTATIVES]
         found = {(pair.first, pair.second): pair for pair in self.pairs}
         rows = [["", *(name.split()[0] for name in names)]]
@@ -125,12 +141,20 @@ class Summary:
 
 
 def survived(endurance: Endurance) -> str:
-    """Cycles, for people."""
+    """Return the survived cycles of an endurance run as text.
+
+    Args:
+        endurance: result of the run.
+    """
     return f"{HORIZON} and more" if endurance.survived is None else str(endurance.survived)
 
 
 def number(value: int | None) -> str:
-    """For people."""
+    """Return a number as text, "-" for None.
+
+    Args:
+        value: number to show.
+    """
     return "-" if value is None else str(value)
 
 

@@ -1,6 +1,6 @@
-"""The one runner: rig in lock-step, the operator starts, the robot walks in the air, a case happens, everything is written down.
+"""Runner of all fault cases: walks the emulated robot in lock-step, injects a case and records the run.
 
-case -> rig -> walk -> it happens -> it is over -> operator's START -> observation
+case -> rig -> walk -> fault begins -> fault ends -> operator's START -> observation
 """
 
 from __future__ import annotations
@@ -36,38 +36,38 @@ if TYPE_CHECKING:
     from atalante_hal.safety.events import Event
 
 Vector = npt.NDArray[np.float64]
-#: What the controller records of its guide: tracking error of the assisted joints, and how far off the guide is.
+#: Telemetry fields of the controller: tracking error of the assisted joints, and width of the guide.
 _GUIDE: Final = ("error", "q_bound")
-#: The robot hangs in the gait's first pose: what is wanted is the walk.
+#: Short startup, because the suspended robot is already in the first pose of the gait.
 CONFIG: Final = AirwalkConfig(startup=0.1)
 ASSISTANCE: Final = 0.5
-#: Cycles of the HAL within which a robot with no fault is ACTIVE.
+#: HAL cycles within which a robot without fault must be ACTIVE.
 _START: Final = 600
-#: Cycles between the operator's presses of START when it is over (the first leaves FAULT, the second HOLD), and after the last.
+#: Cycles after each START after the fault. The operator presses it twice: the first leaves FAULT, the second leaves HOLD.
 RECOVERY: Final = 100
-#: Cycles in a row in ACTIVE after which it has started again.
+#: Consecutive cycles in ACTIVE after which the robot counts as restarted.
 AGAIN: Final = 10
 
 
 @dataclass(frozen=True)
 class Stage:
-    """What all runs of a process share, read and built once."""
+    """Objects shared by all runs of a process, built once."""
 
     network: Network
     robot: Robot
     gait: Gait
-    pose: list[float]  # the gait's first, rad
+    pose: list[float]  # rad, first pose of the gait
     controller: AirwalkController
 
 
 @functools.cache
 def stage() -> Stage:
-    """Network, robot, gait and controller of every run."""
+    """Return network, robot, gait and controller of all runs."""
     network, robot = atalante_dbc.load(), load_robot()
     gait = load_gait(AIRWALK_GAIT, robot)
     pose = gait.tables().q[0].tolist()
     shared = Stage(network, robot, gait, pose, AirwalkController(robot, gait, SHAPES["constant"], CONFIG))
-    # It lives as long as the process; or the loop would collect before every run, a quarter of what a run takes.
+    # These objects exist until the process ends. Frozen, they do not slow down the garbage collection before every run.
     gc.collect()
     gc.freeze()
     return shared
@@ -75,24 +75,27 @@ def stage() -> Stage:
 
 @functools.cache
 def walk_begins() -> int:
-    """Cycle of the HAL in which the first step begins when nothing is wrong: lock-step gives the same in every run.
+    """Return the HAL cycle in which the first step begins without a fault; it is the same in every lock-step run.
 
     Raises:
-        RuntimeError: the robot does not start although nothing is wrong.
+        RuntimeError: If the robot does not start without a fault.
     """
     trial = _Run(Case("nothing", ()), moment=1)
     trial.go(lambda state: state.supervisor is SupervisorState.ACTIVE or state.cycle >= _START)
     if trial.states[-1] is not SupervisorState.ACTIVE:
-        raise RuntimeError(f"the robot is not ACTIVE after {_START} cycles although nothing is wrong")
+        raise RuntimeError(
+            f"the robot without fault must be ACTIVE within {_START} cycles, got {trial.states[-1].name}"
+        )
     return len(trial.states) + round(CONFIG.startup / PERIOD)
 
 
 def observe(case: Case, bound: int, *, recovery: bool = True) -> Observation:
-    """Run a case.
+    """Run a case and return the observation.
 
     Args:
-        bound: cycles within which it has to be reacted to; what lasts for good is watched that long and `case.watched` more.
-        recovery: whether the operator presses START when all is over.
+        case: faults to inject and actions of the operator.
+        bound: cycles within which the reaction must occur. A permanent fault is observed for `bound + case.watched` cycles.
+        recovery: whether the operator presses START after the fault.
     """
     moment = 1 if case.phase is None else walk_begins() + round(case.phase * stage().gait.duration / PERIOD)
     quiet = moment + max(case.begins + bound, case.ends or 0) + case.watched
@@ -111,12 +114,12 @@ def observe(case: Case, bound: int, *, recovery: bool = True) -> Observation:
 
 
 class _Run:
-    """One run of one case, which happens from cycle `moment` of the HAL on."""
+    """One run of one case, whose faults begin at the HAL cycle `moment`."""
 
     def __init__(self, case: Case, moment: int) -> None:
         self._case, self._begins = case, moment
         self.states: list[SupervisorState] = []
-        #: What the operator does, by cycle.
+        #: Actions of the operator, by cycle.
         self.presses: defaultdict[int, list[str]] = defaultdict(list)
         for one in case.happens:
             if isinstance(one, Press):
@@ -125,11 +128,15 @@ class _Run:
         self._moment = Moment([one for one in case.happens if isinstance(one, Host)], moment)
         self._witness = Witness()
         self._seen: list[_Seen] = []
-        self._events: list[Event] = []  # without the HOLD in which the loop ends
-        self._counted = 0  # events of the HAL that are in `_events` or were dropped
+        self._events: list[Event] = []  # without the HOLD at the end of the loop
+        self._counted = 0  # events of the HAL that were copied to `_events` or dropped
 
     def go(self, until: Callable[[State], bool]) -> None:
-        """Run the rig until `until(state)`; the operator presses START when the HAL is first READY."""
+        """Run the rig; the operator presses START when the HAL is READY for the first time.
+
+        Args:
+            until: returns True for the state after which the run ends.
+        """
         from atalante_emulator.pendant import Operator
 
         shared = stage()
@@ -170,13 +177,17 @@ class _Run:
             self._messages = hal.messages
 
     def _before(self, cycle: int, operator: Operator) -> None:
-        """The next cycle is this one."""
+        """Prepare the next cycle: set its number and execute the actions of the operator."""
         self._moment.cycle = self._witness.cycle = cycle
         for press in self.presses.get(cycle, ()):
             getattr(operator, press)()
 
     def observation(self, pressed: int | None) -> Observation:
-        """What was seen; `pressed` is the cycle of the operator's START after it was over."""
+        """Return the observation of the run.
+
+        Args:
+            pressed: cycle of the operator's START after the fault. None if there was none.
+        """
         shared, ends = stage(), self._case.ends
         cycles, frames = self._witness.frames()
         keep = cycles <= len(self.states)
@@ -196,7 +207,7 @@ class _Run:
 
 
 class _Seen(NamedTuple):
-    """Columns of an `Observation`, one cycle."""
+    """One cycle of the arrays of an `Observation`."""
 
     drive_state: list[int]
     torque: Vector
@@ -208,7 +219,7 @@ class _Seen(NamedTuple):
 
     @classmethod
     def of(cls, rig: Rig) -> _Seen:
-        """As it is now; past the HAL, at the drives and the body themselves."""
+        """Read the present values, from the emulated drives and the body directly where the HAL could be wrong."""
         hal, emulator = rig.hal, rig.emulator
         assert emulator is not None
         (hip, knee), (hip_bound, knee_bound) = (hal.record[hal.layout[f"controller.{name}"]] for name in _GUIDE)

@@ -1,8 +1,8 @@
-"""A scenario as data: what happens to a walking robot, when, and what has to come of it.
+"""Scenarios as data: faults of a walking robot, their timing and the expected reaction.
 
     row of the matrix -> scenario: its cases -> runner -> observation -> verdict
 
-What a case does not say, its row of the matrix does: state, code and bounds.
+State, code and bounds that a case leaves open are those of its row of the matrix.
 """
 
 from __future__ import annotations
@@ -17,18 +17,23 @@ from atalante_hal.types import SupervisorState
 if TYPE_CHECKING:
     from atalante_tools.faults.observation import Observation
 
-#: Where in the first right-stance step a fault begins unless a case says otherwise: the swing leg is at its fastest.
+#: Default phase of the first right-stance step at which faults begin: the swing leg is at its fastest.
 MID_SWING: Final = 0.35
 
 
 @dataclass(frozen=True)
 class Host:
-    """A fault of the computer the HAL runs on, in the HAL's cycles.
+    """Fault of the computer that runs the HAL; times are in HAL cycles.
 
-    `late`: the cycle begins `value` seconds late. `slow`: each cycle takes `value` seconds instead of its period.
-    `raise`, `raise_in_reset`: the controller raises the builtin exception `value`.
-    `ask`: it asks for `value` Nm on every joint. `shake`: it asks the left hip for `value` Nm more and less in turn. `shape`: it
-    asks for `value` torques. `bus_down`, `bus_full`: the HAL's end of the bus raises on sending.
+    Kinds of faults:
+
+    - `late`: the cycle begins `value` seconds late.
+    - `slow`: each cycle takes `value` seconds instead of its period.
+    - `raise`, `raise_in_reset`: the controller raises the builtin exception named `value`.
+    - `ask`: the controller requests `value` Nm on every joint.
+    - `shake`: the controller alternates between `value` Nm more and `value` Nm less on the left hip.
+    - `shape`: the controller requests an array of `value` torques.
+    - `bus_down`, `bus_full`: the HAL's end of the bus raises an error on sending.
     """
 
     kind: str
@@ -39,7 +44,7 @@ class Host:
 
 @dataclass(frozen=True)
 class Press:
-    """What the operator does in one cycle: a method of `atalante_emulator.pendant.Operator`, such as stop or release."""
+    """Action of the operator in one cycle: a method of `atalante_emulator.pendant.Operator`, such as stop or release."""
 
     kind: str
     start: int = 0
@@ -47,40 +52,40 @@ class Press:
 
 
 Happening = Fault | Host | Press
-#: A further judgement of a run: one sentence when it fails.
+#: Additional check of a run; returns one sentence if it fails, else None.
 Check = Callable[["Observation"], str | None]
 
 
 @dataclass(frozen=True)
 class Case:
-    """One run."""
+    """One run of a scenario."""
 
-    name: str  # what sets it apart from the other cases of its scenario
-    happens: tuple[Happening, ...]  # `start` counts from the moment of the case
-    phase: float | None = MID_SWING  # of the first step; None: from switching on
+    name: str  # name within the scenario
+    happens: tuple[Happening, ...]  # faults and actions; `start` counts from the moment of the case
+    phase: float | None = MID_SWING  # moment of the case, as phase of the first step; None: at power-on
     begins: int = 0  # first faulty cycle, counted from the moment of the case
-    state: SupervisorState | None = None  # None: the row's, as for the three below
-    dtc: str | None = None  # "": nothing to notice
-    noticed: int | None = None  # cycles
-    reacted: int | None = None  # cycles
-    node: str | None = None  # that the diagnostic names; None: whichever
-    recovers: bool = True  # ACTIVE again after the operator's START, once it is over
-    watched: int = 60  # cycles after the end of what happens, or after the bound of what does not end
-    seed: int = 0
-    checks: tuple[Check, ...] = ()
+    state: SupervisorState | None = None  # expected state; here and in the next three, None means the value of the row
+    dtc: str | None = None  # expected diagnostic code; "" for none
+    noticed: int | None = None  # bound of the diagnostic [cycles]
+    reacted: int | None = None  # bound of the reaction [cycles]
+    node: str | None = None  # node that the diagnostic must name; None: any
+    recovers: bool = True  # whether the operator's START after the fault must lead to ACTIVE
+    watched: int = 60  # cycles observed after the end of the fault, or after the bound of a permanent fault
+    seed: int = 0  # seed of the emulator
+    checks: tuple[Check, ...] = ()  # additional checks
 
     @property
     def ends(self) -> int | None:
-        """First cycle after everything that happens, counted from the moment of the case; None: something lasts for good."""
+        """First cycle after all faults and actions, counted from the moment of the case; None if one is permanent."""
         ends = [None if one.cycles is None else one.start + one.cycles for one in self.happens]
         return None if None in ends else max((end for end in ends if end is not None), default=0)
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """The proof of one row of the matrix."""
+    """Cases that prove one row of the matrix."""
 
     id: str
     cases: tuple[Case, ...]
-    #: What of it may last for a while, as one case: how long does the walk survive it? None: nothing does.
+    #: Permanent fault for the endurance run, which measures how long the walk survives it; None: no endurance run.
     lasting: Case | None = None

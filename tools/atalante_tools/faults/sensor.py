@@ -1,4 +1,4 @@
-"""Sensors that stand still, jump, drift, freeze or say nothing of use."""
+"""Scenarios of sensor faults: stuck, jumping or drifting encoders, and failed IMUs and force cells."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from atalante_tools.faults.scenario import Case, Press, Scenario
 _ACTIVE: Final = SupervisorState.ACTIVE
 _HOLD: Final = SupervisorState.HOLD
 _KNEE: Final = "LEFT_SK"
-#: A joint that hardly moves while the left leg swings: what it may jump by is told sharply.
+#: Joint that hardly moves while the left leg swings, so that the smallest detected jump is exact.
 _QUIET: Final = "RIGHT_FH"
 _IMUS: Final = tuple(f"IMU_{name.upper()}" for name in IMUS)
 _FEET: Final = tuple(f"FOOT_{name.upper()}" for name in FEET)
-#: What the cells of a foot say under somebody's weight [N].
+#: Forces of the cells of a foot on the ground [N].
 _STANDS: Final = {f"{cell}_ForceZ": 150.0 for cell in CELLS}
-#: For good, and each of another node; the two last are of what the checks compare.
+#: Permanent faults of other nodes; the last two affect messages that the checks themselves use.
 _RIDDEN_THROUGH: Final = {
     "FOOT_LEFT doubled": Fault("duplicate", "FOOT_LEFT_STATE"),
     "FOOT_LEFT a cycle late": Fault("delay", "FOOT_LEFT_STATE"),
@@ -33,7 +33,7 @@ _RIDDEN_THROUGH: Final = {
 
 
 def _imu(kind: str, cycles: int, *, ridden: int) -> tuple[Case, ...]:
-    """Each IMU, and one for a time that is ridden through."""
+    """Return a case for each IMU, and one with a short fault during which the walk must continue."""
     return (
         *(Case(imu, (Fault(kind, imu, 0, cycles),), node=imu) for imu in _IMUS),
         Case(f"for {ridden} cycles", (Fault(kind, _IMUS[0], 0, ridden),), state=_ACTIVE, node=_IMUS[0]),
@@ -41,7 +41,7 @@ def _imu(kind: str, cycles: int, *, ridden: int) -> tuple[Case, ...]:
 
 
 def _stuck(node: str, cycles: int) -> tuple[Fault, ...]:
-    """An encoder that shows its joint where it was, jumps to where it is by then, and is referenced by a restart."""
+    """Return a stuck encoder that jumps to the true position at the end, and a restart that references it."""
     return Fault("encoder_stuck", node, 0, cycles), Fault("reset", node, cycles + 30, 3)
 
 
@@ -88,7 +88,7 @@ SCENARIOS: Final = (
             ),
             *(
                 Case(f"{1e3 * by:g} mrad for good", (Fault("encoder_jump", _QUIET, 0, 100, by=by),), node=_QUIET)
-                for by in (0.025, -0.025, 0.1, -1.0)  # five times what the joint can move in a cycle are 20 mrad
+                for by in (0.025, -0.025, 0.1, -1.0)  # a joint can move 20 mrad in five cycles
             ),
             Case(
                 "25 mrad that stay",
@@ -133,7 +133,7 @@ SCENARIOS: Final = (
             for cell, force in zip(CELLS, (400.0, 0.0, -50.0, 61.0), strict=True)
         ),
     ),
-    # They stand for 60 cycles, then both swing. Hanging alone is no fault, and after a second of it this one is forgotten.
+    # Both feet report contact for 60 cycles, then swing. Missing contact alone is no fault: after a second, it is cleared.
     Scenario(
         "F34",
         tuple(
@@ -180,7 +180,7 @@ SCENARIOS: Final = (
                 recovers=False,
                 checks=(start_is_refused,),
             ),
-            # The controller follows the encoder as long as the joint can.
+            # The controller follows the encoder until the joint reaches its limits.
             Case(
                 "RIGHT_SA at 2 rad/s",
                 (Fault("encoder_drift", "RIGHT_SA", rate=2.0),),

@@ -1,8 +1,8 @@
-"""What a campaign is made of: the cases of a fault, how long it is survived, and two faults together.
+"""Tasks of a campaign: cases of a fault, endurance runs and pairs of faults.
 
     task -> runner -> verdict
 
-A task is a few words and its result a few numbers, so both travel to another process or another computer.
+Tasks and results are small data, so that they can be sent to another process or computer.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from atalante_tools.faults.runner import observe
 from atalante_tools.faults.scenario import Case, Happening
 from atalante_tools.faults.verdict import WALKING, Expectation, Verdict, improved, judge, uncontrolled
 
-#: For how long a fault that lasts is watched [cycles]: more than a step.
+#: Duration of the faults in endurance runs [cycles]; longer than a step.
 HORIZON: Final = 1000
 #: Cycles between the first and the second fault of a pair.
 APART: Final = 3
-#: One case of each kind of fault for the pairs: ID and name of the case.
+#: Cases for the pairs, one of each kind of fault: ID and name of the case.
 REPRESENTATIVES: Final = (
     ("F03", "4 frames"),
     ("F04", "LEFT_SK"),
@@ -45,43 +45,43 @@ REPRESENTATIVES: Final = (
 
 @dataclass(frozen=True)
 class Endurance:
-    """How long the walk survives a fault."""
+    """Result of an endurance run."""
 
     id: str
     case: str
-    survived: int | None  # cycles; None: to the end of the watch
+    survived: int | None  # cycles; None if the walk continued for the whole `HORIZON`
 
 
 @dataclass(frozen=True)
 class PairVerdict:
-    """Two faults together."""
+    """Result of a pair of faults."""
 
     first: str
     second: str
-    state: str  # the supervisor's in the end
-    failures: tuple[str, ...]
+    state: str  # final state of the HAL
+    failures: tuple[str, ...]  # one sentence each
 
 
 @dataclass(frozen=True)
 class CaseTask:
-    """One case of a scenario."""
+    """Task to run one case of a scenario."""
 
     id: str
     index: int
 
     def __call__(self) -> Verdict:
-        """Run and judge."""
+        """Run the case and return its verdict."""
         return attempt(self.id, SCENARIOS[self.id].cases[self.index])
 
 
 @dataclass(frozen=True)
 class EnduranceTask:
-    """How long the walk survives what of a scenario may last."""
+    """Task to measure how long the walk survives the permanent fault of a scenario."""
 
     id: str
 
     def __call__(self) -> Endurance:
-        """Let it last: the walk ends after some cycles, or it does not; show that one less is survived, or shorten it on."""
+        """Shorten the fault until the walk survives it, and return the largest number of cycles that it survives."""
         case = SCENARIOS[self.id].lasting
         assert case is not None
         cycles = HORIZON
@@ -92,13 +92,17 @@ class EnduranceTask:
 
 @dataclass(frozen=True)
 class PairTask:
-    """Two of the representatives, the second `APART` cycles after the first."""
+    """Task to run two of the representatives, the second `APART` cycles after the first."""
 
     first: tuple[str, str]
     second: tuple[str, str]
 
     def __call__(self) -> PairVerdict:
-        """Run: nothing out of control, nothing better by itself, and in the end as bad a state as each of the two asks for."""
+        """Run the pair and check limits, states and the final state.
+
+        No limit may be exceeded, and the state may not improve without the operator. The final state must be at least as severe
+        as that of each fault alone.
+        """
         matrix = load_matrix()
         cases = [_named(*which) for which in (self.first, self.second)]
         wanted = [
@@ -114,7 +118,7 @@ class PairTask:
         failures = [*uncontrolled(seen), *improved(seen, seen.last)]
         state, worst = seen.state(seen.last), max(one.state for one in wanted)
         if state < worst:
-            failures.append(f"{state.name}, where one of them alone ends in {worst.name}")
+            failures.append(f"the final state must be at least {worst.name}, as of one fault alone, got {state.name}")
         return PairVerdict(first, second, state.name, tuple(failures))
 
 
@@ -123,7 +127,12 @@ Result = Verdict | Endurance | PairVerdict
 
 
 def attempt(id_: str, case: Case) -> Verdict:
-    """Run a case of the scenario of a row and judge it; a crash is a failed case."""
+    """Run a case and return its verdict; a crash is a failed case.
+
+    Args:
+        id_: ID of the row of the matrix.
+        case: case of its scenario.
+    """
     row = load_matrix()[id_]
     wanted = Expectation.of(case, row)
     try:
@@ -134,7 +143,13 @@ def attempt(id_: str, case: Case) -> Verdict:
 
 
 def plan(ids: Sequence[str], *, endurance: bool, pairs: bool) -> list[Task]:
-    """The tasks of a campaign over the scenarios of these IDs, the long ones first."""
+    """Return the tasks of a campaign, the long ones first.
+
+    Args:
+        ids: IDs of the scenarios.
+        endurance: whether to include endurance runs.
+        pairs: whether to include the pairs of the representatives.
+    """
     chosen = [SCENARIOS[id_] for id_ in ids]
     tasks: list[Task] = []
     if endurance:
@@ -145,18 +160,22 @@ def plan(ids: Sequence[str], *, endurance: bool, pairs: bool) -> list[Task]:
     return tasks
 
 
-#: The runs of a process share a controller, and a worker of dask may have several threads.
+#: Lock for one run at a time, because the runs of a process share a controller and dask workers may have several threads.
 _one_at_a_time = threading.Lock()
 
 
 def run_task(task: Task) -> Result:
-    """What a worker does."""
+    """Run a task in a worker.
+
+    Args:
+        task: task to run.
+    """
     with _one_at_a_time:
         return task()
 
 
 def _walked(case: Case, cycles: int) -> int | None:
-    """Cycles the robot walked on while it lasted that long; None: it walked to the end."""
+    """Run a permanent fault for some cycles and return after how many the walk ended, None if it did not end."""
     lasting = replace(case, happens=tuple(_lasting(one, cycles) for one in case.happens))
     seen = observe(lasting, cycles, recovery=False)
     for cycle in range(seen.first, seen.last + 1):
@@ -170,7 +189,7 @@ def _named(id_: str, name: str) -> Case:
 
 
 def _lasting(one: Happening, cycles: int) -> Happening:
-    """For that many cycles, if it is for good."""
+    """Return a permanent fault with a duration of `cycles`; return any other unchanged."""
     if one.cycles is not None:
         return one
     if isinstance(one, Fault):
@@ -179,7 +198,7 @@ def _lasting(one: Happening, cycles: int) -> Happening:
 
 
 def _shifted(one: Happening, cycles: int) -> Happening:
-    """The same, later."""
+    """Return the same fault or action, starting `cycles` later."""
     return one.starting(one.start + cycles) if isinstance(one, Fault) else replace(one, start=one.start + cycles)
 
 

@@ -1,9 +1,11 @@
-"""Judging a run: the four things every fault is asked, each failed one told in a sentence.
+"""Evaluation of a run by four checks; each failure is one sentence.
 
     observation + row of the matrix -> verdict
 
-1. the state is right, by the bound; 2. the diagnostic is there, by the bound; 3. no command outside the limits left, and no drive
-or joint went where it must not; 4. nothing got better by itself, and after the operator's START the walk goes on if it may.
+1. The state is reached within its bound.
+2. The diagnostic is reported within its bound.
+3. No command exceeded its limits, and no motor or joint did.
+4. The state improved only by an action of the operator, and START led to ACTIVE if it may.
 """
 
 from __future__ import annotations
@@ -25,64 +27,74 @@ from atalante_tools.faults.scenario import Case
 _S = SupervisorState
 #: States in which the controller drives the joints.
 WALKING: Final = (_S.ACTIVE, _S.FULL_ASSIST, _S.FINISH_STEP)
-#: How far past its limit a joint may swing when its drive stops it [rad], and how fast it may be against its limit.
+#: Allowed overshoot past the position limit when a drive stops its joint [rad].
 _OVERSHOOT: Final = 0.05
+#: Allowed ratio of joint velocity to velocity limit.
 _HASTE: Final = 1.2
 
 
 @dataclass(frozen=True)
 class Expectation:
-    """What has to come of a case: its own words, and its row's where it says nothing."""
+    """Expected result of a case, with the values of its row where the case has none."""
 
     state: SupervisorState
-    dtc: str  # a regular expression: one code, or several
-    noticed: int
-    reacted: int
+    dtc: str  # regular expression of the diagnostic code; empty: none expected
+    noticed: int  # bound of the diagnostic [cycles]
+    reacted: int  # bound of the reaction [cycles]
 
     @classmethod
     def of(cls, case: Case, row: Row) -> Expectation:
-        """Of a case of the scenario of a row.
+        """Return the expectation of a case.
+
+        Args:
+            case: case of the scenario.
+            row: row of the matrix that the scenario proves.
 
         Raises:
-            ValueError: neither says within how many cycles.
+            ValueError: If neither case nor row has a bound in cycles.
         """
         noticed = row.noticed if case.noticed is None else case.noticed
         reacted = row.reacted if case.reacted is None else case.reacted
         if noticed is None or reacted is None:
             raise ValueError(
-                f"{row.id} {case.name}: its row says {row.cycles!r}, so the case has to say how many cycles"
+                f"{row.id} {case.name}: `noticed` and `reacted` must be given, because the bound of the row is "
+                f"{row.cycles!r} and no number of cycles"
             )
         state = row.state if case.state is None else case.state
         return cls(state, row.dtc if case.dtc is None else case.dtc, noticed, reacted)
 
     @property
     def walks_on(self) -> bool:
-        """The fault is ridden through."""
+        """Whether the walk must continue during the fault."""
         return self.state is _S.ACTIVE
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """One case, judged."""
+    """Result of one case."""
 
     id: str
     case: str
-    state: str  # the supervisor's before the operator's START
-    cycles: (
-        int | None
-    )  # from the first faulty one to the reaction or, ridden through, to the diagnostic; None: neither came
-    bound: int  # for them
-    dtc: str  # the code that was noted, of those asked for
+    state: str  # state of the HAL before the operator's START
+    cycles: int | None  # cycles to the reaction, else to the diagnostic; None if there was neither
+    bound: int  # bound of `cycles`
+    dtc: str  # first matching diagnostic code that was reported
     failures: tuple[str, ...]  # one sentence each
 
     @property
     def passed(self) -> bool:
-        """Nothing failed."""
+        """Whether no check failed."""
         return not self.failures
 
 
 def judge(row: Row, case: Case, seen: Observation) -> Verdict:
-    """All four."""
+    """Run all four checks and the additional checks of the case.
+
+    Args:
+        row: row of the matrix.
+        case: case that was run.
+        seen: observation of the run.
+    """
     wanted = Expectation.of(case, row)
     reaction = reacted(seen, wanted.state)
     failures = [
@@ -100,9 +112,14 @@ def judge(row: Row, case: Case, seen: Observation) -> Verdict:
 
 
 def reacted(seen: Observation, state: SupervisorState) -> int | None:
-    """First cycle in which what was commanded is the reaction: the HOLD frame for HOLD and worse, else the supervisor's state.
+    """Return the first cycle with the reaction, None if there was none.
 
-    For ACTIVE, where no reaction is wanted, the first cycle in which there was one.
+    The reaction is a command without ENABLE OPERATION for HOLD and worse, else the state itself. If ACTIVE is expected, the
+    first cycle with any reaction is returned.
+
+    Args:
+        seen: observation of the run.
+        state: expected state.
     """
     for cycle in range(seen.first, seen.last + 1):
         now = seen.state(cycle)
@@ -115,10 +132,14 @@ def reacted(seen: Observation, state: SupervisorState) -> int | None:
 
 
 def uncontrolled(seen: Observation) -> list[str]:
-    """What must never be, whatever happens: on the wire, at the drives, at the joints."""
+    """Return one sentence for each limit that a command, a motor or a joint exceeded.
+
+    Args:
+        seen: observation of the run.
+    """
     robot = seen.robot
     found = seen.commands.outside(robot)
-    for what, wrong in (
+    for sentence, wrong in (
         ("a motor's torque was beyond its limit", np.abs(seen.torque) > robot.torque_max * (1.0 + 1e-9)),
         ("a joint was beyond its limit", seen.position > robot.position_max + _OVERSHOOT),
         ("a joint was beyond its limit", seen.position < robot.position_min - _OVERSHOOT),
@@ -126,12 +147,17 @@ def uncontrolled(seen: Observation) -> list[str]:
     ):
         if wrong.any():
             row, joint = (int(index) for index in np.argwhere(wrong)[0])
-            found.append(f"{what}: {JOINTS[joint]} in cycle {row + 1}")
+            found.append(f"{sentence}: {JOINTS[joint]} in cycle {row + 1}")
     return found
 
 
 def improved(seen: Observation, until: int) -> list[str]:
-    """A sentence if the supervisor's state got better between the first faulty cycle and `until`."""
+    """Return a sentence if the state improved without the operator after the first faulty cycle.
+
+    Args:
+        seen: observation of the run.
+        until: last cycle to check.
+    """
     for cycle in range(seen.first + 1, until + 1):
         if seen.state(cycle) < seen.state(cycle - 1):
             return [f"{seen.state(cycle).name} in cycle {cycle} without the operator"]
@@ -140,18 +166,18 @@ def improved(seen: Observation, until: int) -> list[str]:
 
 def _state(seen: Observation, case: Case, wanted: Expectation, reaction: int | None) -> list[str]:
     if case.phase is not None and seen.state(seen.first - 1) is not _S.ACTIVE:
-        return [f"the robot was {seen.state(seen.first - 1).name} and did not walk when it began"]
+        return [f"the robot must be ACTIVE before the fault, got {seen.state(seen.first - 1).name}"]
     if wanted.walks_on:
         if reaction is None:
             return []
-        return [f"{seen.state(reaction).name} after {seen.latency(reaction)} cycles, where it should walk on"]
+        return [f"the robot must stay ACTIVE, got {seen.state(reaction).name} after {seen.latency(reaction)} cycles"]
     if reaction is None:
         return [f"no {wanted.state.name} within {seen.latency(seen.quiet)} cycles"]
     found = []
     if seen.latency(reaction) > wanted.reacted:
-        found.append(f"{wanted.state.name} after {seen.latency(reaction)} cycles, and {wanted.reacted} are allowed")
+        found.append(f"{wanted.state.name} must come within {wanted.reacted} cycles, got {seen.latency(reaction)}")
     if seen.state(seen.quiet) is not wanted.state:
-        found.append(f"the robot ended in {seen.state(seen.quiet).name}, not in {wanted.state.name}")
+        found.append(f"the final state must be {wanted.state.name}, got {seen.state(seen.quiet).name}")
     return found
 
 
@@ -160,28 +186,30 @@ def _diagnostic(seen: Observation, case: Case, wanted: Expectation) -> list[str]
         return []
     noted = _noted(seen, wanted)
     if not noted:
-        return [f"no {wanted.dtc}; noted were {', '.join(dict.fromkeys(seen.codes())) or 'none'}"]
+        return [f"no {wanted.dtc}; reported codes: {', '.join(dict.fromkeys(seen.codes())) or 'none'}"]
     nodes = sorted({event.node for event in noted})
     if case.node is not None and case.node not in nodes:
-        return [f"{wanted.dtc} names {', '.join(nodes)}, not {case.node}"]
+        return [f"{wanted.dtc} must name {case.node}, got {', '.join(nodes)}"]
     latency = min(seen.latency(event.cycle) for event in noted if case.node in (None, event.node))
     if latency > wanted.noticed:
-        return [f"{wanted.dtc} after {latency} cycles, and {wanted.noticed} are allowed"]
+        return [f"{wanted.dtc} must come within {wanted.noticed} cycles, got {latency}"]
     return []
 
 
 def _noted(seen: Observation, wanted: Expectation) -> list[Event]:
-    """The diagnostics that were asked for."""
+    """Return the events with the expected diagnostic code since the fault began."""
     return [event for event in seen.events if event.cycle >= seen.first and re.fullmatch(wanted.dtc, event.code)]
 
 
 def _recovery(seen: Observation, case: Case, wanted: Expectation) -> list[str]:
-    found = [] if case.phase is None else improved(seen, seen.quiet)  # switching on is an improvement
+    found = (
+        [] if case.phase is None else improved(seen, seen.quiet)
+    )  # at power-on the state improves without the operator
     if seen.pressed is None:
         return found
     again = _S.ACTIVE in (seen.state(cycle) for cycle in range(seen.pressed, seen.last + 1))
     if again and not case.recovers:
-        found.append("ACTIVE again after START, while the fault lasts")
+        found.append("the robot must not be ACTIVE after START, because the fault persists")
     if not again and case.recovers:
-        found.append(f"the operator's START led to {seen.state(seen.last).name}, not to ACTIVE")
+        found.append(f"the operator's START must lead to ACTIVE, got {seen.state(seen.last).name}")
     return found

@@ -1,1 +1,1 @@
-"""The pytest plugin: fixtures for tests on the emulated robot and on hardware."""
+"""Pytest plugin with fixtures for tests on the emulated robot and on hardware."""

@@ -1,8 +1,8 @@
-"""Faults of the wire, by name: a bus that loses, delays or damages what somebody asked for, and tells what it let through.
+"""Communication faults for tests: a bus that loses, delays or damages frames of chosen messages, and records the others.
 
     HAL <- FrameFilter <- bus        HAL -> FrameFilter -> bus
 
-Messages the HAL sends are met on their way out, all others on their way in.
+Faults of messages from the HAL act in `send`, faults of all other messages in `receive`.
 """
 
 from __future__ import annotations
@@ -21,49 +21,49 @@ from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.transceiver import FrameTap
 from atalante_hal.wire.frame import Frames, as_words
 
-#: Frames of one batch that can be held back and come later together.
+#: Largest number of delayed frames that arrive in one batch.
 _ROOM: Final = 128
 
 
 @dataclass
 class Fault:
-    """Something that happens to frames until `frames` of each message were hit, or `end()`."""
+    """Fault of chosen messages; it ends after `frames` frames of each message, or with `end()`."""
 
-    kind: str
-    messages: tuple[str, ...]
-    ids: frozenset[int]
-    probability: float
-    frames: int | None  # of each message; None: until it ends
-    cycles: int = 0  # of a delay
-    bit: int | None = None  # of a damage; None: one at random
-    hits: dict[int, int] = field(default_factory=dict)  # frame id -> frames hit
+    kind: str  # drop, delay or corrupt
+    messages: tuple[str, ...]  # names of the messages
+    ids: frozenset[int]  # identifiers of the messages
+    probability: float  # probability that a frame is affected
+    frames: int | None  # number of frames of each message; None: no limit
+    cycles: int = 0  # duration of a delay [cycles]
+    bit: int | None = None  # index of the bit to damage; None: random
+    hits: dict[int, int] = field(default_factory=dict)  # identifier -> number of affected frames
 
     @property
     def hit(self) -> int:
-        """Frames hit so far."""
+        """Number of frames affected so far."""
         return sum(self.hits.values())
 
     def end(self) -> None:
-        """Hit nothing any more."""
+        """End the fault."""
         self.frames = 0
 
     @property
     def over(self) -> bool:
-        """It will hit nothing any more."""
+        """Whether the fault has ended."""
         return self.frames is not None and all(self.hits.get(frame_id, 0) >= self.frames for frame_id in self.ids)
 
 
 class FrameFilter(WrappedBus):
-    """A bus with faults. Without any it passes everything on.
+    """Bus with faults; without a fault it passes all frames.
 
-    A frame that was delayed, or comes behind one that was dropped, has another's stamp.
+    Time stamps are not shifted with the frames: a delayed frame, or a frame after a dropped one, has the stamp of another frame.
 
     Args:
-        bus: owned by the caller.
-        tap: sees what really was sent and received.
-        step: makes the other end answer, for one that is polled in this process: called before every look at the bus, which
-            then waits for nothing.
-        seed: of everything that happens at random.
+        bus: wrapped bus, owned by the caller.
+        network: nodes and messages of the DBC.
+        tap: records the frames that pass.
+        step: makes the emulated robot in this process answer. It is called before every receive, which then does not wait.
+        seed: seed of the random faults.
     """
 
     def __init__(
@@ -90,19 +90,35 @@ class FrameFilter(WrappedBus):
         """Lose frames.
 
         Args:
-            what: a message (LEFT_SK_STATE), a node (LEFT_SK: all it sends), or a pattern of either (LEFT_*, *_STATE).
-            frames: how many of each message; None: until the fault ends.
-            probability: of each frame to be hit.
+            what: name of a message (LEFT_SK_STATE), of a node (LEFT_SK: all its messages), or a pattern (LEFT_*, *_STATE).
+            frames: number of frames of each message. None means until the fault ends.
+            probability: probability that a frame is affected, above 0 to 1.
+
+        Returns:
+            The fault, to end it or to count its frames.
 
         Raises:
-            ValueError: there is no such message or node.
+            ValueError: If there is no such message or node, or the probability is out of range.
         """
         return self._add("drop", what, frames, probability)
 
     def delay(self, what: str, cycles: int, *, frames: int | None = None, probability: float = 1.0) -> Fault:
-        """Let frames arrive some cycles later. Raises `ValueError`; see `drop`."""
+        """Delay frames.
+
+        Args:
+            what: name or pattern of messages or nodes, as in `drop`.
+            cycles: delay in cycles, from 1.
+            frames: number of frames of each message. None means until the fault ends.
+            probability: probability that a frame is affected, above 0 to 1.
+
+        Returns:
+            The fault, to end it or to count its frames.
+
+        Raises:
+            ValueError: If an argument is out of range, or there is no such message or node.
+        """
         if cycles < 1:
-            raise ValueError(f"a delay is one cycle or more, not {cycles}")
+            raise ValueError(f"cycles of a delay must be 1 or more, got {cycles}")
         fault = self._add("delay", what, frames, probability)
         fault.cycles = cycles
         return fault
@@ -110,24 +126,37 @@ class FrameFilter(WrappedBus):
     def corrupt(
         self, what: str, *, bit: int | None = None, frames: int | None = None, probability: float = 1.0
     ) -> Fault:
-        """Damage one bit of the payload, at random unless given. Raises `ValueError`; see `drop`."""
+        """Invert one bit of the payload.
+
+        Args:
+            what: name or pattern of messages or nodes, as in `drop`.
+            bit: index of the bit, modulo the payload length. None means a random bit.
+            frames: number of frames of each message. None means until the fault ends.
+            probability: probability that a frame is affected, above 0 to 1.
+
+        Returns:
+            The fault, to end it or to count its frames.
+
+        Raises:
+            ValueError: If an argument is out of range, or there is no such message or node.
+        """
         fault = self._add("corrupt", what, frames, probability)
         fault.bit = bit
         return fault
 
     def clear(self) -> None:
-        """End every fault; what is delayed still arrives."""
+        """End all faults; delayed frames still arrive."""
         self.faults.clear()
 
     def _add(self, kind: str, what: str, frames: int | None, probability: float) -> Fault:
         if not 0.0 < probability <= 1.0:
-            raise ValueError(f"a probability is above 0 and at most 1, not {probability}")
+            raise ValueError(f"probability must be above 0 and at most 1, got {probability}")
         messages = [m for m in self._network.messages if fnmatchcase(m.name, what) or fnmatchcase(m.sender, what)]
         if not messages:
             names = [*(m.name for m in self._network.messages), *(n.name for n in self._network.nodes)]
             near = difflib.get_close_matches(what.upper(), names, 3)
             hint = f"; did you mean {' or '.join(near)}?" if near else ""
-            raise ValueError(f"no message and no node is called {what!r}{hint}")
+            raise ValueError(f"no message or node has the name {what!r}{hint}")
         names_hit, ids = tuple(m.name for m in messages), frozenset(m.frame_id for m in messages)
         fault = Fault(kind, names_hit, ids, probability, frames)
         self.faults.append(fault)
@@ -136,7 +165,11 @@ class FrameFilter(WrappedBus):
     # -- bus -----------------------------------------------------------------------------------------------------------
 
     def send(self, frames: Frames) -> None:
-        """As `Bus.send`."""
+        """Send frames that pass the faults; see `Bus.send`.
+
+        Args:
+            frames: frames to send, shape (n,).
+        """
         if not self._syncs.isdisjoint(frames["can_id"].tolist()):
             self._cycle += 1
         if self.faults or self._late[0]:
@@ -147,7 +180,15 @@ class FrameFilter(WrappedBus):
                 self.tap.sent(frames)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """As `Bus.receive`."""
+        """Receive frames that pass the faults; see `Bus.receive`.
+
+        Args:
+            frames: receive buffer, shape (n,).
+            timeout: longest wait for the first frame [s].
+
+        Returns:
+            Number of frames in the buffer.
+        """
         if self._step is not None:
             self._step()
             timeout = 0.0
@@ -161,12 +202,12 @@ class FrameFilter(WrappedBus):
         return count
 
     def _through(self, frames: Frames, late: list[tuple[int, Frames]]) -> Frames:
-        """What arrives of a batch, with what was held back before and is due now. A copy."""
+        """Return a copy of the frames of a batch that pass, after the delayed frames that are due."""
         due = [frame for cycle, frame in late if cycle <= self._cycle][:_ROOM]
         late[:] = [(cycle, frame) for cycle, frame in late if cycle > self._cycle]
         arriving = due
-        for place, frame_id in enumerate(frames["can_id"].tolist()):
-            frame: Frames = frames[place : place + 1].copy()
+        for row, frame_id in enumerate(frames["can_id"].tolist()):
+            frame: Frames = frames[row : row + 1].copy()
             fault = next((f for f in self.faults if frame_id in f.ids and self._hits(f, frame_id)), None)
             if fault is None:
                 arriving.append(frame)

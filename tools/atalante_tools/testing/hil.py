@@ -1,6 +1,6 @@
-"""What the pytest plugin's fixtures are made of: a bus with the robot on it, the loop in steps, a recording.
+"""Parts of the pytest fixtures: a bus with the robot on it, the loop in steps and a recording of the frames.
 
-With an emulated robot everything is in lock-step: on a wire it is polled whenever the HAL listens.
+An emulated robot runs in lock-step with the HAL; on a wire it is polled before every receive of the HAL.
 """
 
 from __future__ import annotations
@@ -29,46 +29,61 @@ from atalante_tools.session.rig import join, open_buses
 if TYPE_CHECKING:
     from atalante_emulator.emulator import Emulator
 
-#: How long the emulated robot listens on a wire for a cycle [s], and how long a wire must be quiet before it is put there.
+#: Longest wait of the emulated robot for the frames of a cycle on a wire [s].
 _POLL: Final = 0.01
+#: Time without a frame before an emulated robot is connected to a wire [s].
 _QUIET: Final = 0.15
-#: Frames a recording keeps: the last half minute or so.
+#: Largest number of frames in a recording, about half a minute.
 KEPT: Final = 600_000
 #: Time between two frames of a cycle in a recording of virtual time [ns].
 _FRAME_NS: Final = 20_000
 
 
 class WireTaken(BusError):  # noqa: N818
-    """Somebody is on the bus an emulated robot was to be put on."""
+    """Bus with frames of another robot, on which an emulated robot cannot run."""
 
 
 def open_line(network: Network, target: Target, *, emulated: bool) -> tuple[Bus, Bus | None]:
-    """The HAL's bus, and the end for an emulated robot unless a real one is there.
+    """Open the HAL's end of the bus, and the other end if the robot is emulated.
+
+    Args:
+        network: nodes and messages of the DBC.
+        target: interface and channels.
+        emulated: whether the robot is emulated.
+
+    Returns:
+        The HAL's end, and the end for the emulated robot, None for a real robot.
 
     Raises:
-        BusError: the bus is not there.
-        WireTaken: an emulated robot is wanted where somebody talks already.
+        BusError: If the bus cannot be opened.
+        WireTaken: If the robot is emulated but another robot sends frames on the bus.
     """
     if target.embedded:
         return lockstep_pair()
     ours = join(network, open_buses(network, target))
     if not emulated:
         return ours, None
-    # A robot sends heartbeats whether it is asked or not.
+    # A robot sends heartbeats also without SYNC.
     scratch = new_frames(1)
     if ours.receive(scratch, _QUIET):
         ours.close()
         raise WireTaken(
-            f"somebody sends {int(scratch['can_id'][0]):#x} on {target}: a test that wants the robot that is there says "
-            "@pytest.mark.hil, all others need a bus of their own"
+            f"{target} must be free for the emulated robot, got frame {int(scratch['can_id'][0]):#x}: mark tests of the "
+            "connected robot with @pytest.mark.hil, and run all others on another bus"
         )
     return ours, join(network, open_buses(network, target))
 
 
 @contextmanager
 def emulated_robot(network: Network, robot: Robot, theirs: Bus) -> Iterator[Emulator]:
-    """The emulated robot at its end, with an operator who starts it as soon as it is ready."""
-    with open_body(robot) as body:  # says what to install where there is no PyBullet
+    """Run the emulated robot on its end of the bus, with an operator who presses START when the HAL is READY.
+
+    Args:
+        network: nodes and messages of the DBC.
+        robot: joint properties.
+        theirs: end of the bus for the robot.
+    """
+    with open_body(robot) as body:  # without PyBullet, its error names the package to install
         from atalante_emulator.emulator import Emulator
         from atalante_emulator.pendant import Operator
 
@@ -76,7 +91,15 @@ def emulated_robot(network: Network, robot: Robot, theirs: Bus) -> Iterator[Emul
 
 
 def answering(ours: Bus, emulator: Emulator) -> Callable[[], object] | None:
-    """What makes the emulated robot answer on a wire: to be called whenever the HAL listens. None: the pair does it itself."""
+    """Connect the emulated robot to the receive calls of the HAL.
+
+    Args:
+        ours: HAL's end of the bus.
+        emulator: emulated robot at the other end.
+
+    Returns:
+        Function to call before every receive of the HAL. None for a `PairBus`, which calls the emulator directly.
+    """
     if isinstance(ours, PairBus):
         ours.step = emulator.poll
         return None
@@ -84,7 +107,7 @@ def answering(ours: Bus, emulator: Emulator) -> Callable[[], object] | None:
 
 
 class Stepper:
-    """The HAL's loop, some cycles at a time. Unless `controller` is another, the robot holds the pose it became active in."""
+    """HAL loop in steps. The default `controller` holds the pose in which the robot became ACTIVE."""
 
     def __init__(self, hal: Hal, clock: Clock) -> None:
         self.hal = hal
@@ -94,7 +117,7 @@ class Stepper:
 
     @property
     def state(self) -> State:
-        """Of the last cycle."""
+        """State of the last cycle."""
         return self.hal.state
 
     @property
@@ -103,7 +126,7 @@ class Stepper:
         return [event.code for event in self.hal.events]
 
     def cycle(self) -> State:
-        """One cycle."""
+        """Run one cycle and return its state."""
         self._clock.wait()
         state = self.hal.read()
         if self.hal.moving:
@@ -118,44 +141,61 @@ class Stepper:
         return state
 
     def run(self, cycles: int) -> State:
-        """Some cycles; the state of the last one."""
+        """Run some cycles and return the state of the last one.
+
+        Args:
+            cycles: number of cycles.
+        """
         for _ in range(cycles):
             self.cycle()
         return self.state
 
     def until(self, wanted: SupervisorState, cycles: int = 2000) -> State:
-        """Cycles until the supervisor is in a state.
+        """Run cycles until the HAL is in a state, and return the last state.
+
+        Args:
+            wanted: state to wait for.
+            cycles: largest number of cycles.
 
         Raises:
-            AssertionError: it is not within `cycles`; says why.
+            AssertionError: If the state is not reached within `cycles`.
         """
         for _ in range(cycles):
             if self.cycle().supervisor is wanted:
                 return self.state
         missing = ", ".join(self.hal.missing()) or "none"
         raise AssertionError(
-            f"not {wanted.name} after {cycles} cycles but {self.state.supervisor.name}: {self.hal.reason}; "
+            f"the HAL must be {wanted.name} within {cycles} cycles, got {self.state.supervisor.name}: {self.hal.reason}; "
             f"missing nodes: {missing}"
         )
 
 
 class Recording:
-    """Every frame that passed between the HAL and the nodes (a `hal.FrameTap`); the oldest go when there are too many."""
+    """Recording of all frames between HAL and nodes, as `FrameTap`; the oldest are dropped above `KEPT` frames."""
 
     def __init__(self, network: Network) -> None:
         self._network = network
         self._batches: list[tuple[Frames, Stamps, bool]] = []
         self._count = 0
         self._cycle, self._in_cycle = 0, 0
-        #: The HAL's cycle, from which frames have their time: that of the robot, not of the wall.
+        #: Returns the HAL cycle, from which the time stamps are computed: robot time, not wall-clock time.
         self.cycle: Callable[[], int] = lambda: 0
 
     def sent(self, frames: Frames) -> None:
-        """As `FrameTap.sent`."""
+        """Record sent frames; see `FrameTap.sent`.
+
+        Args:
+            frames: frames of the HAL, shape (n,).
+        """
         self._add(frames, sent=True)
 
     def received(self, frames: Frames, count: int) -> None:
-        """As `FrameTap.received`."""
+        """Record received frames; see `FrameTap.received`.
+
+        Args:
+            frames: receive buffer.
+            count: number of frames in it.
+        """
         self._add(frames[:count], sent=False)
 
     def _add(self, frames: Frames, *, sent: bool) -> None:
@@ -170,24 +210,33 @@ class Recording:
             self._count -= len(self._batches.pop(0)[0])
 
     def __len__(self) -> int:
-        """Frames kept."""
+        """Return the number of recorded frames."""
         return self._count
 
     def of(self, message: str) -> Frames:
-        """The frames of one message, oldest first. Shape (n,).
+        """Return the recorded frames of one message, oldest first, shape (n,).
+
+        Args:
+            message: name of the message.
 
         Raises:
-            KeyError: there is no such message.
+            KeyError: If there is no such message.
         """
         frame_id = self._network.message(message).frame_id
         batches = [frames[frames["can_id"] == frame_id] for frames, _, _ in self._batches]
         return np.concatenate(batches) if batches else new_frames(0)
 
     def save(self, path: Path) -> Path:
-        """Write a CAN log; the suffix says in what format.
+        """Write the recording to a CAN log.
+
+        Args:
+            path: file to write; its suffix selects the format.
+
+        Returns:
+            The path.
 
         Raises:
-            SinkError: it cannot be written.
+            SinkError: If the file cannot be written.
         """
         network = self._network
         with CanLog(path, network.buses, {m.frame_id: m.bus for m in network.messages}) as log:

@@ -1,15 +1,15 @@
-"""pytest fixtures for tests against the robot: the emulated one in this process, or the real one with `--can-interface`.
+"""Pytest fixtures for tests with a robot: an emulated robot in this process, or a real robot with `--can-interface`.
 
-    bus -> faults -> hal -> loop          emulator: the other end          recorded_run: what passed
+    emulator -> bus -> faults -> hal -> loop          recorded_run: all frames
 
-- `emulator` the emulated robot, `emulator.operator` who holds its pendant;
-- `bus`, `hal` the HAL's end of the line, and the HAL on it;
-- `loop` cycles of the HAL: `loop.until(ACTIVE)`, `loop.run(20)`, `loop.state`, `loop.codes`;
-- `faults` of the wire, by name: `faults.drop("LEFT_SK_STATE", frames=5)`, `delay`, `corrupt`;
-- `recorded_run` every frame that passed; written as a CAN log when the test fails.
+- `emulator`: emulated robot; `emulator.operator` holds its pendant.
+- `bus`, `hal`: HAL's end of the bus, and the HAL on it.
+- `loop`: cycles of the HAL: `loop.until(ACTIVE)`, `loop.run(20)`, `loop.state`, `loop.codes`.
+- `faults`: communication faults by name: `faults.drop("LEFT_SK_STATE", frames=5)`, `delay`, `corrupt`.
+- `recorded_run`: all frames of the test, written to a CAN log if the test fails.
 
-A test marked `hil` is for the robot that is on the bus, without emulator. Where the bus a test needs is missing the test fails
-with what to type, unless `--can-missing=skip` says otherwise. This module is loaded into every pytest run: it imports nothing.
+A test marked `hil` runs with the robot on the bus, without emulator. If the bus is missing, the test fails and names the options
+to use; `--can-missing=skip` skips it instead. Every pytest run loads this module, so it imports nothing heavy.
 """
 
 from __future__ import annotations
@@ -34,31 +34,36 @@ _recording_key = pytest.StashKey["Recording"]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Options."""
+    """Add the command line options of the plugin.
+
+    Args:
+        parser: pytest's parser.
+    """
     group = parser.getgroup("atalante", "Atalante HAL")
     group.addoption(
         "--can-interface",
         default=_EMBEDDED,
         metavar="NAME",
-        help="socketcan, virtual, pcan, ... or embedded: an emulated robot in this process (default)",
+        help="CAN interface (socketcan, virtual, pcan, ...), or embedded for an emulated robot in this process (default)",
     )
     group.addoption(
         "--can-channel",
         default="",
         metavar="CHANNEL",
-        help="for all four buses (vcan0), or one each: left_leg=can0,right_leg=can1,left_sense=can2,right_sense=can3",
+        help="one channel for all four buses (vcan0), or one per bus: "
+        "left_leg=can0,right_leg=can1,left_sense=can2,right_sense=can3",
     )
     group.addoption(
         "--can-missing",
         choices=("fail", "skip"),
         default="fail",
-        help="what becomes of a test whose bus is not there (default: fail)",
+        help="result of a test whose bus is missing (default: fail)",
     )
     group.addoption(
         "--can-log",
         choices=("failed", "always", "never"),
         default="failed",
-        help="of which tests the frames are written to a CAN log (default: failed)",
+        help="tests whose frames are written to a CAN log (default: failed)",
     )
     group.addoption(
         "--can-log-dir", default="runs/can-logs", metavar="DIR", help="folder of the CAN logs (default: %(default)s)"
@@ -66,8 +71,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Marker, and options that make no sense."""
-    config.addinivalue_line("markers", "hil: for the robot on the bus of --can-interface; without the emulator")
+    """Add the marker and check the options.
+
+    Args:
+        config: pytest's configuration.
+    """
+    config.addinivalue_line("markers", "hil: run with the robot on the bus of --can-interface, without the emulator")
     interface, channel = config.getoption("--can-interface"), config.getoption("--can-channel")
     if interface == _EMBEDDED and channel:
         raise pytest.UsageError(f"--can-channel {channel} needs an interface: --can-interface socketcan")
@@ -77,7 +86,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Write the CAN log of a test that recorded one, and say where it is."""
+    """Write the CAN log of a test with a recording and add its path to the report.
+
+    Args:
+        item: test item.
+    """
     report = yield
     recording = item.stash.get(_recording_key, None)
     wanted = item.config.getoption("--can-log")
@@ -102,10 +115,10 @@ def _write_log(item: pytest.Item, report: pytest.TestReport, recording: Recordin
         report.user_properties.append(("can_log", str(path)))
 
 
-def _missing(request: pytest.FixtureRequest, what: str) -> NoReturn:
+def _missing(request: pytest.FixtureRequest, reason: str) -> NoReturn:
     if request.config.getoption("--can-missing") == "skip":
-        pytest.skip(what)
-    pytest.fail(f"{what}; --can-missing=skip leaves such tests out", pytrace=False)
+        pytest.skip(reason)
+    pytest.fail(f"{reason}; use --can-missing=skip to skip such tests", pytrace=False)
 
 
 def _is_hil(request: pytest.FixtureRequest) -> bool:
@@ -128,7 +141,7 @@ def _atalante_robot() -> Robot:
 
 @pytest.fixture
 def _atalante_line(request: pytest.FixtureRequest, _atalante_network: Network) -> Iterator[tuple[Bus, Bus | None]]:
-    """Both ends of the line."""
+    """Open both ends of the bus."""
     from atalante_hal.bus import BusAbsent
     from atalante_tools.console.options import Target
     from atalante_tools.testing.hil import WireTaken, open_line
@@ -136,7 +149,7 @@ def _atalante_line(request: pytest.FixtureRequest, _atalante_network: Network) -
     interface, channel = request.config.getoption("--can-interface"), request.config.getoption("--can-channel")
     target = Target(interface, channel, lockstep=True)
     if target.embedded and _is_hil(request):
-        _missing(request, "a hil test needs the robot: type --can-interface socketcan --can-channel can0")
+        _missing(request, "a hil test needs the robot: use --can-interface socketcan --can-channel can0")
     try:
         ours, theirs = open_line(_atalante_network, target, emulated=not _is_hil(request))
     except BusAbsent as error:
@@ -156,19 +169,22 @@ def emulator(
     _atalante_network: Network,
     _atalante_robot: Robot,
 ) -> Iterator[Emulator]:
-    """The emulated robot, with an operator who starts it as soon as the HAL is ready."""
+    """Return the emulated robot, with an operator who presses START when the HAL is READY."""
     from atalante_tools.testing.hil import emulated_robot
 
     theirs = _atalante_line[1]
     if theirs is None:
-        pytest.fail(f"{request.node.name} is marked hil: the robot is real and there is no emulator", pytrace=False)
+        pytest.fail(
+            f"{request.node.name} is marked hil and has no emulator: remove the marker or the fixture `emulator`",
+            pytrace=False,
+        )
     with emulated_robot(_atalante_network, _atalante_robot, theirs) as robot:
         yield robot
 
 
 @pytest.fixture
 def recorded_run(request: pytest.FixtureRequest, _atalante_network: Network) -> Recording:
-    """Every frame that passes between HAL and nodes in this test; see `--can-log`."""
+    """Return the recording of all frames between HAL and nodes in this test; see `--can-log`."""
     from atalante_tools.testing.hil import Recording
 
     recording = Recording(_atalante_network)
@@ -183,7 +199,7 @@ def bus(
     _atalante_network: Network,
     recorded_run: Recording,
 ) -> FrameFilter:
-    """The HAL's end of the line, behind its faults; the robot at the other end."""
+    """Return the HAL's end of the bus with injectable faults."""
     from atalante_tools.testing.frame_filter import FrameFilter
     from atalante_tools.testing.hil import answering
 
@@ -194,7 +210,7 @@ def bus(
 
 @pytest.fixture
 def faults(bus: FrameFilter) -> FrameFilter:
-    """Faults of the wire: `drop`, `delay` and `corrupt` messages and nodes by name."""
+    """Return the injectable communication faults: `drop`, `delay` and `corrupt` for messages and nodes by name."""
     return bus
 
 
@@ -206,7 +222,7 @@ def hal(
     _atalante_robot: Robot,
     recorded_run: Recording,
 ) -> Iterator[Hal]:
-    """The HAL, in lock-step with the emulated robot; ends in HOLD."""
+    """Return the HAL, in lock-step with an emulated robot; it ends in HOLD."""
     from atalante_hal.hal import Hal
     from atalante_tools.session.rig import LOCKSTEP_PATIENCE, PATIENCE
 
@@ -220,7 +236,7 @@ def hal(
 
 @pytest.fixture
 def loop(request: pytest.FixtureRequest, hal: Hal) -> Stepper:
-    """Cycles of the HAL, with a controller that holds the pose; a real robot gets one a millisecond."""
+    """Return the HAL loop with a controller that holds the pose; with a real robot it runs one cycle per millisecond."""
     from atalante_hal.loop import LockStep, WallClock
     from atalante_tools.testing.hil import Stepper
 
