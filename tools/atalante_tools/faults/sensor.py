@@ -13,7 +13,7 @@ from atalante_tools.faults.scenario import Case, Press, Scenario
 _ACTIVE: Final = SupervisorState.ACTIVE
 _HOLD: Final = SupervisorState.HOLD
 _KNEE: Final = "LEFT_SK"
-#: Joint that hardly moves while the left leg swings, so that the smallest detected jump is exact.
+#: Joint that hardly moves while the left leg swings, so that its motion does not hide a small jump.
 _QUIET: Final = "RIGHT_FH"
 _IMUS: Final = tuple(f"IMU_{name.upper()}" for name in IMUS)
 _FEET: Final = tuple(f"FOOT_{name.upper()}" for name in FEET)

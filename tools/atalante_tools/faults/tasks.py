@@ -113,7 +113,7 @@ class PairTask:
         first, second = (f"{id_} {name}" for id_, name in (self.first, self.second))
         try:
             seen = observe(Case(f"{first} and {second}", happens), bound, recovery=False)
-        except Exception as error:  # noqa: BLE001 - whatever the stack raises is the finding
+        except Exception as error:  # noqa: BLE001 - any exception of the stack is a finding
             return PairVerdict(first, second, "-", (_crash(error),))
         failures = [*uncontrolled(seen), *improved(seen, seen.last)]
         state, worst = seen.state(seen.last), max(one.state for one in wanted)
@@ -137,7 +137,7 @@ def attempt(id_: str, case: Case) -> Verdict:
     wanted = Expectation.of(case, row)
     try:
         seen = observe(case, wanted.reacted, recovery=not wanted.walks_on)
-    except Exception as error:  # noqa: BLE001 - whatever the stack raises is the finding
+    except Exception as error:  # noqa: BLE001 - any exception of the stack is a finding
         return Verdict(id_, case.name, "-", None, wanted.reacted, "", (_crash(error),))
     return judge(row, case, seen)
 

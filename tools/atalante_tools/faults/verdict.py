@@ -58,7 +58,7 @@ class Expectation:
         if noticed is None or reacted is None:
             raise ValueError(
                 f"{row.id} {case.name}: `noticed` and `reacted` must be given, because the bound of the row is "
-                f"{row.cycles!r} and no number of cycles"
+                f"{row.cycles!r}, which is not a number of cycles"
             )
         state = row.state if case.state is None else case.state
         return cls(state, row.dtc if case.dtc is None else case.dtc, noticed, reacted)

@@ -171,7 +171,7 @@ class Stepper:
 
 
 class Recording:
-    """Recording of all frames between HAL and nodes, as `FrameTap`; the oldest are dropped above `KEPT` frames."""
+    """Recording of all frames between HAL and nodes, as `FrameTap`. It keeps the newest `KEPT` frames."""
 
     def __init__(self, network: Network) -> None:
         self._network = network

@@ -79,9 +79,9 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "hil: run with the robot on the bus of --can-interface, without the emulator")
     interface, channel = config.getoption("--can-interface"), config.getoption("--can-channel")
     if interface == _EMBEDDED and channel:
-        raise pytest.UsageError(f"--can-channel {channel} needs an interface: --can-interface socketcan")
+        raise pytest.UsageError(f"--can-channel {channel} needs an interface, add --can-interface socketcan")
     if interface != _EMBEDDED and not channel:
-        raise pytest.UsageError(f"--can-interface {interface} needs a channel: --can-channel vcan0")
+        raise pytest.UsageError(f"--can-interface {interface} needs a channel, add --can-channel vcan0")
 
 
 @pytest.hookimpl(wrapper=True)
