@@ -1,1 +1,1 @@
-"""Robot side of the stack: bus, codec, E2E, HAL, supervisor, 1 kHz loop and telemetry."""
+"""Robot side of the stack: bus, codec, E2E protection, HAL, state machine, 1 kHz loop and telemetry."""

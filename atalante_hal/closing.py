@@ -1,4 +1,4 @@
-"""What holds something open until it is closed: files, processes, memory, sessions."""
+"""Base class of objects that hold a resource until they are closed: files, processes, memory, sessions."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Self
 
 
 class Closing(ABC):
-    """A context manager of what has `close()`: the block's end closes it, whatever ended the block."""
+    """Context manager that calls `close()` at the end of the block, also after an exception."""
 
     @abstractmethod
     def close(self) -> object:
-        """Let go of what is held."""
+        """Release the resource."""
 
     def __enter__(self) -> Self:
         return self

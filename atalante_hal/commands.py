@@ -1,4 +1,4 @@
-"""What the HAL sends every cycle: SYNC, the commands of the drives and of the vibration motors.
+"""Frames that the HAL sends every cycle: SYNC, drive commands and vibration commands.
 
 `limiter -> commands -> process image -> transceiver -> bus`
 """
@@ -17,12 +17,20 @@ from atalante_hal.wire.process_image import TransmitImage
 
 
 class Commands:
-    """Values of the command frames, sealed together with the SYNC of the next cycle: one encoding for both.
+    """Command frames and SYNC frames of the HAL.
+
+    The commands of a cycle and the SYNC of the next one are encoded together, because one encoding costs less than two.
+
+    Args:
+        network: CAN network that defines the frames.
+        transceiver: Transceiver that sends them.
+        record: Record of the cycle, in which the sent torques and levels are stored.
+        limit: MaxTorque of the drives, shape (12,) [Nm].
 
     Attributes:
         control: `Controlword` of each drive, shape (12,).
-        torque: target torque, shape (12,) [Nm].
-        limit: the drives' MaxTorque, shape (12,) [Nm].
+        torque: Target torque, shape (12,) [Nm].
+        limit: MaxTorque of the drives, shape (12,) [Nm].
     """
 
     def __init__(self, network: Network, transceiver: Transceiver, record: Record, limit: Vector) -> None:
@@ -41,48 +49,75 @@ class Commands:
         self._sent_torque, self._sent_level = record.torque_command, record.level_command
         self._no_level = np.zeros_like(self._level)
         self.hold()
-        #: Quick stop to every drive, no torque, motors still: encoded before anything can go wrong.
+        #: HOLD frames (quick stop, zero torque, motors off), encoded in advance so that no later fault can prevent them.
         self._prepared_hold = self._image.prepare()
-        self._sealed = False  # with the SYNC of the next cycle
+        self._sealed = False  # True: the SYNC of the next cycle is already encoded
 
     def announce(self, state: SupervisorState) -> None:
-        """State of the supervisor, as SYNC carries it."""
+        """Set the supervisor state that SYNC carries.
+
+        Args:
+            state: Present state of the state machine.
+        """
         self._state.fill(state)
 
     def hold(self) -> None:
-        """Quick stop to every drive, no torque, motors still: the values, until others are written."""
+        """Set the values of HOLD: quick stop for every drive, zero torque, vibration motors off."""
         self._holding = True
         self.torque.fill(0.0)
         self.control.fill(Controlword.QUICK_STOP)
         self._level.fill(0.0)
 
     def drive(self, torque: Vector, vibration: Vector) -> None:
-        """Torques of enabled drives, shape (12,) [Nm], and levels of the motors, shape (8,), cut to [0, 1]."""
-        np.maximum(vibration, self._no_level, out=self._level)  # the codec cuts at 1
+        """Set the values of a motion: enabled drives, torques and vibration levels.
+
+        Args:
+            torque: Torques after the limiter, shape (12,) [Nm].
+            vibration: Levels of the vibration motors, shape (8,); clipped to [0, 1].
+        """
+        np.maximum(vibration, self._no_level, out=self._level)  # the codec clips at 1
         self.torque[:] = torque
         if self._holding:
             self.control.fill(Controlword.ENABLE_OPERATION)
             self._holding = False
 
     def synchronise(self, cycle: int) -> None:
-        """Send the SYNC of a cycle."""
+        """Send the SYNC frames of a cycle.
+
+        Args:
+            cycle: Cycle number; SYNC carries its lower 32 bits.
+        """
         if not self._sealed:
             self._seal(cycle, None)
         self._sealed = False
         self._transceiver.send(self._syncs)
 
     def send(self, cycle: int) -> Vector:
-        """Send the commands of a cycle. Returns the torques sent, shape (12,) [Nm]."""
+        """Send the commands of a cycle.
+
+        Args:
+            cycle: Number of the present cycle.
+
+        Returns:
+            Torques that were sent, shape (12,) [Nm].
+        """
         self._seal(cycle + 1, None)
         self._transceiver.send(self._commands)
         return self._record()
 
     def send_prepared_hold(self, cycle: int) -> Vector:
-        """Send HOLD whatever the values are; then they are those of HOLD. Returns the torques sent, shape (12,) [Nm]."""
+        """Send the HOLD frames that were encoded in advance, and set the values of HOLD.
+
+        Args:
+            cycle: Number of the present cycle.
+
+        Returns:
+            Torques that were sent, shape (12,) [Nm].
+        """
         self._image.seal_prepared(self._prepared_hold)
         self._transceiver.send(self._commands)
         self.hold()
-        self._seal(cycle + 1, self._image.counter)  # its SYNC was not prepared
+        self._seal(cycle + 1, self._image.counter)  # only the commands were encoded in advance, not the next SYNC
         return self._record()
 
     def _seal(self, next_cycle: int, counter: int | None) -> None:
@@ -97,20 +132,35 @@ class Commands:
 
 
 class StatusReport:
-    """HAL_STATUS, the HAL's heartbeat: state, hashes of what it works with, worst diagnostic."""
+    """Sender of HAL_STATUS, the heartbeat of the HAL: state, hashes of its input files, worst diagnostic.
+
+    Args:
+        network: CAN network; its hash is sent as DbcHash.
+        transceiver: Transceiver that sends the frame.
+        config_hash: CRC-32 of the robot file.
+        gait_hash: CRC-32 of the gait.
+    """
 
     def __init__(self, network: Network, transceiver: Transceiver, config_hash: int, gait_hash: int) -> None:
         self._transceiver = transceiver
         self._image = TransmitImage([network.message("HAL_STATUS")])
         self._frames = transceiver.grant(self._image.frames)
-        #: Cycles between two.
+        #: Period of HAL_STATUS in cycles of 1 ms.
         self.cycles = network.message("HAL_STATUS").cycle_ms
         self._write({"DbcHash": network.hash32, "ConfigHash": config_hash, "GaitHash": gait_hash})
 
     def send(
         self, state: SupervisorState, assistance_factor: float, overruns: float, diagnostic: int, step: int | None
     ) -> None:
-        """Send it. `diagnostic`: of `diagnostics.number_of`."""
+        """Send one HAL_STATUS.
+
+        Args:
+            state: State of the state machine.
+            assistance_factor: Assistance factor Xi, 0 to 1.
+            overruns: Number of late cycles so far.
+            diagnostic: Number of the worst active diagnostic, see `diagnostics.number_of`.
+            step: Number of the present step; None is sent as 0.
+        """
         values = {"HalState": state, "AssistanceFactor": assistance_factor, "Overruns": overruns}
         self._write({**values, "DiagnosticCode": diagnostic, "Step": (step or 0) & 0xFFFF})
         self._image.seal()

@@ -1,10 +1,10 @@
-"""Hot loops as machine code: `compiled(function)` is the same function, compiled by numba when it is first called.
+"""Compilation of numeric kernels: `compiled(function)` is the same function, compiled by numba at its first call.
 
-The source stays plain Python, one copy of it: tests that look into it (coverage, mutation), debuggers and profilers run it as it
-stands when NUMBA_DISABLE_JIT=1 is set, with the same results. Functions it calls are compiled with it. What was compiled is kept
-in the user's cache under a fingerprint of everything it was made from, callees and constants included, so a second start does
-not compile and a change of any of it is never missed. Code is generic for its architecture: one machine's results are
-another's, and one cache serves an emulated kernel, too.
+The source stays plain Python. With NUMBA_DISABLE_JIT=1 it runs uncompiled and gives the same results, for debuggers, profilers,
+coverage and mutation tests. Functions it calls are compiled, too. The machine code is cached in the user's cache directory. The
+name of its folder contains a hash of the function, its callees and its constants. So a second start does not compile, and every
+change leads to a new compilation. The code is generic for the processor architecture, so all machines of one architecture give
+the same results, and a cache can be used in an emulated machine.
 """
 
 from __future__ import annotations
@@ -27,10 +27,16 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(function: Function) -> Function:
-    """The function as machine code: numbers and arrays in, numbers and arrays out. Bounds are checked, as in Python.
+    """Return the function compiled to machine code; array bounds are checked, as in Python.
 
-    Call it once with what it will be given before time matters: types it has not seen are compiled when they come. What is not
-    in the cache takes seconds and is logged as information.
+    A call with new argument types compiles again. So call the function once with its real argument types before timing matters.
+    A compilation that is not in the cache takes seconds and is logged at level INFO.
+
+    Args:
+        function: Function of numbers and arrays that returns numbers and arrays.
+
+    Returns:
+        The compiled function; `function` itself if NUMBA_DISABLE_JIT is set.
     """
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         return function
@@ -46,12 +52,12 @@ def _compiled(function: FunctionType) -> Any:
     folder = _folder(function)
     config.CACHE_DIR = str(folder or "")
     if folder is None or not any(folder.iterdir()):
-        _log.info("%s.%s is compiled", function.__module__, function.__qualname__)
+        _log.info("compiling %s.%s", function.__module__, function.__qualname__)
     return numba.njit(boundscheck=True, cache=folder is not None)(_twin(function))
 
 
 def _twin(function: FunctionType) -> FunctionType:
-    """A copy of the function whose callees are compiled ones."""
+    """Return a copy of the function that calls compiled callees."""
     names = {name: value for name, value in function.__globals__.items() if name != function.__name__}
     for name, callee in _callees(function):
         names[name] = _callee(callee)
@@ -62,7 +68,7 @@ def _twin(function: FunctionType) -> FunctionType:
 
 @cache
 def _callee(function: FunctionType) -> Any:
-    """A compiled callee, one for all its callers."""
+    """Return a compiled callee, which all its callers share."""
     import numba
 
     return numba.njit(boundscheck=True)(_twin(function))
@@ -76,7 +82,7 @@ def _names(code: CodeType) -> Iterator[str]:
 
 
 def _callees(function: FunctionType) -> Iterator[tuple[str, FunctionType]]:
-    """Python functions a function calls, by name."""
+    """Yield the name and the object of each Python function that a function calls."""
     for name in dict.fromkeys(_names(function.__code__)):
         value = function.__globals__.get(name)
         if isinstance(value, FunctionType):
@@ -84,7 +90,7 @@ def _callees(function: FunctionType) -> Iterator[tuple[str, FunctionType]]:
 
 
 def _made_from(function: FunctionType) -> Iterator[bytes]:
-    """Everything the machine code of a function depends on."""
+    """Yield the bytes on which the machine code of a function depends: code, constants, globals and callees."""
     yield function.__qualname__.encode()
     yield function.__code__.co_code + repr(_constants(function.__code__)).encode()
     for name in dict.fromkeys(_names(function.__code__)):
@@ -102,7 +108,7 @@ def _constants(code: CodeType) -> tuple[Any, ...]:
 
 
 def _folder(function: FunctionType) -> Path | None:
-    """Where the machine code of a function is kept; None: nowhere, this user has no place that can be written."""
+    """Return the cache folder of the machine code of a function; None if the user's cache is not writable."""
     import numba
 
     digest = hashlib.sha256(f"{numba.__version__} {sys.version}".encode())

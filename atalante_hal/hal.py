@@ -1,8 +1,8 @@
-"""The hardware abstraction layer: `read()` a state, `write()` a command, once a cycle each.
+"""Hardware abstraction layer: `read()` returns the state and `write()` sends a command, each once a cycle.
 
     bus -> process image -> E2E + plausibility -> state -> safety monitor -> [controller] -> limiter -> process image -> bus
 
-The emulator and the robot differ in the bus handed to the constructor, in nothing else.
+The emulator and the robot differ only in the bus passed to the constructor.
 """
 
 from __future__ import annotations
@@ -30,30 +30,30 @@ from atalante_hal.wire.codec import Vector
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 PERIOD = 1e-3  # s, the SYNC period
-#: Cycles in a row with a torque the limiter cuts, after which the controller is helped.
+#: Consecutive cycles with a limited torque after which TORQUE_SATURATED is confirmed.
 SATURATED_CYCLES = 200
-#: Longest wait for answers while the robot is put into HOLD at the end [s].
+#: Longest total wait for the nodes' answers while `Hal.stop` puts the robot into HOLD [s].
 STOP_PATIENCE = 1.0
 
 _S = SupervisorState
 
 
 class Hal:
-    """One robot on one bus (or several joined to one).
+    """Interface between a controller and one robot, over one bus or several joined buses.
 
     Args:
-        network: of `atalante_dbc.load`.
-        robot: joint limits and transmission.
-        bus: owned by the caller, who closes it.
-        patience: longest wait [s] for the nodes' answers to a SYNC. On the wall clock well under the period; in lock-step with
-            another process long, so that the slowest machine still gives the same run.
-        assistance_factor: Xi until the pendant sets another.
-        controller_fields: (name, length) of what the controller wants recorded, see `types.Controller`.
-        gait_hash: of the gait the controller walks, for HAL_STATUS.
-        tap: sees every frame sent and received, for a CAN log.
+        network: CAN network, as `atalante_dbc.load` returns it.
+        robot: Joint limits and transmission.
+        bus: Open bus. The caller owns it and closes it.
+        patience: Longest wait for the nodes' answers to a SYNC [s]. On the wall clock it must be well below the period of 1 ms.
+            In lock-step with another process it should be long, so that a slow machine gives the same run.
+        assistance_factor: Assistance factor Xi in [0, 1], used until the pendant sets another.
+        controller_fields: (name, length) of each field the controller records, see `types.Controller`.
+        gait_hash: CRC-32 of the gait the controller walks, sent in HAL_STATUS.
+        tap: Receiver of a copy of every frame sent and received, for a CAN log.
 
     Raises:
-        ValueError: the assistance factor is not between 0 and 1.
+        ValueError: If the assistance factor is not between 0 and 1.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Hal:
         tap: FrameTap | None = None,
     ) -> None:
         if not 0.0 <= assistance_factor <= 1.0:
-            raise ValueError(f"the assistance factor is between 0 and 1, not {assistance_factor}")
+            raise ValueError(f"assistance_factor must be between 0 and 1, got {assistance_factor}")
         self.network, self.robot, self.patience = network, robot, patience
         self._build_images(controller_fields, assistance_factor)
         self._transceiver = Transceiver(
@@ -91,19 +91,19 @@ class Hal:
             self._limiter,
             self._commands,
         )
-        #: What went wrong or changed, once, when it began.
+        #: Diagnostics and state changes so far, one event for each, raised when it begins.
         self.events = self._safety_monitor.memory.events
 
     # -- construction ------------------------------------------------------------------------------------------------
 
     def _build_images(self, controller_fields: Sequence[tuple[str, int]], assistance_factor: float) -> None:
         received = self.network.received_by("HAL")
-        # In the order the buses deliver it, see `ReceiveImage.accept`.
+        # In the order in which the buses deliver the messages, see `ReceiveImage.accept`.
         fast = [m for bus in self.network.buses for m in received if m.bus == bus and m.cycle_ms == 1]
         #: Message of each entry of `State.valid` and `State.age`.
         self.messages = tuple(m.name for m in fast)
         parts = self._parts = Record(ReceiveImage(fast).codec, controller_fields)
-        #: Everything known about this cycle, one contiguous vector described by `layout`.
+        #: All values of this cycle in one contiguous vector, whose fields `layout` names.
         self.record, self.layout, self.controller_record = parts.values, parts.layout, parts.controller
         self._header = parts.header
         self._header[3] = assistance_factor
@@ -111,35 +111,40 @@ class Hal:
         self._plausibility = Plausibility(self.robot, self._image, PERIOD)
         self.state = parts.state(assistance_factor, len(fast))
         per_turn = self.robot.polarity / self.robot.gear
-        # Torque is at the joint on the wire, in both directions.
+        # Torques on the bus are already joint torques, so their factor is 1.
         self._to_joint = np.concatenate([per_turn, per_turn, np.ones(len(JOINTS))])
 
     # -- one cycle ---------------------------------------------------------------------------------------------------
 
     def listen(self) -> None:
-        """Make sure that no other HAL is at work on this bus. Call before the first `read` where there may be one.
+        """Check that no other HAL is active on this bus.
+
+        Call it before the first `read` on a bus that another HAL may use.
 
         Raises:
-            HalDuplicate: there is one.
+            HalDuplicate: If a message of another HAL was received.
         """
         self._transceiver.listen()
 
     def read(self) -> State:
-        """Send SYNC, take the nodes' answers, judge them. The state is the same object every cycle.
+        """Send SYNC, receive the nodes' answers, check them and return the state.
 
-        A bus that fails does not raise here: it ends in HOLD like any other fault.
+        A failing bus does not raise an exception here. It leads to HOLD, as any other fault does.
+
+        Returns:
+            State of this cycle: the same object every cycle, valid until the next `read`.
         """
         state, image, transceiver = self.state, self._image, self._transceiver
         state.cycle = cycle = state.cycle + 1
         state.time = cycle * PERIOD
-        late = 0 if image.all_fresh else transceiver.receive()  # what the last cycle did not wait for
+        late = 0 if image.all_fresh else transceiver.receive()  # answers that arrived after the last cycle's wait
         self._commands.synchronise(cycle)
         count = transceiver.receive(late, image, self.patience)
         foreign = image.accept(transceiver.scratch, count, cycle & 0xFF)
         if foreign:
             in_row = isinstance(foreign, range)
-            places = slice(foreign[0], foreign[-1] + 1) if in_row else list(foreign)
-            self._safety_monitor.accept(transceiver.scratch[places])
+            rows = slice(foreign[0], foreign[-1] + 1) if in_row else list(foreign)
+            self._safety_monitor.accept(transceiver.scratch[rows])
         self._plausibility.check()
         parts = self._parts
         np.multiply(parts.motor_side, self._to_joint, parts.joint_side)
@@ -151,17 +156,20 @@ class Hal:
         return state
 
     def write(self, command: Command) -> Vector:
-        """Limit and send a command; unless the robot is `moving` its torques are not used.
+        """Limit a command and send it; send HOLD instead while the robot is not `moving`.
+
+        Args:
+            command: Torques, shape (12,) [Nm at the joint], and vibration levels, shape (8,), of this cycle.
 
         Returns:
-            The torques really sent, after the limits. Shape (12,) [Nm], valid until the next call.
+            Torques that were sent, after the limits. Shape (12,) [Nm], valid until the next call.
         """
         safety_monitor = self._safety_monitor
         if not safety_monitor.moving:
             return self.hold()
         limited = self._limiter.apply(command.torque, self._parts.motion)
         if not limited.finite:
-            safety_monitor.report(Dtc.CMD_NONFINITE, "the controller asked for a torque that is not finite")
+            safety_monitor.report(Dtc.CMD_NONFINITE, "the commanded torque must be finite, got NaN or infinity")
             return self._commands.send_prepared_hold(self.state.cycle)
         if limited.clamped:
             cycles = self._limiter.saturated
@@ -175,17 +183,21 @@ class Hal:
         return self._send_command()
 
     def hold(self) -> Vector:
-        """Send HOLD; drives being enabled for a start get the next step of their state machine instead."""
+        """Send HOLD, or, during a start, the next CiA 402 controlword that enables each drive.
+
+        Returns:
+            Torques that were sent, shape (12,) [Nm], valid until the next call.
+        """
         self._commands.hold()
         state, control, safety_monitor = self.state, self._commands.control, self._safety_monitor
         if safety_monitor.lowered:
             control[[node in safety_monitor.lowered for node in DRIVE_NODES]] = Controlword.DISABLE_VOLTAGE
         if safety_monitor.start_wanted and state.supervisor in (_S.LOWER, _S.FAULT):
-            # The operator acknowledged: clear the drives that have a fault, the others go on holding.
+            # The operator acknowledged: reset the drives that have a fault; the others continue to hold.
             control[state.drive_state == DriveState.FAULT] = Controlword.FAULT_RESET
         elif safety_monitor.start_wanted and state.supervisor in (_S.READY, _S.HOLD) and not safety_monitor.hindered:
             control[:] = [controlword_towards_operation(int(s)) for s in state.drive_state.tolist()]
-            # What the drive holds with now, so that nothing sags between its hold and the controller's first torque.
+            # Command the present holding torque, so that no joint sags before the controller's first torque.
             self._follow_drives()
             self._commands.torque[:] = self._limiter.last
         else:
@@ -193,7 +205,10 @@ class Hal:
         return self._send_command()
 
     def _follow_drives(self) -> None:
-        """Command what the drives hold with, within all limits from the second cycle on; a drive that is off makes no torque."""
+        """Set the commanded torque to the torque with which each drive holds now.
+
+        From the second cycle on all limits apply. A drive that is off produces no torque, so its command is 0.
+        """
         torque = np.where(powered(self.state.drive_state), self.state.torque, 0.0)
         if self._safety_monitor.enabling:
             self._limiter.apply(torque, self._parts.motion)
@@ -202,22 +217,45 @@ class Hal:
             self._safety_monitor.enabling = True
 
     def fail(self, error: Exception) -> Vector:
-        """The controller, or what was done with its command, raised: HOLD in this same cycle."""
+        """Report an exception of the controller or of its command, and send HOLD in the same cycle.
+
+        Args:
+            error: Exception that `Controller.reset`, `Controller.update` or `write` raised.
+
+        Returns:
+            Torques that were sent, shape (12,) [Nm], valid until the next call.
+        """
         self._safety_monitor.report(Dtc.CONTROLLER_ERROR, f"the controller raised {type(error).__name__}: {error}")
         return self._commands.send_prepared_hold(self.state.cycle)
 
     def report(self, dtc: Dtc, text: str, *, confirmed: bool = True, value: float = 0.0) -> None:
-        """The loop noticed a fault of timing at the start of a cycle; judged in its `read`."""
+        """Report a timing fault at the start of a cycle; the following `read` evaluates it.
+
+        Args:
+            dtc: Diagnostic to raise.
+            text: One sentence for the event.
+            confirmed: True if the fault is confirmed, False if it is only pending.
+            value: Measured value, for the event.
+        """
         self._safety_monitor.report(dtc, text, confirmed, value, cycle=self.state.cycle + 1)
         if dtc is Dtc.CYCLE_GAP and confirmed:
             self._transceiver.discard()
 
     def end(self) -> None:
-        """HOLD from the next cycle on, and no START any more. A signal handler may call it at any time."""
+        """Request HOLD from the next cycle on and ignore every further START.
+
+        A signal handler may call it at any time.
+        """
         self._safety_monitor.end()
 
     def stop(self, cycles: int = 10) -> None:
-        """HOLD, and stay long enough for every drive to have followed. Call at the end, before closing the bus."""
+        """Send HOLD until every drive has had time to follow.
+
+        Call it at the end of a run, before the bus is closed. It waits `STOP_PATIENCE` at most for the nodes' answers.
+
+        Args:
+            cycles: Number of cycles in which HOLD is sent.
+        """
         self.end()
         patience, deadline = self.patience, time.monotonic() + STOP_PATIENCE
         for _ in range(cycles):
@@ -228,22 +266,22 @@ class Hal:
 
     @property
     def moving(self) -> bool:
-        """The controller's torques are used."""
+        """Return whether the torques of the controller are sent to the drives."""
         return self._safety_monitor.moving
 
     @property
     def reason(self) -> str:
-        """Why the robot is in the state it is in, one sentence."""
+        """Return the reason of the present supervisor state, as one sentence."""
         return self._safety_monitor.reason
 
     @property
     def conditions(self) -> Conditions:
-        """What the supervisor judged last."""
+        """Return the conditions that the state machine evaluated last."""
         return self._safety_monitor.conditions
 
     @property
     def bus(self) -> Bus:
-        """What carries the frames."""
+        """Return the bus that carries the frames."""
         return self._transceiver.bus
 
     @bus.setter
@@ -252,7 +290,7 @@ class Hal:
 
     @property
     def tap(self) -> FrameTap | None:
-        """Sees every frame."""
+        """Return the receiver of a copy of every frame; None if there is none."""
         return self._transceiver.tap
 
     @tap.setter
@@ -261,16 +299,19 @@ class Hal:
 
     @property
     def crc_errors(self) -> int:
-        """Frames refused for their CRC so far."""
+        """Return the number of frames rejected so far because of a wrong CRC."""
         return self._safety_monitor.crc_errors
 
     @property
     def silent(self) -> bool:
-        """No node has ever answered a SYNC."""
+        """Return whether no node has answered any SYNC so far."""
         return bool((self._image.age >= NEVER).all())
 
     def missing(self) -> list[str]:
-        """Nodes that keep the robot out of READY: not heard in time or not trusted yet, no status, another DBC. For people."""
+        """Return the names of the nodes that prevent READY.
+
+        Such a node timed out, is not qualified yet, has sent no status, or uses another DBC.
+        """
         names = self._safety_monitor.missing()
         return [node.name for node in self.network.nodes if node.name in names]
 
@@ -278,7 +319,7 @@ class Hal:
         state, safety_monitor = self.state, self._safety_monitor
         sent = self._commands.send(state.cycle)
         if state.cycle % self._status.cycles == 0:
-            worst_one, overruns = number_of(safety_monitor.memory.bits), self._header[6]
-            self._status.send(state.supervisor, state.assistance_factor, overruns, worst_one, safety_monitor.step)
+            worst, overruns = number_of(safety_monitor.memory.bits), self._header[6]
+            self._status.send(state.supervisor, state.assistance_factor, overruns, worst, safety_monitor.step)
             safety_monitor.look_for_heartbeats()
         return sent

@@ -1,4 +1,4 @@
-"""The 1 kHz loop: the flow of the stack in one screen, on the wall clock or in lock-step."""
+"""The 1 kHz control loop, on the wall clock or in lock-step: wait, read, update the controller, write, record."""
 
 from __future__ import annotations
 
@@ -17,42 +17,49 @@ from atalante_hal.hal import PERIOD, Hal
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.types import Controller, State
 
-#: Late cycles in a row, and longest gap between two cycles [s], that end in HOLD: the drives' own watchdog is as long.
+#: Consecutive late cycles that lead to HOLD.
 OVERRUNS_TO_HOLD = 3
+#: Longest gap between two cycles [s]; a longer one leads to HOLD. The drives' own watchdog has the same timeout.
 GAP_TO_HOLD = 5e-3
-#: Time [s] the robot may fall behind the monotonic clock within `DRIFT_CYCLES` cycles. More ends in HOLD: every limit and timeout
-#: that is counted in cycles would be too long.
+#: Time [s] the loop may lose against the monotonic clock within `DRIFT_CYCLES` cycles. More leads to HOLD, because every limit
+#: and timeout counted in cycles would be too long.
 DRIFT_TO_HOLD = 5e-3
+#: Window of the drift check [cycles].
 DRIFT_CYCLES = 50
 #: Bins of the histogram of cycle costs, 1 us each.
 COST_BINS = 10_000
 
 
 class Clock(Protocol):
-    """When the next cycle begins."""
+    """Timing source of the loop."""
 
     def wait(self) -> float:
-        """Wait for the next cycle.
+        """Wait for the beginning of the next cycle.
 
         Returns:
-            How late it begins [s], against deadlines one period apart; 0 when in time. A cycle that begins more than a period
-            late moves its own and all later deadlines by that time.
+            Lateness of the cycle against its deadline [s]; 0 when it begins in time. Deadlines are one period apart. A cycle
+            that is late by more than a period moves its own and all later deadlines by that time.
         """
 
 
 class LockStep:
-    """As fast as it goes: the nodes answer each SYNC, and the next one is sent when they have."""
+    """Clock without waiting: the next SYNC is sent as soon as the nodes have answered the last one."""
 
     def wait(self) -> float:
-        """Never waits and is never late."""
+        """Return immediately with a lateness of 0 s."""
         return 0.0
 
 
 class WallClock:
-    """Absolute monotonic deadlines one period apart.
+    """Clock with absolute deadlines on the monotonic clock, one period apart.
 
-    A cycle that begins up to a period late leaves the deadlines where they are. A later one moves them: a burst of catch-up
-    cycles would command old states.
+    A cycle that is late by up to one period does not move the deadlines. A later cycle moves them, because a burst of catch-up
+    cycles would send commands for old states.
+
+    Args:
+        period: Time between two deadlines [s].
+        now: Function that returns the present time [s].
+        sleep: Function that sleeps for a given time [s].
     """
 
     def __init__(
@@ -65,7 +72,7 @@ class WallClock:
         self._next = now()
 
     def wait(self) -> float:
-        """Sleep until the deadline; returns how late the cycle begins [s]."""
+        """Sleep until the deadline and return the lateness of the cycle [s]."""
         self._next += self._period
         now = self._now()
         if now < self._next:
@@ -78,18 +85,18 @@ class WallClock:
 
 
 class Drift:
-    """Time by which the robot, which counts cycles, falls behind the clock, over the last `DRIFT_CYCLES` cycles."""
+    """Time lost against the monotonic clock over the last `DRIFT_CYCLES` cycles."""
 
     def __init__(self) -> None:
         self._lost = 0.0
         self._behind = deque([0.0] * DRIFT_CYCLES, maxlen=DRIFT_CYCLES)
 
     def add(self, late: float) -> float:
-        """Add a cycle.
+        """Add a cycle and return the time lost within the window.
 
         Args:
-            late: how late it begins [s], as `Clock.wait` returns it. A gap of more than `GAP_TO_HOLD` does not count: it is a
-                diagnostic by itself.
+            late: Lateness of the cycle [s], as `Clock.wait` returns it. A gap longer than `GAP_TO_HOLD` does not count,
+                because it has a diagnostic of its own.
 
         Returns:
             Time lost within the window [s].
@@ -104,22 +111,33 @@ class Drift:
 
 @dataclass
 class Statistics:
-    """Timing of a run. Costs are of the whole cycle without the wait, with the emulator's share on an embedded bus."""
+    """Timing of a run.
+
+    The cost of a cycle is its computing time without the wait. On an embedded bus it includes the emulator.
+    """
 
     cycles: int = 0
     overruns: int = 0  # cycles that began more than a period late
     lateness_max: float = 0.0  # s
     wall: float = 0.0  # s, first to last cycle
-    #: Cycles that cost 0, 1, 2, ... us; the last entry counts all longer ones. Bounded, so that a run may last for days.
+    #: Number of cycles for each cost of 0, 1, 2, ... us; the last entry counts all longer cycles. Its size does not grow with
+    #: the run.
     costs: list[int] = field(default_factory=lambda: [0] * (COST_BINS + 1))
 
     @property
     def real_time_factor(self) -> float:
-        """Simulated over elapsed time; 1 on the wall clock."""
+        """Return the ratio of simulated to elapsed time; 1 on the wall clock."""
         return self.cycles * PERIOD / self.wall if self.wall else 0.0
 
     def cost(self, percentile: float) -> float:
-        """Return the cycle cost [s] that `percentile` percent of the cycles did not exceed, to 1 us; 10 ms stands for more."""
+        """Return the cycle cost that a share of the cycles did not exceed.
+
+        Args:
+            percentile: Share of the cycles, 0 to 100 [%].
+
+        Returns:
+            Cost [s] with a resolution of 1 us. 10 ms means 10 ms or more.
+        """
         total = np.cumsum(self.costs)
         return float(np.searchsorted(total, max(1.0, total[-1] * percentile / 100.0))) * 1e-6 if total[-1] else 0.0
 
@@ -132,14 +150,20 @@ def run(
     until: Callable[[State], bool],
     record: Callable[[], None] = lambda: None,
 ) -> Statistics:
-    """Run the controller on the robot until `until(state)` says so, then leave the robot in HOLD.
+    """Run the controller on the robot until `until(state)` is true, then leave the robot in HOLD.
 
     Args:
-        until: asked once a cycle, after the command was sent.
-        record: called once a cycle with `hal.record` complete, e.g. a ring's `write`.
+        hal: Hardware abstraction layer of the robot.
+        controller: Controller to run. An exception in it leads to HOLD, not to the end of the loop.
+        clock: Timing source, `WallClock` or `LockStep`.
+        until: Condition that ends the loop, called once a cycle after the command was sent.
+        record: Function called once a cycle when `hal.record` is complete, e.g. `write` of a telemetry ring.
+
+    Returns:
+        Timing of the run.
 
     Raises:
-        ValueError: the HAL was made for other `controller_fields` than the controller's.
+        ValueError: If the HAL was constructed with other `controller_fields` than those of the controller.
     """
     statistics = Statistics()
     costs, header = statistics.costs, hal.record
@@ -148,10 +172,10 @@ def run(
     controller_record, telemetry = hal.controller_record, controller.telemetry
     if len(telemetry) != len(controller_record):
         raise ValueError(
-            f"the controller's telemetry is {len(telemetry)} numbers and the HAL was made to record {len(controller_record)}: "
-            "give it `controller_fields=controller.telemetry_fields`"
+            f"controller.telemetry must have the length that the HAL records ({len(controller_record)}), got "
+            f"{len(telemetry)}: construct the HAL with `controller_fields=controller.telemetry_fields`"
         )
-    # What lives now lives as long as the run: the collector need not look at it again and again. Who froze it before keeps it so.
+    # All present objects last as long as the run, so the garbage collector need not scan them. A caller's freeze is kept.
     frozen = gc.get_freeze_count() > 0
     if not frozen:
         gc.collect()
@@ -171,7 +195,7 @@ def run(
                         controller.reset(state)
                     hal.write(controller.update(state))
                     controller_record[:] = telemetry
-                except Exception as error:  # noqa: BLE001 - whatever a controller raises or asks for, the robot holds
+                except Exception as error:  # noqa: BLE001 - any exception of a controller leads to HOLD
                     hal.fail(error)
                 active = True
             else:
@@ -193,7 +217,7 @@ def run(
 
 
 def _judge_lateness(hal: Hal, statistics: Statistics, late: float, in_row: int, drift: float) -> int:
-    """Report a late cycle and a loop that falls behind; returns the number of late cycles in a row."""
+    """Report a late cycle and a drifting loop; return the number of consecutive late cycles."""
     statistics.lateness_max = max(statistics.lateness_max, late)
     if drift > DRIFT_TO_HOLD:
         slow = f"the loop lost {drift * 1e3:.1f} ms within {DRIFT_CYCLES} cycles"
@@ -202,19 +226,22 @@ def _judge_lateness(hal: Hal, statistics: Statistics, late: float, in_row: int, 
         return 0
     in_row += 1
     statistics.overruns += 1
-    gap = f"{late * 1e3:.1f} ms went by without a cycle"
+    gap = f"no cycle began for {late * 1e3:.1f} ms"
     hal.report(Dtc.CYCLE_GAP, gap, confirmed=late > GAP_TO_HOLD, value=late)
     if drift <= DRIFT_TO_HOLD:
-        many = f"{in_row} cycles in a row were more than {PERIOD * 1e3:.0f} ms late"
+        many = f"{in_row} consecutive cycles were more than {PERIOD * 1e3:.0f} ms late"
         hal.report(Dtc.OVERRUN, many, confirmed=in_row >= OVERRUNS_TO_HOLD, value=in_row)
     return in_row
 
 
 def realtime(priority: int = 50) -> list[str]:
-    """Ask for a quiet process: SCHED_FIFO and locked memory.
+    """Request real-time scheduling (SCHED_FIFO) and locked memory for this process.
+
+    Args:
+        priority: SCHED_FIFO priority, 1 to 99.
 
     Returns:
-        One sentence for each wish the system refused, with what to type.
+        One sentence for each refused request, with the remedy; empty if both were granted.
     """
     refused = []
     try:

@@ -1,4 +1,4 @@
-"""Memory that two processes share: an anonymous file, whose descriptor one hands to the other."""
+"""Memory shared by two processes: an anonymous file, whose descriptor one process passes to the other."""
 
 from __future__ import annotations
 
@@ -7,11 +7,16 @@ import tempfile
 
 
 def anonymous_file(label: str, size: int) -> int:
-    """Descriptor of a zeroed file without a name, in memory where the system can: nothing is left whoever crashes.
+    """Create a zeroed file without a name and return its descriptor.
+
+    The file is in memory if the system supports it. It disappears with its last user, also after a crash.
 
     Args:
-        label: what /proc shows it as.
-        size: bytes.
+        label: Name shown in /proc.
+        size: Size of the file [bytes].
+
+    Returns:
+        File descriptor, owned by the caller.
     """
     if hasattr(os, "memfd_create"):
         descriptor = os.memfd_create(label, os.MFD_CLOEXEC)

@@ -1,10 +1,10 @@
-"""The operator's requests, as the pendant node sends them every cycle: dead-man, buttons, assistance factor.
+"""Requests of the operator, which the pendant node sends every cycle: dead-man switch, buttons, assistance factor.
 
-`process image -> pendant -> supervisor`: the one command path into the robot.
+`process image -> pendant -> state machine`: the only command path into the robot.
 
-START is edge-triggered: a press is a change of `RequestCounter` between two accepted frames. What stands in the first frame is
-no press. A press that comes while the sender is not trusted yet is kept until it is, as long as dead-man and START stay
-pressed and the supervisor does not move.
+START is edge-triggered: a press is a change of `RequestCounter` between two accepted frames. The first frame is never a press. A
+press that arrives while the pendant is not qualified yet is stored until it is. It is dropped if the dead-man switch or START is
+released before, or if the state changes.
 """
 
 from __future__ import annotations
@@ -21,56 +21,74 @@ _SIGNALS = ("DeadMan", "Request", "RequestCounter", "AssistanceFactor", "Assista
 
 
 class Demand(NamedTuple):
-    """What a frame of the pendant demands that may end a motion."""
+    """Part of a pendant frame that can end a motion."""
 
-    dead_man: bool
-    stop: bool  # STOP or HOLD is requested, or what no pendant may request
+    dead_man: bool  # the dead-man switch is pressed
+    stop: bool  # the request is STOP, HOLD or an invalid value
 
 
 def demand_of(signals: Sequence[float]) -> Demand:
     """Return the demand of a frame.
 
     Args:
-        signals: DeadMan, Request and the others in the order of the message.
+        signals: Signal values in the order of the message, DeadMan and Request first.
+
+    Returns:
+        Dead-man switch and stop request of the frame.
     """
     return Demand(signals[0] == 1, signals[1] not in (_NONE, _START))
 
 
 def safest(demands: Iterable[Demand]) -> Demand:
-    """Return the one demand that is as safe as each of them: the dead-man counts if all frames have it, STOP if one has."""
+    """Combine the demands of several frames to the safest one.
+
+    The dead-man switch counts as pressed only if it is pressed in every frame. One frame with STOP is sufficient for STOP.
+
+    Args:
+        demands: Demands of the frames, at least one.
+
+    Returns:
+        The combined demand.
+    """
     dead_man, stop = zip(*demands, strict=True)
     return Demand(all(dead_man), any(stop))
 
 
 class Pendant:
-    """What the operator wants now."""
+    """Requests of the operator in the present cycle.
+
+    Args:
+        image: Process image with the message PENDANT_STATE.
+    """
 
     def __init__(self, image: ReceiveImage) -> None:
         codec = image.codec
         self.row = codec.rows["PENDANT_STATE"]
-        places = [codec.index("PENDANT_STATE", name) for name in _SIGNALS]
-        assert places == list(range(places[0], places[0] + len(places)))
-        self._places = slice(places[0], places[-1] + 1)
-        #: The values as received; bytes other than `heard` have to be heard.
-        self.signals = image.values[self._places]
+        indices = [codec.index("PENDANT_STATE", name) for name in _SIGNALS]
+        assert indices == list(range(indices[0], indices[0] + len(indices)))
+        self._slice = slice(indices[0], indices[-1] + 1)
+        #: Signal values as received. `hear` must be called when their bytes differ from `heard`, the bytes handled last.
+        self.signals = image.values[self._slice]
         self.heard = b""
         self.dead_man = False
         self.stop_requested = False
-        #: START was pressed in this cycle.
+        #: True in the cycle in which START counts.
         self.started = False
-        #: Xi in [0, 1]; None: the HAL keeps its own.
+        #: Assistance factor Xi in [0, 1]; None: the pendant sets none.
         self.assistance_factor: float | None = None
         self._press: float | None = None  # RequestCounter of the last cycle
-        self._pressed = False  # START was pressed before the sender was trusted, or among frames that differ
+        self._pressed = (
+            False  # stored START: pressed before the pendant was qualified, or in a cycle with differing frames
+        )
 
     def hear(self, present: bool, *, qualifying: bool = False, beside: Sequence[Vector] = ()) -> None:
-        """Take the requests of one cycle.
+        """Evaluate the requests of one cycle.
 
         Args:
-            present: the node is heard in time and trusted. While it is not, dead-man, STOP and the factor do not count.
-            qualifying: the node is heard in time. A START pressed meanwhile counts when the node is trusted.
-            beside: values of the image as other intact frames of this cycle have them, see `ReceiveImage.beside`. The safest
-                frame of a cycle counts, and no press counts before the frames of a cycle agree again.
+            present: True if the pendant is in time and qualified. Otherwise dead-man switch, STOP and factor do not count.
+            qualifying: True if the pendant is in time but not qualified yet. A START pressed now counts once it is qualified.
+            beside: Values of the process image for each further intact frame of this cycle, see `ReceiveImage.beside`. The
+                safest frame of a cycle counts. START does not count until the frames of a cycle agree again.
         """
         self.started = False
         if not (present or qualifying):
@@ -78,10 +96,10 @@ class Pendant:
             self.heard, self._press, self._pressed = b"", None, False
             return
         self.heard = self.signals.tobytes()
-        said = self.signals.tolist()
-        _, request, press, factor, factor_set = said
-        others = [demand_of(values[self._places].tolist()) for values in beside]
-        demand = safest([demand_of(said), *others])
+        received = self.signals.tolist()
+        _, request, press, factor, factor_set = received
+        others = [demand_of(values[self._slice].tolist()) for values in beside]
+        demand = safest([demand_of(received), *others])
         self.dead_man, self.stop_requested = present and demand.dead_man, present and demand.stop
         if not beside:
             edge = request == _START and self._press is not None and press != self._press
@@ -94,5 +112,5 @@ class Pendant:
             self.assistance_factor = factor if factor_set else None
 
     def forget_press(self) -> None:
-        """Drop a START that has not counted yet: the supervisor has moved."""
+        """Drop a stored START; called when the state of the state machine has changed."""
         self._pressed = False

@@ -1,6 +1,6 @@
-"""The record of a cycle: everything known about it in one contiguous vector, and the controller's `State` as views of it.
+"""Record of a cycle: all its values in one contiguous vector, and the controller's `State` as views of it.
 
-The fast process image decodes right into the record; a ring takes it with one copy.
+The process image of the 1 ms messages decodes directly into the record. One copy moves the record into a telemetry ring.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, MOTORS
 from atalante_hal.types import State, SupervisorState
 from atalante_hal.wire.codec import Codec, group_of
 
-#: One number each at the head of the record; "diagnostics" are bits of `diagnostics.Dtc`.
+#: Fields at the start of the record, one number each; "diagnostics" has one bit for each active `diagnostics.Dtc`.
 HEADER_FIELDS = (
     "cycle", "time", "supervisor", "assistance_factor", "cost_us", "lateness_us",
     "overruns", "frames", "crc_errors", "dropped", "diagnostics",
@@ -24,26 +24,26 @@ HEADER_FIELDS = (
 
 
 class Record:
-    """The vector and its parts.
+    """Vector of all values of a cycle, and views of its parts.
 
     Args:
-        codec: of the fast image, whose values lie inside the record.
-        controller_fields: (name, length) of what the controller wants recorded, see `types.Controller`.
+        codec: Codec of the 1 ms messages, whose values are a part of the record.
+        controller_fields: (name, length) of each field the controller records, see `types.Controller`.
     """
 
     def __init__(self, codec: Codec, controller_fields: Sequence[tuple[str, int]]) -> None:
         self.layout = Layout(_fields(codec, controller_fields))
         self._imu_rows = tuple(codec.rows[f"IMU_{imu.upper()}_STATE"] for imu in IMUS)
         self.values = np.zeros(self.layout.size)
-        # A memoryview: half the price of an array, a number at a time.
+        # A memoryview accesses a single number in half the time of an array.
         self.header = memoryview(self.values.data).cast("B").cast("d")[: len(HEADER_FIELDS)]
         first = self.layout["motor_position"].start
         self.signals = self.values[first : first + codec.size]
         self.joint_side = self.values[self.layout["position"].start : self.layout["torque"].stop]
         self.motor_side = self.values[self.layout["motor_position"].start : self.layout["motor_torque"].stop]
-        #: Position and velocity, shape (2, 12).
+        #: Position [rad] and velocity [rad/s] of the joints, shape (2, 12).
         self.motion = self.joint_side[: 2 * len(JOINTS)].reshape(2, len(JOINTS))
-        #: State and temperature of the drives, which seldom change: one piece to compare.
+        #: State and temperature of the drives, shape (24,): they change seldom, so one comparison finds a change.
         self.drive_side = self.values[self.layout["drive_state"].start : self.layout["temperature"].stop]
         assert self.drive_side.size == 2 * len(JOINTS)
         self.torque_command = self.values[self.layout["torque_command"]]
@@ -51,7 +51,15 @@ class Record:
         self.controller = self.values[self.layout["vibration_command"].stop :]
 
     def state(self, assistance_factor: float, messages: int) -> State:
-        """The state a controller reads; `messages`: how many are judged every cycle."""
+        """Create the state that a controller reads, as views of the record.
+
+        Args:
+            assistance_factor: Initial assistance factor Xi, 0 to 1.
+            messages: Number of messages monitored every cycle.
+
+        Returns:
+            State in OFF, with all messages invalid.
+        """
         values, layout = self.values, self.layout
         return State(
             cycle=0,
@@ -76,7 +84,7 @@ class Record:
 
 
 def _fields(codec: Codec, controller_fields: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
-    """Header, joint side, every signal as received, commands, the controller's own."""
+    """Return (name, length) of all fields: header, joint side, received signals, commands, controller fields."""
     signals: dict[str, int] = {}
     for message, signal in codec.signals:
         name = _field_name(message, group_of(signal.name))
@@ -92,7 +100,7 @@ def _fields(codec: Codec, controller_fields: Sequence[tuple[str, int]]) -> list[
     ]
 
 
-#: Quantity of the DBC -> field of the record, where the plain name would be ambiguous.
+#: Signal group of the DBC -> field of the record, for groups whose plain name would be ambiguous.
 _FIELD_NAMES = {
     "Position": "motor_position",
     "Velocity": "motor_velocity",

@@ -1,4 +1,4 @@
-"""Names of the places of one contiguous float64 vector: what a record holds, for whoever reads it later."""
+"""Layout of a record: the name and the slice of each field of a contiguous float64 vector."""
 
 from __future__ import annotations
 
@@ -10,29 +10,32 @@ CONTROLLER = "controller."
 
 
 class Layout:
-    """Ordered fields of a vector, each a slice.
+    """Ordered fields of a vector, each with a name and a slice.
+
+    Args:
+        fields: (name, length) of each field, in order.
 
     Raises:
-        ValueError: a name twice, or a length that is not positive.
+        ValueError: If a name is repeated or a length is not positive.
     """
 
     def __init__(self, fields: Iterable[tuple[str, int]]) -> None:
         self.fields = tuple((str(name), int(length)) for name, length in fields)
         self._slices: dict[str, slice] = {}
-        place = 0
+        offset = 0
         for name, length in self.fields:
             if name in self._slices or length <= 0:
-                raise ValueError(f"field {name!r} needs a name of its own and a positive length, not {length}")
-            self._slices[name] = slice(place, place + length)
-            place += length
+                raise ValueError(f"field {name!r} must have a unique name and a positive length, got length {length}")
+            self._slices[name] = slice(offset, offset + length)
+            offset += length
         #: Length of the whole vector.
-        self.size = place
+        self.size = offset
 
     def __getitem__(self, name: str) -> slice:
         try:
             return self._slices[name]
         except KeyError:
-            raise KeyError(f"no field {name!r}; there are {', '.join(self._slices)}") from None
+            raise KeyError(f"field must be one of {', '.join(self._slices)}, got {name!r}") from None
 
     def __contains__(self, name: object) -> bool:
         return name in self._slices
@@ -41,10 +44,17 @@ class Layout:
         return iter(self._slices)
 
     def to_json(self) -> str:
-        """The fields as a JSON list of [name, length]."""
+        """Return the fields as a JSON list of [name, length]."""
         return json.dumps(self.fields)
 
     @classmethod
     def from_json(cls, text: str) -> Layout:
-        """The inverse of `to_json`."""
+        """Create a layout from the text that `to_json` returned.
+
+        Args:
+            text: JSON list of [name, length].
+
+        Returns:
+            The layout.
+        """
         return cls((name, length) for name, length in json.loads(text))

@@ -1,6 +1,6 @@
-"""The robot as data: names, order and limits of its joints, sensors and motors, read once from `robot.toml`.
+"""Description of the robot: names, order and limits of its joints, sensors and motors, read from `robot.toml`.
 
-Limiter, plausibility checks, drives, model generator and controller all take their numbers from here.
+The limiter, the plausibility checks, the emulated drives, the model generator and the controller use these values.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-#: Joints of one leg, hip to foot: frontal, transverse, sagittal hip; sagittal knee; sagittal, henke ankle.
+#: Joints of one leg, hip to foot: frontal, transverse and sagittal hip; sagittal knee; sagittal and Henke ankle.
 LEG_JOINTS = ("FH", "TH", "SH", "SK", "SA", "HA")
 SIDES = ("left", "right")
 JOINTS = tuple(f"{side}_{joint}" for side in SIDES for joint in LEG_JOINTS)
-#: q_right = sign * q_left for the mirrored pose, per leg joint.
+#: Sign of each leg joint in the mirrored pose: q_right = sign * q_left.
 MIRROR_SIGN = (-1, -1, 1, 1, 1, -1)
 IMUS = ("torso", "pelvis", "left_tibia", "right_tibia")
 FEET = SIDES
@@ -36,70 +36,75 @@ Vector = npt.NDArray[np.float64]
 
 
 class RobotError(ValueError):
-    """The robot file does not describe this robot; the message names the key and what is valid."""
+    """Error in the robot file; the message names the key and its valid values."""
 
     code = "CONFIG_INVALID"
 
 
 @dataclass(frozen=True)
 class Envelope:
-    """How torque fades towards the limits of position and velocity, see `limiter`."""
+    """Reduction of the torque near the limits of position and velocity, see `limiter`."""
 
-    look_ahead: float  # s, at its velocity, in which a joint has to stay inside its position limits
-    position_margin: float  # rad past a position limit where no torque drives it any further
-    velocity_margin: float  # rad/s past a velocity limit where no torque drives it any faster
+    look_ahead: float  # s, time in which a joint at its present velocity must stay inside its position limits
+    position_margin: float  # rad beyond a position limit from which no torque drives the joint further out
+    velocity_margin: float  # rad/s beyond a velocity limit from which no torque accelerates the joint further
 
 
 @dataclass(frozen=True)
 class Derating:
-    """Torque a hot drive may give."""
+    """Torque limit of a hot drive as a function of its temperature."""
 
-    start: float  # degC, up to here all of it
-    end: float  # degC, from here `floor`
-    floor: float  # share of torque_max
+    start: float  # degC, up to this temperature torque_max is allowed
+    end: float  # degC, from this temperature on only `floor` is allowed
+    floor: float  # share of torque_max, 0 to 1
 
 
 @dataclass(frozen=True)
 class Sensors:
-    """What healthy sensors agree within, see `plausibility`."""
+    """Tolerances of healthy sensors, see `plausibility`."""
 
-    velocity_error: float  # rad/s at the joint, reported velocity against the encoder, on average
-    attitude_error: float  # rad, tibia against pelvis IMU, each axis, against the encoders between them
-    attitude_change: float  # rad, by which that changes within a fraction of a second
-    misalignment: float  # rad more for each rad the leg turns meanwhile
-    quaternion_error: float  # of its squared norm against 1
-    cell_free: float  # N, vertical: a force cell under this carries nothing
-    cell_loaded: float  # N, vertical, three cells together: over this the fourth carries something
+    velocity_error: float  # rad/s at the joint, mean error of the reported velocity against the encoder
+    attitude_error: float  # rad, each axis: tibia IMU relative to the pelvis IMU, against the encoders between them
+    attitude_change: float  # rad, change of the attitude error within a fraction of a second
+    misalignment: float  # rad of additional tolerance for each rad the leg turns meanwhile
+    quaternion_error: float  # error of the squared norm of a quaternion against 1
+    cell_free: float  # N, vertical: a force cell below it carries no load
+    cell_loaded: float  # N, vertical sum of three cells: above it the fourth cell must carry load
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """What the HAL bears before it reacts, and how fast it does."""
+    """Thresholds and ramps of the HAL's fault reactions."""
 
-    supply_low: float  # V, of a drive: below it the battery is nearly empty
-    supply_under: float  # V, below it drives cannot hold much longer
-    derated_imbalance: float  # share of its twin's torque on the other leg below which a hot drive no longer walks
-    full_assist_ramp: float  # s, in which FULL_ASSIST leads the assistance factor from 0 to 1
-    position_tolerance: float  # rad past a position limit from where on a joint is out of its range
-    idle_torque: float  # Nm a drive may report when it is off, and beyond its limit when it is on
-    surplus_frames: float  # beyond one of each cyclic message that a cycle may bring
+    supply_low: float  # V at a drive; below it the battery is nearly empty
+    supply_under: float  # V at a drive; below it the drives cannot hold much longer
+    derated_imbalance: (
+        float  # torque limit of a hot drive, as a share of the same joint's on the other leg; below: no walking
+    )
+    full_assist_ramp: float  # s, time in which FULL_ASSIST ramps the assistance factor from 0 to 1
+    position_tolerance: float  # rad beyond a position limit from which a joint is out of its range
+    idle_torque: float  # Nm that a drive may report while off, or beyond its limit while on
+    surplus_frames: float  # frames a cycle may bring in addition to one of each cyclic message
 
 
 @dataclass(frozen=True)
 class Robot:
-    """Limits, transmission and sensors; arrays of shape (12,) in the order of `JOINTS`, read-only, joint side."""
+    """Limits, transmission and sensor tolerances of the robot.
+
+    Arrays have shape (12,), in the order of `JOINTS`, on the joint side, and are read-only.
+    """
 
     position_min: Vector  # rad
     position_max: Vector  # rad
     velocity_max: Vector  # rad/s
     torque_max: Vector  # Nm
     torque_rate_max: Vector  # Nm/s
-    gear: Vector  # motor turns a joint turn
+    gear: Vector  # motor turns for each joint turn
     polarity: Vector  # +1 or -1: encoder sign against the joint
-    hold_kp: Vector  # Nm/rad, the drive's own position hold
-    hold_kd: Vector  # Nm s/rad
+    hold_kp: Vector  # Nm/rad, stiffness of the drive's own position hold
+    hold_kd: Vector  # Nm s/rad, damping of the drive's own position hold
     encoder_noise: Vector  # rad rms
-    breakaway: Vector  # Nm, change of torque that moves a joint out of dry friction
+    breakaway: Vector  # Nm, change of torque that overcomes dry friction
     envelope: Envelope
     derating: Derating
     sensors: Sensors
@@ -107,20 +112,22 @@ class Robot:
     hash32: int  # CRC-32 of the file, as reported in HAL_STATUS
 
     def torque_limit(self, temperature: Vector) -> Vector:
-        """What a drive may give when it is this hot: `torque_max` up to `derating.start`, linear to `floor` at `end`.
+        """Return the torque limit of each drive at its temperature.
+
+        The limit is `torque_max` up to `derating.start` and falls linearly to `derating.floor * torque_max` at `derating.end`.
 
         Args:
-            temperature: as the drives report it, shape (12,) [degC].
+            temperature: Temperatures that the drives report, shape (12,) [degC].
 
         Returns:
-            Shape (12,) [Nm].
+            Torque limits, shape (12,) [Nm].
         """
         start, end, floor = self.derating.start, self.derating.end, self.derating.floor
         return self.torque_max * np.clip(1.0 - (temperature - start) / (end - start) * (1.0 - floor), floor, 1.0)
 
 
 class _Key(NamedTuple):
-    """What a key of a joint table holds; the range is wide: it catches another unit or a slipped digit, not a bold design."""
+    """Valid values of a key. The range is wide: it detects a wrong unit or a misplaced decimal point."""
 
     size: int
     low: float
@@ -133,13 +140,13 @@ _KEYS = {
     "velocity_max": _Key(1, 0.01, 50.0, "rad/s"),
     "torque_max": _Key(1, 0.1, 400.0, "Nm"),  # the command frame carries 409 Nm
     "torque_rate_max": _Key(1, 10.0, 1e6, "Nm/s"),
-    "gear": _Key(1, 1.0, 1000.0, "motor turns a joint turn"),
+    "gear": _Key(1, 1.0, 1000.0, "motor turns for each joint turn"),
     "polarity": _Key(1, -1.0, 1.0, "1 or -1"),
     "hold": _Key(2, 0.01, 1e5, "Nm/rad and Nm s/rad"),
     "encoder_noise": _Key(1, 1e-9, 1e-2, "rad"),
     "breakaway": _Key(1, 0.01, 400.0, "Nm"),
 }
-#: Keys of the tables beside [joints].
+#: Keys of the tables other than [joints].
 _TABLES = {
     "envelope": {
         "look_ahead": _Key(1, 1e-3, 1.0, "s"),
@@ -155,15 +162,15 @@ _TABLES = {
         "velocity_error": _Key(1, 0.01, 10.0, "rad/s"),
         "attitude_error": _Key(1, 1e-3, 0.5, "rad"),
         "attitude_change": _Key(1, 1e-4, 0.5, "rad"),
-        "misalignment": _Key(1, 0.0, 0.5, "rad a rad"),
-        "quaternion_error": _Key(1, 1e-4, 0.5, "of 1"),
+        "misalignment": _Key(1, 0.0, 0.5, "rad for each rad"),
+        "quaternion_error": _Key(1, 1e-4, 0.5, "without unit"),
         "cell_free": _Key(1, 1.0, 1000.0, "N"),
         "cell_loaded": _Key(1, 1.0, 3000.0, "N"),
     },
     "thresholds": {
         "supply_low": _Key(1, 5.0, 100.0, "V"),
         "supply_under": _Key(1, 5.0, 100.0, "V"),
-        "derated_imbalance": _Key(1, 0.01, 1.0, "share of the other leg's"),
+        "derated_imbalance": _Key(1, 0.01, 1.0, "share of the other leg's torque limit"),
         "full_assist_ramp": _Key(1, 0.01, 60.0, "s"),
         "position_tolerance": _Key(1, 1e-3, 0.5, "rad"),
         "idle_torque": _Key(1, 0.1, 50.0, "Nm"),
@@ -173,10 +180,16 @@ _TABLES = {
 
 
 def load_robot(path: Path | None = None) -> Robot:
-    """Read the robot file strictly.
+    """Read the robot file and check every key.
+
+    Args:
+        path: Robot file (TOML); None: the `robot.toml` of this package.
+
+    Returns:
+        The robot it describes.
 
     Raises:
-        RobotError: unknown or missing key, a value that is no number or far from any such joint, an empty range.
+        RobotError: If the file cannot be read, or if a key is unknown, missing or outside its valid range.
     """
     path = path or ROBOT_FILE
     try:
@@ -187,21 +200,23 @@ def load_robot(path: Path | None = None) -> Robot:
     except (ValueError, RecursionError) as error:
         raise RobotError(f"{path}: {error}") from error
     if set(document) != {"joints", *_TABLES}:
-        raise RobotError(f"{path}: the top-level tables are joints, {', '.join(_TABLES)}, found {sorted(document)}")
+        raise RobotError(f"{path}: the top-level tables must be joints, {', '.join(_TABLES)}, got {sorted(document)}")
     tables = document["joints"]
     if not isinstance(tables, dict) or set(tables) != set(LEG_JOINTS):
-        raise RobotError(f"{path}: [joints] needs exactly the tables {', '.join(LEG_JOINTS)}")
+        raise RobotError(f"{path}: [joints] must have exactly the tables {', '.join(LEG_JOINTS)}")
     joints = {joint: _table(f"{path}: joints.{joint}", tables[joint], _KEYS) for joint in LEG_JOINTS}
     left = {key: np.array([joints[joint][key] for joint in LEG_JOINTS]) for key in _KEYS}
-    others = {
+    scalars = {
         name: {key: numbers[0] for key, numbers in _table(f"{path}: {name}", document[name], keys).items()}
         for name, keys in _TABLES.items()
     }
-    if not others["derating"]["start"] < others["derating"]["end"]:
-        raise RobotError(f"{path}: derating.start is below derating.end, not {others['derating']['start']!r}")
-    if not others["thresholds"]["supply_under"] < others["thresholds"]["supply_low"]:
+    start, end = scalars["derating"]["start"], scalars["derating"]["end"]
+    if not start < end:
+        raise RobotError(f"{path}: derating.start must be below derating.end ({end!r}), got {start!r}")
+    under, low_supply = scalars["thresholds"]["supply_under"], scalars["thresholds"]["supply_low"]
+    if not under < low_supply:
         raise RobotError(
-            f"{path}: thresholds.supply_under is below thresholds.supply_low, not {others['thresholds']['supply_under']!r}"
+            f"{path}: thresholds.supply_under must be below thresholds.supply_low ({low_supply!r}), got {under!r}"
         )
 
     def both(column: Vector) -> Vector:
@@ -221,22 +236,22 @@ def load_robot(path: Path | None = None) -> Robot:
         hold_kd=both(left["hold"][:, 1]),
         encoder_noise=both(left["encoder_noise"][:, 0]),
         breakaway=both(left["breakaway"][:, 0]),
-        envelope=Envelope(**others["envelope"]),
-        derating=Derating(**others["derating"]),
-        sensors=Sensors(**others["sensors"]),
-        thresholds=Thresholds(**others["thresholds"]),
+        envelope=Envelope(**scalars["envelope"]),
+        derating=Derating(**scalars["derating"]),
+        sensors=Sensors(**scalars["sensors"]),
+        thresholds=Thresholds(**scalars["thresholds"]),
         hash32=zlib.crc32(raw),
     )
 
 
 def _table(where: str, table: Any, keys: dict[str, _Key]) -> dict[str, list[float]]:
-    """The numbers of each key of a table, which has exactly these."""
+    """Return the numbers of each key of a table, which must have exactly the given keys."""
     if not isinstance(table, dict):
-        raise RobotError(f"{where} is a table with the keys {', '.join(keys)}")
+        raise RobotError(f"{where} must be a table with the keys {', '.join(keys)}, got {table!r}")
     if unknown := sorted(set(table) - set(keys)):
         raise RobotError(f"{where}.{unknown[0]} is unknown; valid keys are {', '.join(keys)}")
     if missing := [key for key in keys if key not in table]:
-        raise RobotError(f"{where}.{missing[0]} is missing")
+        raise RobotError(f"{where}.{missing[0]} is missing; required keys are {', '.join(keys)}")
     return {key: _numbers(f"{where}.{key}", table[key], valid) for key, valid in keys.items()}
 
 
@@ -244,12 +259,13 @@ def _numbers(where: str, value: Any, valid: _Key) -> list[float]:
     numbers = value if isinstance(value, list) else [value]
     # The comparison is false for NaN too.
     if len(numbers) != valid.size or not all(type(n) in (int, float) and valid.low <= n <= valid.high for n in numbers):
-        what = "1 number" if valid.size == 1 else f"{valid.size} numbers"
-        raise RobotError(f"{where} is {what} from {valid.low:.6g} to {valid.high:.6g} ({valid.unit}), not {value!r}")
+        count = "1 number" if valid.size == 1 else f"{valid.size} numbers"
+        valid_range = f"from {valid.low:.6g} to {valid.high:.6g} ({valid.unit})"
+        raise RobotError(f"{where} must be {count} {valid_range}, got {value!r}")
     if where.endswith(".position") and not numbers[0] < numbers[1]:
-        raise RobotError(f"{where} is [min, max] with min < max, not {value!r}")
+        raise RobotError(f"{where} must be [min, max] with min < max, got {value!r}")
     if where.endswith(".polarity") and numbers[0] not in (-1, 1):
-        raise RobotError(f"{where} is 1 or -1, not {value!r}")
+        raise RobotError(f"{where} must be 1 or -1, got {value!r}")
     return [float(n) for n in numbers]
 
 

@@ -1,8 +1,9 @@
-"""The HAL's end of the bus: what leaves is in its table, what comes in a cycle is bounded, and a bus that fails raises nothing.
+"""Transceiver of the HAL: it sends only permitted frames, bounds the frames received in a cycle and reports bus faults.
 
 `bus -> transceiver -> process image`, and back.
 
-Transmit is default-deny: a batch whose frames are not, header by header, messages this node sends does not reach the bus.
+Transmission is denied by default. A batch reaches the bus only if the header of each frame belongs to a message of this node.
+A failing bus raises no exception; `judge` raises its diagnostics.
 """
 
 from __future__ import annotations
@@ -17,38 +18,51 @@ from atalante_hal.safety.fault_memory import FaultMemory
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, Frames, as_words, header_word, new_frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Frames one cycle can take; the cyclic set is about 20.
+#: Most frames that are received in one cycle; about 20 are cyclic.
 RECEIVE_BUDGET = 128
-#: Cycles in a row after which a flood, or a transmit queue without room, is confirmed.
+#: Consecutive cycles after which a flood or a full transmit queue is confirmed.
 PERSISTENT = 5
 #: Time to listen for another HAL before the first SYNC [s].
 LISTEN = 0.2
-#: Longest wait [s] for answers that nobody may give: no node has been heard, or what would ask them was not sent.
+#: Longest wait for answers that are unlikely [s]: no node has answered so far, or the last SYNC was not sent.
 _DOUBTFUL_PATIENCE = 0.1
-#: Class of an error frame that says bus-off, linux/can/error.h.
+#: Class bit of an error frame that reports bus-off (linux/can/error.h).
 ERROR_BUS_OFF = 0x40
 
 
 class TransmitDenied(Exception):  # noqa: N818
-    """A frame that this node may not send; the program has a defect."""
+    """Error of a frame that this node may not send: a defect of the program."""
 
 
 class HalDuplicate(BusError):  # noqa: N818
-    """Another HAL is at work on this bus."""
+    """Error of a second HAL that is active on the same bus."""
 
 
 class FrameTap(Protocol):
-    """Sees every frame the HAL sends and receives, for a CAN log."""
+    """Receiver of a copy of every frame that the HAL sends or receives, for a CAN log."""
 
     def sent(self, frames: Frames) -> None:
-        """Frames just handed to the bus."""
+        """Log frames that were just passed to the bus.
+
+        Args:
+            frames: Sent frames, shape (n,).
+        """
 
     def received(self, frames: Frames, count: int) -> None:
-        """`frames[:count]` as they came from the bus."""
+        """Log frames that were just received.
+
+        Args:
+            frames: Receive buffer, shape (m,).
+            count: Number of received frames at its start.
+        """
 
 
 class Outgoing:
-    """A batch of frames that may be sent, always the same array."""
+    """Batch of frames that may be sent, with the headers they had when they were checked.
+
+    Args:
+        frames: Frames, shape (n,); always the same array.
+    """
 
     def __init__(self, frames: Frames) -> None:
         self.frames = frames
@@ -57,16 +71,20 @@ class Outgoing:
 
 
 class Transceiver:
-    """Sends and receives for one node; collects what is wrong with the bus until `judge`."""
+    """Transceiver of one node; it collects the faults of the bus until `judge` reports them."""
 
     def __init__(
         self, network: Network, node: str, bus: Bus, tap: FrameTap | None, *, cyclic: int, surplus: float
     ) -> None:
-        """Begin.
+        """Prepare the receive buffer and the table of permitted frames.
 
         Args:
-            cyclic: frames a perfect cycle brings.
-            surplus: frames more than that are a flood, see `robot.Thresholds`.
+            network: CAN network that defines the messages of the node.
+            node: DBC name of the sending node, such as HAL.
+            bus: Open bus. The caller owns it.
+            tap: Receiver of a copy of every frame; None: none.
+            cyclic: Number of frames received in a cycle without faults.
+            surplus: Number of additional frames in a cycle above which a flood is reported, see `robot.Thresholds`.
         """
         self.bus, self.tap = bus, tap
         self._table = {_header(m) for m in network.sent_by(node)}
@@ -75,21 +93,27 @@ class Transceiver:
         self._most = cyclic + surplus
         #: Receive buffer, always the same array.
         self.scratch = new_frames(RECEIVE_BUDGET)
-        #: Found since the last `judge`: code, whether confirmed, value, sentence.
+        #: Faults found since the last `judge`: code, whether confirmed, value, sentence.
         self._found: list[tuple[Dtc, bool, float, str]] = []
-        self._refused = 0  # batches in a row for which the transmit queue had no room
+        self._refused = 0  # consecutive cycles in which the transmit queue was full
         self._full_this_cycle = False
-        self._asked = True  # the last batch has left whole
-        self._floods = 0  # cycles in a row
-        self._bus_off = 0  # error class of the frame that said so, until the operator acknowledges it
-        #: Nothing is wrong with the bus.
+        self._asked = True  # the last batch was sent completely
+        self._floods = 0  # consecutive cycles with a flood
+        self._bus_off = 0  # error class of the last bus-off frame; 0 after the operator's acknowledgement
+        #: True if the bus has no fault.
         self.quiet = True
 
     def grant(self, frames: Frames) -> Outgoing:
-        """Make a batch that may be sent.
+        """Check the headers of a batch of frames and permit their transmission.
+
+        Args:
+            frames: Frames of messages of this node, shape (n,). `send` uses the same array later.
+
+        Returns:
+            The batch for `send`.
 
         Raises:
-            TransmitDenied: a frame is no message of this node.
+            TransmitDenied: If a frame is not a message of this node.
         """
         for header in as_words(frames)[:, 0].tolist():
             if header not in self._table:
@@ -97,13 +121,18 @@ class Transceiver:
         return Outgoing(frames)
 
     def send(self, batch: Outgoing) -> None:
-        """Send a batch; what the bus refuses is dropped and told in `judge`.
+        """Send a batch; frames that the bus rejects are dropped, and `judge` reports the fault.
+
+        Args:
+            batch: Batch that `grant` returned.
 
         Raises:
-            TransmitDenied: a header was changed since it was granted.
+            TransmitDenied: If a header has changed since `grant`.
         """
         if batch.headers.tobytes() != batch.granted:
-            raise TransmitDenied(f"a frame of {self._node} has another identifier, length or format than was granted")
+            raise TransmitDenied(
+                f"a frame of {self._node} must keep the identifier, length and format it was granted with"
+            )
         self._asked = False
         try:
             self.bus.send(batch.frames)
@@ -111,21 +140,22 @@ class Transceiver:
             self._full_this_cycle = True
             self._find(Dtc.BUS_TX_FULL, self._refused + 1 >= PERSISTENT, error.sent, f"{error}")
         except BusError as error:
-            self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} refuses frames: {error}")
+            self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot send: {error}")
         else:
             self._asked = True
             if self.tap is not None:
                 self.tap.sent(batch.frames)
 
     def receive(self, count: int = 0, cycle: ReceiveImage | None = None, patience: float = 0.0) -> int:
-        """Append to the first `count` frames of `scratch` what the bus has, at most the budget.
+        """Receive frames into `scratch`, behind those already in it, up to `RECEIVE_BUDGET` frames.
 
         Args:
-            cycle: wait for its messages; None: what is there at once will do.
-            patience: longest wait for them [s]; shorter when the last batch, their SYNC, did not leave.
+            count: Number of frames already in `scratch`.
+            cycle: Process image whose messages are waited for; None: do not wait.
+            patience: Longest wait for them [s]. It is shortened if the last batch (their SYNC) was not sent.
 
         Returns:
-            Frames in the buffer now.
+            Number of frames now in `scratch`.
         """
         first, scratch = count, self.scratch
         try:
@@ -133,7 +163,7 @@ class Transceiver:
             if cycle is not None and (first or not cycle.begins(scratch, count)):
                 count = self._receive_rest(first, count, cycle.expected_ids(), patience)
         except BusError as error:
-            self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} fails: {error}")
+            self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot receive: {error}")
             count = first
         if self.tap is not None:
             self.tap.received(scratch[first:] if first else scratch, count - first)
@@ -142,48 +172,60 @@ class Transceiver:
         return count
 
     def foreign(self, frames: Frames) -> None:
-        """Frames that nobody may send to this node: unknown, its own, or what the controller says of itself."""
+        """Report frames that no other node may send to this one: error frames, own messages and unknown messages.
+
+        Args:
+            frames: Received frames that are not in a process image, shape (n,).
+        """
         for can_id in frames["can_id"].tolist():
             if can_id & ID_ERROR:
                 if can_id & ERROR_BUS_OFF:
                     self._bus_off = can_id & ~ID_ERROR
                     self.quiet = False
             elif can_id in self._own_ids:
-                self._find(Dtc.HAL_DUPLICATE, True, can_id, f"somebody else sends id 0x{can_id:X}, which is this HAL's")
+                self._find(Dtc.HAL_DUPLICATE, True, can_id, f"another node sends id 0x{can_id:X} of this HAL")
             else:
-                self._find(Dtc.FRAME_UNKNOWN, True, can_id, f"id 0x{can_id:X} is no message to this HAL")
+                self._find(Dtc.FRAME_UNKNOWN, True, can_id, f"id 0x{can_id:X} is not a message to this HAL")
 
     def listen(self, seconds: float = LISTEN) -> None:
-        """Hear whether another HAL is at work, before the first frame is sent; what else comes is dropped.
+        """Check that no other HAL sends on this bus, before the first frame is sent; other frames are dropped.
+
+        Args:
+            seconds: Time to listen [s].
 
         Raises:
-            HalDuplicate: a message of this node was heard.
-            BusError: the bus is gone.
+            HalDuplicate: If a message of this node was received.
+            BusError: If the bus is down.
         """
         deadline = time.monotonic() + seconds
         while (left := deadline - time.monotonic()) > 0.0:
             count = self.bus.receive(self.scratch, left)
-            heard = self._own_ids.intersection(self.scratch["can_id"][:count].tolist())
-            if heard:
+            duplicates = self._own_ids.intersection(self.scratch["can_id"][:count].tolist())
+            if duplicates:
                 raise HalDuplicate(
-                    f"another HAL is at work on {self.bus.name} (id 0x{min(heard):X} was heard): end it first"
+                    f"another HAL is active on {self.bus.name} (received id 0x{min(duplicates):X}): stop it first"
                 )
 
     def discard(self) -> None:
-        """Drop what has piled up: the answers to SYNCs of long ago."""
+        """Drop all queued frames: after a gap they are answers to old SYNCs."""
         try:
             for _ in range(RECEIVE_BUDGET):
                 if self.bus.receive(self.scratch) < RECEIVE_BUDGET:
                     return
         except BusError as error:
-            self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} fails: {error}")
+            self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot receive: {error}")
 
     def acknowledge(self) -> None:
-        """The operator starts again: a controller that was bus-off may be used, if it can."""
+        """Clear a bus-off after the operator's acknowledgement; it is reported again if the CAN controller reports it again."""
         self._bus_off = 0
 
     def judge(self, cycle: int, memory: FaultMemory) -> None:
-        """Raise what was found since the last `judge`, and a bus-off that nobody has acknowledged."""
+        """Raise the diagnostics of the faults found since the last call, and of a bus-off that is not acknowledged.
+
+        Args:
+            cycle: Number of the present cycle.
+            memory: Fault memory that receives the diagnostics.
+        """
         self._refused = self._refused + 1 if self._full_this_cycle else 0
         self._full_this_cycle = False
         self._floods = self._floods + 1 if any(dtc is Dtc.BUS_FLOOD for dtc, *_ in self._found) else 0
@@ -199,14 +241,15 @@ class Transceiver:
         self.quiet = False
 
     def _receive_rest(self, first: int, count: int, expected: set[int], patience: float) -> int:
-        """Wait until every expected message has come after the `first` frames, at most `patience` [s]."""
-        # Nobody heard yet: take whoever answers until they fall silent, so that no answer is left for the next cycle.
-        nobody = not expected
-        deadline = time.monotonic() + (min(patience, _DOUBTFUL_PATIENCE) if nobody or not self._asked else patience)
+        """Wait until every expected message has arrived after the first `first` frames, at most `patience` [s]."""
+        # If no node has answered so far, receive until the bus is silent, so that no answer is left for the next cycle.
+        until_silent = not expected
+        unlikely = until_silent or not self._asked
+        deadline = time.monotonic() + (min(patience, _DOUBTFUL_PATIENCE) if unlikely else patience)
         while count < RECEIVE_BUDGET:
             expected.difference_update(self.scratch["can_id"][first:count].tolist())
             remaining = deadline - time.monotonic()
-            if remaining <= 0.0 or not (expected or nobody):
+            if remaining <= 0.0 or not (expected or until_silent):
                 break
             first = count
             got = self.bus.receive(self.scratch[count:], remaining)

@@ -1,4 +1,4 @@
-"""What passes between the HAL and a controller: the state read, the command written, and the controller protocol."""
+"""Data exchanged between the HAL and a controller: `State`, `Command` and the `Controller` protocol."""
 
 from __future__ import annotations
 
@@ -14,30 +14,33 @@ Vector = npt.NDArray[np.float64]
 
 
 class SupervisorState(IntEnum):
-    """State of the supervisor; larger is worse. Values are those of `HalState` on the wire."""
+    """State of the supervisory state machine; a larger value is a worse state.
+
+    The values are those of the signal `HalState` on the bus.
+    """
 
     OFF = 0  # no node is expected to answer
-    READY = 1  # every node is heard and well; drives may be enabled on the operator's word
+    READY = 1  # every node answers without a fault; the operator may enable the drives
     ACTIVE = 2  # the controller drives the joints
-    FULL_ASSIST = 3  # as ACTIVE with the assistance factor led to 1
-    FINISH_STEP = 4  # the step under way is finished, then HOLD
-    HOLD = 5  # every drive holds its position by itself
-    LOWER = 6  # a joint that cannot hold is let down slowly
-    FAULT = 7  # latched; leaves by the operator alone
+    FULL_ASSIST = 3  # as ACTIVE, while the assistance factor is ramped to 1
+    FINISH_STEP = 4  # the present step is finished, then HOLD follows
+    HOLD = 5  # every drive holds its position with its own control loop
+    LOWER = 6  # a joint that cannot hold is lowered slowly
+    FAULT = 7  # latched; only the operator can end it
 
 
 @dataclass(slots=True)
 class State:
-    """One cycle as the HAL sees it; joint side, SI units, order of `robot.JOINTS`.
+    """Measured state of the robot in one cycle: joint side, SI units, joints in the order of `robot.JOINTS`.
 
-    The arrays are views of the HAL's memory, valid until the next `Hal.read()`: copy what must live longer.
-    Do not write into them.
+    The arrays are views of the HAL's memory and valid until the next `Hal.read()`. Copy values that are needed longer.
+    Do not write into the arrays.
     """
 
     cycle: int  # SYNC counter
     time: float  # s, cycle * period
     supervisor: SupervisorState
-    assistance_factor: float  # Xi in [0, 1], set by the operator; led to 1 in FULL_ASSIST
+    assistance_factor: float  # Xi in [0, 1], set by the operator; ramped to 1 in FULL_ASSIST
     position: Vector  # (12,) rad
     velocity: Vector  # (12,) rad/s
     torque: Vector  # (12,) Nm, measured by the drive
@@ -48,39 +51,50 @@ class State:
     imu_accel: Vector  # (4, 3) m/s2, specific force
     foot_force: Vector  # (2, 4, 3) N, on the foot, in the foot frame
     vibration: Vector  # (8,) measured level, 0 to 1
-    valid: npt.NDArray[np.bool_]  # (messages,) fresh, intact, plausible, and its sender is trusted
-    age: npt.NDArray[np.int64]  # (messages,) cycles between the SYNC the data answers and the last one
+    valid: npt.NDArray[np.bool_]  # (messages,) True: fresh, intact, plausible, and its sender is qualified
+    age: npt.NDArray[np.int64]  # (messages,) cycles since the SYNC that the data answers
     joints_valid: bool  # all twelve joint states are fresh
-    imu_rows: tuple[int, ...] = ()  # places of the IMUs' messages in `valid` and `age`; empty: their age is not known
-    torque_sent: Vector | None = None  # (12,) Nm, what the limits left of the last command; None: it is not known
+    imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty: their age is unknown
+    torque_sent: Vector | None = None  # (12,) Nm, last command after the limits; None: unknown
 
 
 @dataclass(slots=True)
 class Command:
-    """What a controller asks for; the limiter decides what is sent.
+    """Command of a controller for one cycle, before the limiter.
 
-    Raises nothing: a non-finite value is caught by the limiter and ends in HOLD.
+    A torque that is not finite raises no exception. The limiter detects it and the robot goes to HOLD.
     """
 
     torque: Vector  # (12,) Nm at the joint
     vibration: Vector  # (8,) level, 0 to 1
-    step: int | None = None  # number of the step under way; None: this controller does not walk
-    outside: bool = False  # a joint is outside its safe backward image: told, not acted upon
+    step: int | None = None  # number of the present step; None: this controller does not walk
+    outside: bool = False  # a joint is outside its safe backward image; reported as an event without any other effect
 
 
 class Controller(Protocol):
-    """What the loop runs: any object with these members."""
+    """Controller that the loop runs: any object with these members."""
 
     @property
     def telemetry(self) -> Vector:
-        """What the controller wants recorded: always the same array, rewritten every update."""
+        """Return the values to record: always the same array, rewritten at every update."""
 
     @property
     def telemetry_fields(self) -> Sequence[tuple[str, int]]:
-        """(name, length) of each piece of `telemetry`."""
+        """Return (name, length) of each field of `telemetry`, in order."""
 
     def reset(self, state: State) -> None:
-        """Called when the supervisor enters ACTIVE, before the first `update`."""
+        """Prepare for a motion; called when the controller takes over, before the first `update`.
+
+        Args:
+            state: State of the present cycle.
+        """
 
     def update(self, state: State) -> Command:
-        """One cycle: read the state, return the command. Any exception puts the robot into HOLD."""
+        """Compute the command of one cycle; any exception puts the robot into HOLD.
+
+        Args:
+            state: State of the present cycle.
+
+        Returns:
+            Command of this cycle, before the limits.
+        """

@@ -1,12 +1,12 @@
-"""The bus: first and last stage of the flow, `bus -> process image -> ... -> process image -> bus`.
+"""CAN buses: first and last stage of the flow, `bus -> process image -> ... -> process image -> bus`.
 
-One small protocol and the transports behind it; the HAL and the emulator run on any of them unchanged:
+The protocol `Bus` has several transports. The HAL and the emulator run on any of them without change:
 
-- `socketcan.SocketCanBus`: a Linux CAN interface, `can0` of an adapter or a `vcan0`;
+- `socketcan.SocketCanBus`: a Linux CAN interface, such as `can0` of an adapter or `vcan0`;
 - `pair.PairBus`: two ends in one process, in lock-step;
-- `shared.SharedBus`: the same between two processes, which then work at once;
-- `python_can.PythonCanBus`: any interface python-can knows (virtual, pcan, kvaser, ...);
-- `replay.ReplayBus`: a log, read only.
+- `shared.SharedBus`: two ends in two processes, which run in parallel;
+- `python_can.PythonCanBus`: any interface that python-can supports (virtual, pcan, kvaser, ...);
+- `replay.ReplayBus`: a recorded log, read only.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ Stamps = npt.NDArray[np.int64]
 
 
 class BusError(Exception):
-    """Something is wrong with the bus; the message says what, and what would be right."""
+    """Error of the bus; the message names the cause and the remedy."""
 
 
 class BusAbsent(BusError):  # noqa: N818
-    """The bus cannot be opened: no such interface, interface down, no CAN FD, no driver."""
+    """Error on opening: no such interface, interface down, no CAN FD or no driver."""
 
 
 class BusDown(BusError):  # noqa: N818
-    """The bus was open and is gone: interface down or unplugged, or closed by us."""
+    """Error on an open bus that can no longer be used: interface down, adapter unplugged, or bus closed."""
 
 
 class BusFull(BusError):  # noqa: N818
-    """The transmit queue took only the first `sent` frames of the batch."""
+    """Error of a full transmit queue, which accepted only the first `sent` frames of the batch."""
 
     def __init__(self, message: str, sent: int = 0) -> None:
         super().__init__(message)
@@ -42,51 +42,75 @@ class BusFull(BusError):  # noqa: N818
 
 
 class Bus(Protocol):
-    """What carries frames. Frames are `frame.FRAME` records, shape (n,), contiguous.
+    """Interface of every CAN transport. Frames are contiguous arrays of `frame.FRAME` records, shape (n,).
 
-    Pass the same array objects cycle after cycle: a bus remembers the memory of the arrays it has seen.
+    Pass the same array objects in every cycle: a bus caches memory views of the arrays passed to it.
     """
 
     @property
     def name(self) -> str:
-        """The channel, as messages to the user name it."""
+        """Return the name of the channel for messages to the user."""
         ...
 
     @property
     def stamps(self) -> Stamps:
-        """Receive times of the frames of the last `receive()`, in its order. Shape (capacity,) int64 [ns]."""
+        """Return the receive times of the frames of the last `receive()`, in the same order. Shape (capacity,) int64 [ns]."""
         ...
 
     @property
     def dropped(self) -> int:
-        """Frames that reached this end and were lost before `receive()`, since it was opened."""
+        """Return the number of frames lost at this end before `receive()`, since the bus was opened."""
         ...
 
     def send(self, frames: Frames) -> None:
-        """Send all frames, in order; the array may be written again as soon as this returns.
+        """Send all frames, in order. The caller may reuse the array after the call.
 
-        Raises `BusFull` or `BusDown`, and `ValueError` for a frame that no CAN controller could send.
+        Args:
+            frames: Frames to send, shape (n,).
+
+        Raises:
+            BusFull: If the transmit queue accepted only a part of the frames.
+            BusDown: If the bus is closed or down.
+            ValueError: If a frame is not a valid CAN frame.
         """
         ...
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Fill `frames[:n]` with what has arrived, oldest first, and return n; the rest of `frames` is left alone.
+        """Write the received frames to `frames[:n]`, oldest first, and return n.
 
-        Waits up to `timeout` [s] for the first frame only. Own frames are not received. Payload bytes beyond a frame's
-        length are not defined. Raises `BusDown`.
+        The rest of `frames` does not change. Own frames are not received. Payload bytes beyond the length of a frame are
+        undefined.
+
+        Args:
+            frames: Receive buffer, shape (m,) with m >= n.
+            timeout: Longest wait for the first frame [s]; 0: return without waiting.
+
+        Returns:
+            Number of received frames n; 0 if none arrived in time.
+
+        Raises:
+            BusDown: If the bus is closed or down.
         """
         ...
 
     def close(self) -> None:
-        """Leave the bus; a second call does nothing, and `send()` and `receive()` raise `BusDown` from then on."""
+        """Close the bus; a second call has no effect. Later calls of `send()` and `receive()` raise `BusDown`."""
         ...
 
 
 def open_bus(interface: str, channel: str, **options: Any) -> Bus:
-    """Open one channel, by python-can's names for interface and channel.
+    """Open one channel of a CAN interface.
 
-    `socketcan` is ours; every other interface is python-can's and gets `options` as they are. Raises `BusAbsent` with
-    what to type.
+    Args:
+        interface: Name of the interface in python-can. `socketcan` uses `SocketCanBus`; all others use python-can.
+        channel: Name of the channel, such as `can0`.
+        **options: Keyword arguments of the chosen bus class. python-can receives those it defines without change.
+
+    Returns:
+        The open bus.
+
+    Raises:
+        BusAbsent: If the channel cannot be opened; the message contains the command that helps.
     """
     if interface == "socketcan":
         from atalante_hal.bus.socketcan import SocketCanBus

@@ -250,7 +250,7 @@ def test_the_cycle_after_an_exception_is_whole(rig):
 
 def test_a_gap_drops_what_piled_up_and_holds(rig):
     rig.until(S.ACTIVE)
-    rig.hal.report(Dtc.CYCLE_GAP, "2000 ms went by without a cycle", value=2.0)
+    rig.hal.report(Dtc.CYCLE_GAP, "no cycle began for 2000 ms", value=2.0)
     assert rig.cycle().supervisor is S.HOLD
     event = next(e for e in rig.hal.events if e.code == "CYCLE_GAP")
     assert (event.cycle, event.value, event.severity) == (rig.hal.state.cycle, 2.0, "error")
@@ -258,7 +258,7 @@ def test_a_gap_drops_what_piled_up_and_holds(rig):
 
 def test_a_short_gap_is_noted(rig):
     rig.until(S.ACTIVE)
-    rig.hal.report(Dtc.CYCLE_GAP, "4 ms went by without a cycle", confirmed=False, value=0.004)
+    rig.hal.report(Dtc.CYCLE_GAP, "no cycle began for 4 ms", confirmed=False, value=0.004)
     assert rig.cycle().supervisor is S.ACTIVE
     assert rig.seen("CYCLE_GAP") == [("CYCLE_GAP", "warning")]
 

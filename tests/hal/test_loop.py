@@ -256,7 +256,8 @@ def test_who_oversleeps_makes_no_cycle_up_either():
 def test_a_controller_the_hal_cannot_record_is_refused_before_anything_moves(make_rig):
     rig = make_rig()
     with pytest.raises(
-        ValueError, match="telemetry is 1 numbers and the HAL was made to record 0: give it `controller_fields="
+        ValueError,
+        match=r"controller\.telemetry must have the length that the HAL records \(0\), got 1: construct the HAL with",
     ):
         run(rig.hal, Recorder(), LockStep(), until=after(1))
     assert rig.hal.state.cycle == 0

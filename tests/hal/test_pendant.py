@@ -95,10 +95,10 @@ def test_the_dial_rules_when_it_is_set(pendant: Pendant):
 
 def others(pendant: Pendant, *frames: tuple[int, int, int]) -> list[np.ndarray]:
     """What further frames of a cycle say: dead-man, request and its counter each, as the image hands it over."""
-    image = np.zeros(pendant._places.stop + 3)
+    image = np.zeros(pendant._slice.stop + 3)
     said = []
     for frame in frames:
-        image[pendant._places] = *frame, 0.0, 0.0
+        image[pendant._slice] = *frame, 0.0, 0.0
         said.append(image.copy())
     return said
 

@@ -140,7 +140,7 @@ def test_a_frame_in_another_format_is_none_of_the_table(desk: Desk, field: str, 
 def test_a_header_changed_after_it_was_granted_does_not_leave(desk: Desk, field: str, value: int):
     batch = desk.transceiver.grant(TransmitImage(OURS).frames)
     batch.frames[field][0] = value
-    with pytest.raises(TransmitDenied, match="another identifier, length or format"):
+    with pytest.raises(TransmitDenied, match="must keep the identifier, length and format"):
         desk.transceiver.send(batch)
     assert desk.bus.sent == []
 
@@ -174,7 +174,7 @@ def test_a_bus_that_is_gone_is_confirmed_at_once(desk: Desk):
     desk.transceiver.send(sync(desk))
     assert desk.judge() == {"BUS_DOWN": True}
     event = desk.memory.events[0]
-    assert (event.text, event.value, event.node) == ("the bus bench refuses frames: gone", 0.0, "HAL")
+    assert (event.text, event.value, event.node) == ("the bus bench cannot send: gone", 0.0, "HAL")
     assert desk.tap.sent_ids == []
     assert desk.judge() == {}
 
@@ -290,7 +290,7 @@ def test_a_bus_that_fails_while_receiving_raises_nothing(desk: Desk):
     assert desk.transceiver.receive(1) == 1
     assert desk.judge() == {"BUS_DOWN": True}
     event = desk.memory.events[0]
-    assert (event.text, event.value, event.node) == ("the bus bench fails: gone", 0.0, "HAL")
+    assert (event.text, event.value, event.node) == ("the bus bench cannot receive: gone", 0.0, "HAL")
     desk.bus.arrivals = [ids(1), BusDown("gone")]
     assert desk.transceiver.receive(0, image(0, 1), 1.0) == 0
 
@@ -332,9 +332,9 @@ def test_each_of_several_strange_frames_counts(desk: Desk):
     desk.transceiver.foreign(ids(0x7FF, ID_ERROR | 0x40, 0x100))
     assert desk.judge() == {"FRAME_UNKNOWN": True, "BUS_OFF": True, "HAL_DUPLICATE": True}
     assert {e.text for e in desk.memory.events} == {
-        "id 0x7FF is no message to this HAL",
+        "id 0x7FF is not a message to this HAL",
         "HAL: the CAN controller is bus-off",
-        "somebody else sends id 0x100, which is this HAL's",
+        "another node sends id 0x100 of this HAL",
     }
 
 
@@ -343,7 +343,7 @@ def test_each_of_several_strange_frames_counts(desk: Desk):
 
 def test_a_hal_that_is_there_is_heard_before_anything_is_sent(desk: Desk):
     desk.bus.arrivals = [ids(0x181, 0x191), ids(0x700, 0x10)]
-    with pytest.raises(HalDuplicate, match=r"another HAL is at work on bench \(id 0x10 was heard\): end it first"):
+    with pytest.raises(HalDuplicate, match=r"another HAL is active on bench \(received id 0x10\): stop it first"):
         desk.transceiver.listen(60.0)
     assert desk.bus.sent == []
 
@@ -387,7 +387,7 @@ def test_dropping_from_a_bus_that_is_gone_raises_nothing(desk: Desk):
     desk.transceiver.discard()
     assert desk.judge() == {"BUS_DOWN": True}
     event = desk.memory.events[0]
-    assert (event.text, event.value) == ("the bus bench fails: gone", 0.0)
+    assert (event.text, event.value) == ("the bus bench cannot receive: gone", 0.0)
 
 
 def test_a_tap_is_not_needed(desk: Desk):

@@ -146,7 +146,7 @@ def test_f14_a_second_hal_refuses_to_start_and_leaves_the_first_alone(vcan: str,
             while second.poll() is None:
                 assert line.loop.cycles(1) is S.ACTIVE, line.hal.reason
             assert second.stderr is not None
-            assert "another HAL is at work on vcan0" in second.stderr.read()
+            assert "another HAL is active on vcan0" in second.stderr.read()
         assert second.returncode == 1
 
 
