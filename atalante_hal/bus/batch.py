@@ -1,7 +1,7 @@
-"""The memory of the frame arrays a bus is given: what lies between `Bus.send()`/`receive()` and a copy of bytes.
+"""Byte views of frame arrays, cached for each array that is passed to `Bus.send()` or `Bus.receive()`.
 
-Making a byte view of an array costs more than copying a cycle's frames, so the views are kept; and a batch is known to
-be legal by the bytes of its header words, which rarely change from cycle to cycle.
+Creating a byte view of an array costs more than copying the frames of a cycle, so the views are cached. Header patterns that were
+found valid are cached, too, because headers rarely change from cycle to cycle.
 """
 
 from __future__ import annotations
@@ -22,36 +22,54 @@ from atalante_hal.wire.frame import (
     as_words,
 )
 
-#: Arrays, and header patterns, remembered at once; a HAL or an emulator uses a handful.
+#: Largest number of cached arrays, and of cached header patterns; a HAL or an emulator uses about five.
 REMEMBERED = 64
 CLASSIC_LENGTHS = tuple(range(9))
 
 
 class Batch(NamedTuple):
-    """One array of frames and the views a bus copies from or to."""
+    """Array of frames and the views that a bus copies from or to."""
 
-    frames: Frames  # held so that its id() cannot be given to another array
-    memory: memoryview  # its bytes, length 72 n
+    frames: Frames  # reference that keeps the array alive, so that its id() stays unique
+    memory: memoryview  # bytes of the array, length 72 n
     headers: npt.NDArray[np.uint64]  # identifier, length and flags of each frame, shape (n,)
 
 
 class Batches:
-    """The arrays one bus has been given so far, found again by identity."""
+    """Cache of the arrays that were passed to one bus, found by identity."""
 
     def __init__(self) -> None:
-        self._seen: dict[int, Batch] = {}
+        self._batches: dict[int, Batch] = {}
         self._legal: set[bytes] = set()
 
     def to_fill(self, frames: Frames) -> memoryview:
-        """Bytes of an array to receive into. Raises `TypeError` if it is not a contiguous array of `FRAME`."""
-        return (self._seen.get(id(frames)) or self._first_sight(frames))[1]
+        """Return the bytes of an array to receive into.
+
+        Args:
+            frames: Receive buffer, shape (n,).
+
+        Returns:
+            Writable bytes of the array, length 72 n.
+
+        Raises:
+            TypeError: If `frames` is not a contiguous array of `FRAME`.
+        """
+        return (self._batches.get(id(frames)) or self._add(frames))[1]
 
     def to_send(self, frames: Frames) -> tuple[memoryview, bytes]:
-        """Bytes and header words of a batch that a CAN controller could send.
+        """Check a batch of frames to send, and return its bytes and header words.
 
-        Raises `ValueError` naming the first frame that is not legal, and `TypeError` as `to_fill()`.
+        Args:
+            frames: Frames to send, shape (n,).
+
+        Returns:
+            Bytes of the array, length 72 n, and bytes of its header words, length 8 n.
+
+        Raises:
+            ValueError: If a frame is not a valid CAN frame; the message names the first one.
+            TypeError: If `frames` is not a contiguous array of `FRAME`.
         """
-        _, memory, words = self._seen.get(id(frames)) or self._first_sight(frames)
+        _, memory, words = self._batches.get(id(frames)) or self._add(frames)
         headers = words.tobytes()
         if headers not in self._legal:
             require_legal(frames)
@@ -60,22 +78,31 @@ class Batches:
             self._legal.add(headers)
         return memory, headers
 
-    def _first_sight(self, frames: Frames) -> Batch:
+    def _add(self, frames: Frames) -> Batch:
         if not isinstance(frames, np.ndarray) or frames.dtype != FRAME or frames.ndim != 1:
             raise TypeError(
-                "a bus carries one-dimensional arrays of frame.FRAME records; frame.new_frames(n) makes one"
+                "frames must be a one-dimensional array of frame.FRAME records, as frame.new_frames(n) creates"
             )
         if not frames.flags.c_contiguous:
-            raise TypeError("a bus needs contiguous frames: pass a copy() of this slice")
+            raise TypeError("frames must be contiguous, got a strided slice: pass its copy()")
         batch = Batch(frames, frames.view(np.uint8).data, as_words(frames)[:, 0])
-        if len(self._seen) >= REMEMBERED:
-            self._seen.clear()
-        self._seen[id(frames)] = batch
+        if len(self._batches) >= REMEMBERED:
+            self._batches.clear()
+        self._batches[id(frames)] = batch
         return batch
 
 
 def is_legal(can_id: int, length: int, flags: int) -> bool:
-    """Whether a CAN FD controller could put this frame on the wire (ISO 11898-1)."""
+    """Return whether a CAN FD controller can send this frame (ISO 11898-1).
+
+    Args:
+        can_id: Identifier with the flags of `struct canfd_frame`.
+        length: Payload length [bytes].
+        flags: CAN FD flags of the frame.
+
+    Returns:
+        True if identifier, length and flags are a valid combination.
+    """
     number = can_id & 0x1FFF_FFFF
     if not can_id & ID_EXTENDED and not can_id & ID_ERROR and number > 0x7FF:
         return False
@@ -85,12 +112,19 @@ def is_legal(can_id: int, length: int, flags: int) -> bool:
 
 
 def require_legal(frames: Frames) -> None:
-    """Raise `ValueError` for the first frame that no CAN FD controller could put on the wire."""
+    """Check that a CAN FD controller can send every frame.
+
+    Args:
+        frames: Frames to check, shape (n,).
+
+    Raises:
+        ValueError: If a frame is not a valid CAN frame; the message names the first one.
+    """
     headers = zip(frames["can_id"].tolist(), frames["len"].tolist(), frames["flags"].tolist(), strict=True)
     for index, (can_id, length, flags) in enumerate(headers):
         if not is_legal(can_id, length, flags):
             raise ValueError(
-                f"frame {index} (id 0x{can_id:X}, {length} bytes, flags 0x{flags:02X}) is no CAN frame: with FDF a "
-                "payload is 0 to 8, 12, 16, 20, 24, 32, 48 or 64 bytes and there is no remote frame, without it 0 to 8 "
-                "bytes and flags 0; an identifier above 0x7FF needs the extended flag"
+                f"frame {index} (id 0x{can_id:X}, {length} bytes, flags 0x{flags:02X}) is not a valid CAN frame: with "
+                "FDF the payload must be 0 to 8, 12, 16, 20, 24, 32, 48 or 64 bytes and the frame must not be remote; "
+                "without FDF the payload must be 0 to 8 bytes and the flags 0; an identifier above 0x7FF must be extended"
             )

@@ -1,4 +1,4 @@
-"""Which interface carries which of the robot's buses: the command line's `-c`, as text, as a map, as open buses."""
+"""Assignment of the robot's buses to CAN channels: parsed from the option `-c`, then opened."""
 
 from __future__ import annotations
 
@@ -9,14 +9,21 @@ from atalante_hal.bus import Bus, BusError, open_bus
 
 
 class ChannelMapError(ValueError):
-    """The channel map is not one; the message says what one looks like."""
+    """Error in the text of a channel map; the message contains a valid example."""
 
 
 def parse_channel_map(text: str, buses: Sequence[str]) -> dict[str, str]:
-    """Channel of each bus, in the order of `buses`.
+    """Parse the text of a channel map.
 
-    `vcan0` puts all buses on one channel; `left_leg=can0,right_leg=can1,...` names one for each. Raises
-    `ChannelMapError`.
+    Args:
+        text: `vcan0` for all buses on one channel, or `left_leg=can0,right_leg=can1,...` with a channel for each bus.
+        buses: Names of the robot's buses.
+
+    Returns:
+        Channel of each bus, in the order of `buses`.
+
+    Raises:
+        ChannelMapError: If the text is not valid or does not assign every bus exactly once.
     """
     example = ",".join(f"{bus}=can{index}" for index, bus in enumerate(buses))
     entries = [entry.strip() for entry in text.split(",")]
@@ -26,28 +33,37 @@ def parse_channel_map(text: str, buses: Sequence[str]) -> dict[str, str]:
         )
     if "=" not in text:
         if len(entries) > 1:
-            raise ChannelMapError(f"channel map {text!r} does not say which bus is on which channel; write {example}")
+            raise ChannelMapError(f"channel map {text!r} must assign a bus to each channel; write {example}")
         return dict.fromkeys(buses, entries[0])
     channels: dict[str, str] = {}
     for entry in entries:
         bus, equals, channel = (part.strip() for part in entry.partition("="))
         if not equals or not bus or not channel:
-            raise ChannelMapError(f"{entry!r} in the channel map is not BUS=CHANNEL; write {example}")
+            raise ChannelMapError(f"an entry of the channel map must be BUS=CHANNEL, got {entry!r}; write {example}")
         if bus not in buses:
-            raise ChannelMapError(f"there is no bus {bus!r}; the buses are {', '.join(buses)}")
+            raise ChannelMapError(f"a bus of the channel map must be one of {', '.join(buses)}, got {bus!r}")
         if bus in channels:
-            raise ChannelMapError(f"the channel map names {bus} twice: {channels[bus]} and {channel}")
+            raise ChannelMapError(f"the channel map assigns {bus} twice: to {channels[bus]} and to {channel}")
         channels[bus] = channel
     missing = [bus for bus in buses if bus not in channels]
     if missing:
-        raise ChannelMapError(f"the channel map gives no channel for {', '.join(missing)}; write {example}")
+        raise ChannelMapError(f"the channel map has no channel for {', '.join(missing)}; write {example}")
     return {bus: channels[bus] for bus in buses}
 
 
 def open_channels(interface: str, channels: Mapping[str, str], **options: Any) -> dict[str, Bus]:
-    """The open bus of each of the robot's buses; those that share a channel share one `Bus` object.
+    """Open the channels of the robot's buses.
 
-    Raises `BusAbsent`, after closing what was already open.
+    Args:
+        interface: Name of the CAN interface, see `open_bus`.
+        channels: Channel of each bus.
+        **options: Keyword arguments of `open_bus`.
+
+    Returns:
+        Open bus of each of the robot's buses. Buses on the same channel share one `Bus` object.
+
+    Raises:
+        BusAbsent: If a channel cannot be opened. The channels opened before are closed again.
     """
     opened: dict[str, Bus] = {}
     try:

@@ -1,7 +1,7 @@
-"""Several channels as one bus: what the HAL holds when the robot's buses are on more than one interface.
+"""Several channels joined to one bus, for a robot whose buses are on more than one CAN interface.
 
-Identifiers are unique in the whole network, so a frame's identifier says which channel it goes to, and what is received can
-be poured together: the process image finds its rows by identifier.
+Identifiers are unique in the whole network. So the identifier of a frame determines its channel, and frames received on different
+channels can be mixed: the process image finds its rows by identifier.
 """
 
 from __future__ import annotations
@@ -18,28 +18,38 @@ from atalante_hal.bus import Bus, BusDown, BusError, BusFull, Stamps
 from atalante_hal.bus.batch import REMEMBERED, Batches
 from atalante_hal.wire.frame import Frames, as_words, new_frames
 
-#: How often a channel without a file descriptor is looked at while waiting [s].
+#: Polling period of channels without a file descriptor [s].
 LOOK_AGAIN: Final = 100e-6
 
 
 class Share(NamedTuple):
-    """What one channel gets of a batch."""
+    """Frames of a batch that go to one channel."""
 
     link: Bus
-    places: list[int]  # in the batch
-    frames: Frames  # the same array every time, as a bus likes it
+    indices: list[int]  # of the frames in the batch
+    frames: Frames  # always the same array, because a bus caches its views
 
 
 class JoinedBus:
-    """The robot's buses behind one `Bus`: `buses` gives the channel of each of `network.buses`.
+    """Buses of the robot joined to one `Bus`.
 
-    Frames keep their order on a channel, not between channels. A frame goes to the bus of its message; a `ValueError`
-    says when the network has no such message. A channel that refuses its frames does not keep the others from theirs.
+    Each frame goes to the bus of its message. The order of frames is kept on each channel, but not between channels. If one
+    channel cannot send its frames, the others still send theirs.
+
+    Args:
+        network: CAN network that assigns each message to a bus.
+        buses: Open bus of each of `network.buses`.
+        capacity: Largest number of frames that one `receive()` returns.
+
+    Raises:
+        ValueError: If `buses` lacks a bus of the network.
     """
 
     def __init__(self, network: Network, buses: Mapping[str, Bus], capacity: int = 256) -> None:
         if missing := [bus for bus in network.buses if bus not in buses]:
-            raise ValueError(f"no channel given for {missing[0]}; the buses are {', '.join(network.buses)}")
+            raise ValueError(
+                f"buses must have an entry for each of {', '.join(network.buses)}; {missing[0]} is missing"
+            )
         self._links = list({id(buses[name]): buses[name] for name in network.buses}.values())
         self._link_of = {m.frame_id: self._links.index(buses[m.bus]) for m in network.messages}
         self.name = " + ".join(link.name for link in self._links)
@@ -48,7 +58,7 @@ class JoinedBus:
         self._batches = Batches()
         self._shares: dict[bytes, list[Share]] = {}
         self._tails: dict[int, list[Frames]] = {}
-        self._turn = 0  # channel that is read first, so that a busy one cannot starve the others
+        self._turn = 0  # index of the channel read first: it rotates, so that a busy channel cannot block the others
         self._closed = False
         files = [_file_of(link) for link in self._links]
         self._files = [file for file in files if file is not None]
@@ -56,11 +66,20 @@ class JoinedBus:
 
     @property
     def dropped(self) -> int:
-        """Frames lost on any of the channels."""
+        """Return the number of frames lost on all channels."""
         return sum(link.dropped for link in self._links)
 
     def send(self, frames: Frames) -> None:
-        """Send each frame on its message's channel; raises `BusFull`, `BusDown`, `ValueError`. Shape (n,)."""
+        """Send each frame on the channel of its message.
+
+        Args:
+            frames: Frames to send, shape (n,).
+
+        Raises:
+            BusFull: If a transmit queue accepted only a part of its frames.
+            BusDown: If a channel is closed or down.
+            ValueError: If a frame is not a valid CAN frame or not a message of the network.
+        """
         if self._closed:
             raise BusDown(f"{self.name} is closed")
         _, headers = self._batches.to_send(frames)
@@ -68,7 +87,7 @@ class JoinedBus:
         sent = 0
         failure: BusError | None = None
         for share in self._shares.get(headers) or self._divide(headers, frames):
-            as_words(share.frames)[:] = words[share.places]
+            as_words(share.frames)[:] = words[share.indices]
             try:
                 share.link.send(share.frames)
             except BusFull as error:
@@ -77,14 +96,25 @@ class JoinedBus:
             except BusError as error:
                 failure = failure or error
             else:
-                sent += len(share.places)
+                sent += len(share.indices)
         if isinstance(failure, BusFull):
             raise BusFull(str(failure), sent)
         if failure is not None:
             raise failure
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Fill `frames[:n]` with what any channel has; waits on all together. Raises `BusDown`. Shape (m,), n <= m."""
+        """Receive from all channels into `frames[:n]` and return n, see `Bus.receive`.
+
+        Args:
+            frames: Receive buffer, shape (m,) with m >= n.
+            timeout: Longest wait for the first frame on any channel [s].
+
+        Returns:
+            Number of received frames n.
+
+        Raises:
+            BusDown: If a channel is closed or down.
+        """
         if self._closed:
             raise BusDown(f"{self.name} is closed")
         tails = self._tails_of(frames)
@@ -122,27 +152,27 @@ class JoinedBus:
         return count
 
     def _tails_of(self, frames: Frames) -> list[Frames]:
-        """`frames` from each place on; kept, because a bus remembers the arrays it has seen."""
+        """Return the slices `frames[i:]` for all i; they are cached, because a bus caches views by array object."""
         tails = self._tails.get(id(frames))
         if tails is None:
-            self._batches.to_fill(frames)  # refuses what is no array of frames
+            self._batches.to_fill(frames)  # raises TypeError if it is not an array of frames
             if len(self._tails) >= REMEMBERED:
                 self._tails.clear()
-            tails = [frames, *(frames[place:] for place in range(1, len(frames)))]
+            tails = [frames, *(frames[offset:] for offset in range(1, len(frames)))]
             self._tails[id(frames)] = tails
         return tails
 
     def _divide(self, headers: bytes, frames: Frames) -> list[Share]:
-        """Which frames of a batch with these identifiers go where."""
-        places: dict[int, list[int]] = {}
-        for place, frame_id in enumerate(frames["can_id"].tolist()):
+        """Return the share of each channel in a batch with these headers, and cache it."""
+        rows: dict[int, list[int]] = {}
+        for index, frame_id in enumerate(frames["can_id"].tolist()):
             link = self._link_of.get(frame_id)
             if link is None:
                 raise ValueError(
-                    f"frame {place} (id 0x{frame_id:X}) is no message of the network: which bus is it for?"
+                    f"frame {index} (id 0x{frame_id:X}) is not a message of the network, so it has no channel"
                 )
-            places.setdefault(link, []).append(place)
-        shares = [Share(self._links[link], found, new_frames(len(found))) for link, found in places.items()]
+            rows.setdefault(link, []).append(index)
+        shares = [Share(self._links[link], found, new_frames(len(found))) for link, found in rows.items()]
         if len(self._shares) >= REMEMBERED:
             self._shares.clear()
         self._shares[headers] = shares
@@ -150,6 +180,6 @@ class JoinedBus:
 
 
 def _file_of(link: Bus) -> int | None:
-    """File descriptor to wait on, of a bus that has one."""
+    """Return the file descriptor of a bus; None if it has none."""
     fileno = getattr(link, "fileno", None)
     return None if fileno is None else fileno()

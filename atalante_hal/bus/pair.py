@@ -1,7 +1,7 @@
-"""The embedded bus: two ends in one process, in lock-step, as fast as memory.
+"""Embedded bus: two ends in one process, in lock-step.
 
-The HAL holds one end and the emulator the other. When the HAL asks for frames and none are there, its end calls `step`,
-in which the emulator consumes what was sent and answers: the code on both sides is the same as on a wire.
+The HAL has one end and the emulator the other. If the HAL calls `receive()` and its queue is empty, its end calls `step`. In this
+call the emulator receives the HAL's frames and sends its answers. Both sides run the same code as on a real bus.
 """
 
 from __future__ import annotations
@@ -16,11 +16,16 @@ from atalante_hal.wire.frame import FRAME_BYTES, Frames, new_frames
 
 
 class PairBus:
-    """One end of the pair; `lockstep_pair()` makes both. Never waits.
+    """One end of an embedded bus; `lockstep_pair()` creates both. It never waits.
 
-    `step`, if set, is called by `receive()` when nothing is queued. `now_ns` is the virtual time that stamps what is
-    received, set by the owner of the end. `send()` keeps up to `capacity` frames for a peer that does not read, then
-    raises `BusFull`; frames for a closed peer are gone, as on a wire nobody listens to.
+    Args:
+        name: Name of this end.
+        capacity: Number of frames that can be queued for this end. More raise `BusFull` at the peer.
+
+    Attributes:
+        step: Function that `receive()` calls when no frame is queued; None: none.
+        now_ns: Virtual time of received frames [ns], set by the owner of this end.
+        dropped: Always 0, because no frame is lost here.
     """
 
     __slots__ = (
@@ -43,7 +48,7 @@ class PairBus:
         self.name = name
         self.step: Callable[[], object] | None = None
         self.now_ns = 0
-        self.dropped = 0  # nothing is ever lost here
+        self.dropped = 0
         self._peer = self
         self._closed = False
         self._queue = new_frames(capacity).view(np.uint8).data  # frames for this end, in bytes [head, tail)
@@ -56,12 +61,21 @@ class PairBus:
 
     @property
     def stamps(self) -> Stamps:
-        """`now_ns` at the last `receive()`, for each frame. Shape (capacity,) int64 [ns]."""
+        """Return the value of `now_ns` at the last `receive()`, for each frame. Shape (capacity,) int64 [ns]."""
         self._stamps.fill(self._received_at)
         return self._stamps
 
     def send(self, frames: Frames) -> None:
-        """Queue a copy of the frames for the peer; raises `BusFull`, `BusDown`, `ValueError`. Shape (n,)."""
+        """Queue a copy of the frames for the peer; drop them if the peer is closed.
+
+        Args:
+            frames: Frames to send, shape (n,).
+
+        Raises:
+            BusFull: If the queue of the peer has no room for the whole batch.
+            BusDown: If this end is closed.
+            ValueError: If a frame is not a valid CAN frame.
+        """
         if self._closed:
             raise BusDown(f"{self.name} is closed")
         memory, _ = self._batches.to_send(frames)
@@ -75,13 +89,24 @@ class PairBus:
             end = tail + memory.nbytes
             if end > peer._limit:
                 raise BusFull(
-                    f"{self.name}: {peer.name} has {tail // FRAME_BYTES} frames waiting and does not read them"
+                    f"{self.name}: the queue of {peer.name} is full, {tail // FRAME_BYTES} frames were not received"
                 )
         peer._queue[tail:end] = memory
         peer._tail = end
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Fill `frames[:n]`, after a `step` if nothing is queued; `timeout` is for wires. Shape (m,), n <= m."""
+        """Move queued frames to `frames[:n]` and return n; call `step` first if the queue is empty.
+
+        Args:
+            frames: Receive buffer, shape (m,) with m >= n.
+            timeout: Ignored, because this end never waits.
+
+        Returns:
+            Number of received frames n.
+
+        Raises:
+            BusDown: If this end is closed.
+        """
         head, tail = self._head, self._tail
         if head == tail:
             if self._closed:
@@ -104,13 +129,13 @@ class PairBus:
         return size // FRAME_BYTES
 
     def close(self) -> None:
-        """Leave the pair; what was queued for this end is gone."""
+        """Close this end and drop the frames queued for it."""
         self._closed = True
         self.step = None
         self._head = self._tail = 0
 
     def _close_ranks(self) -> int:
-        """Move what is queued to the front; return where it ends [bytes]."""
+        """Move the queued frames to the start of the queue and return the offset of their end [bytes]."""
         waiting = self._tail - self._head
         self._queue[:waiting] = self._queue[self._head : self._tail]
         self._head = 0
@@ -121,7 +146,15 @@ class PairBus:
 def lockstep_pair(
     capacity: int = 1024, names: tuple[str, str] = ("embedded", "embedded peer")
 ) -> tuple[PairBus, PairBus]:
-    """The two ends of an embedded bus; `capacity` frames may wait on each."""
+    """Create the two ends of an embedded bus.
+
+    Args:
+        capacity: Number of frames that can be queued for each end.
+        names: Names of the two ends.
+
+    Returns:
+        Both ends, in the order of `names`.
+    """
     one, other = PairBus(names[0], capacity), PairBus(names[1], capacity)
     one._peer, other._peer = other, one
     return one, other

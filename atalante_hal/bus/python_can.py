@@ -1,6 +1,6 @@
-"""Any interface python-can knows, as a bus: adapters without SocketCAN, and `virtual` in tests.
+"""Bus on any interface of python-can: adapters without SocketCAN, and `virtual` in tests.
 
-About 6 us a frame: fine to reach an adapter, no match for `socketcan.SocketCanBus` where the kernel has the interface.
+It takes about 6 us for each frame. Use `socketcan.SocketCanBus` for interfaces that the kernel supports, because it is faster.
 """
 
 from __future__ import annotations
@@ -26,18 +26,27 @@ from atalante_hal.wire.frame import (
     Frames,
 )
 
-#: One `FRAME`: identifier, length, flags, payload.
+#: Packed form of one `FRAME`: identifier, length, flags, payload.
 RECORD = struct.Struct("<IBB2x64s")
 ID_NUMBER = 0x1FFF_FFFF
 LINK_LOST = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF)
 
 
 class PythonCanBus:
-    """A python-can bus of the given interface and channel; `options` go to python-can as they are.
+    """Bus on one channel of a python-can interface.
 
-    `dropped` counts messages that no CAN controller can have received (python-can builds a 13-byte FD message without
-    a word); what the adapter itself loses it does not say. Raises `BusAbsent` if python-can cannot open it or opens it
-    for classic CAN only.
+    Args:
+        interface: Name of the interface in python-can.
+        channel: Name of the channel.
+        capacity: Largest number of frames that one `receive()` returns.
+        **options: Keyword arguments of `can.Bus`.
+
+    Attributes:
+        dropped: Number of received messages that are not valid CAN frames, such as an FD message of 13 bytes. Frames lost in
+            the adapter are not counted, because python-can does not report them.
+
+    Raises:
+        BusAbsent: If python-can cannot open the channel or opens it for classic CAN only.
     """
 
     def __init__(self, interface: str, channel: str, capacity: int = 256, **options: Any) -> None:
@@ -50,7 +59,16 @@ class PythonCanBus:
         self._bus = _open(interface, channel, options)
 
     def send(self, frames: Frames) -> None:
-        """Send each frame as a message; raises `BusFull`, `BusDown`, `ValueError`. Shape (n,)."""
+        """Send each frame as a python-can message.
+
+        Args:
+            frames: Frames to send, shape (n,).
+
+        Raises:
+            BusFull: If python-can accepted only a part of the frames.
+            BusDown: If the bus is closed or down.
+            ValueError: If a frame is not a valid CAN frame.
+        """
         self._require_open()
         memory, _ = self._batches.to_send(frames)
         for sent, (can_id, length, flags, data) in enumerate(RECORD.iter_unpack(memory)):
@@ -59,10 +77,21 @@ class PythonCanBus:
             except can.CanOperationError as error:
                 if error.error_code in LINK_LOST:
                     raise BusDown(f"{self.name} is down: {error}") from error
-                raise BusFull(f"{self.name} took {sent} of {len(frames)} frames: {error}", sent) from error
+                raise BusFull(f"{self.name} accepted {sent} of {len(frames)} frames: {error}", sent) from error
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Fill `frames[:n]` with the messages that have arrived; raises `BusDown`. Shape (m,), n <= m."""
+        """Write the received messages to `frames[:n]` and return n, see `Bus.receive`.
+
+        Args:
+            frames: Receive buffer, shape (m,) with m >= n.
+            timeout: Longest wait for the first message [s].
+
+        Returns:
+            Number of received frames n.
+
+        Raises:
+            BusDown: If the bus is closed or cannot receive.
+        """
         self._require_open()
         memory = self._batches.to_fill(frames)
         room = min(len(frames), self._capacity)
@@ -82,7 +111,7 @@ class PythonCanBus:
         return count
 
     def close(self) -> None:
-        """Shut python-can's bus down."""
+        """Shut down the python-can bus; a second call has no effect."""
         if not self._closed:
             self._closed = True
             self._bus.shutdown()
@@ -93,7 +122,17 @@ class PythonCanBus:
 
 
 def message_of(can_id: int, length: int, flags: int, data: bytes) -> can.Message:
-    """The python-can message of one legal frame."""
+    """Convert one valid frame to a python-can message.
+
+    Args:
+        can_id: Identifier with the flags of `struct canfd_frame`.
+        length: Payload length [bytes].
+        flags: CAN FD flags of the frame.
+        data: Payload buffer of 64 bytes.
+
+    Returns:
+        The message.
+    """
     remote = bool(can_id & ID_REMOTE)
     return can.Message(
         arbitration_id=can_id & ID_NUMBER,
@@ -109,7 +148,16 @@ def message_of(can_id: int, length: int, flags: int, data: bytes) -> can.Message
 
 
 def pack(message: can.Message, memory: memoryview, offset: int) -> bool:
-    """Write a message as one `FRAME` at a byte offset; False, and nothing written, if it is no legal frame."""
+    """Write a python-can message as one `FRAME`, unless it is not a valid frame.
+
+    Args:
+        message: Received message.
+        memory: Bytes of a frame array.
+        offset: Offset of the frame in `memory` [bytes].
+
+    Returns:
+        True if the frame was written; False if the message is not a valid CAN frame.
+    """
     can_id = message.arbitration_id
     if message.is_extended_id and not message.is_error_frame:
         can_id |= ID_EXTENDED
@@ -146,7 +194,5 @@ def _open(interface: str, channel: str, options: dict[str, Any]) -> can.BusABC:
         ) from error
     if bus.protocol is can.CanProtocol.CAN_20:
         bus.shutdown()
-        raise BusAbsent(
-            f"{interface}:{channel} carries classic CAN only and the robot speaks CAN FD: use another interface"
-        )
+        raise BusAbsent(f"{interface}:{channel} must support CAN FD, got classic CAN only: use another interface")
     return bus

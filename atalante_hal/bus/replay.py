@@ -1,7 +1,7 @@
-"""A recorded log as a bus: the HAL, the validator or the viewer reads it as if the robot spoke.
+"""Bus that replays a recorded log, for the HAL, the validator or the viewer.
 
-Frames come in the order and with the time stamps of the log. `receive()` fills what it is given; with `cycle_id`, the
-identifier that begins a cycle (a SYNC), it also stops before each such frame, so that one call returns one cycle.
+Frames have the order and the time stamps of the log. With `cycle_id`, the identifier of the first frame of a cycle (a SYNC),
+`receive()` also stops before each such frame, so that one call returns one cycle.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from atalante_hal.bus.batch import Batches
 from atalante_hal.bus.python_can import pack
 from atalante_hal.wire.frame import FRAME_BYTES, Frames
 
-#: python-can's writers for these do not keep the FD flag, and its .db loses frames.
+#: Formats whose python-can writers lose the FD flag, or lose frames (.db).
 WITHOUT_FD = (".csv", ".db")
-#: One frame a line: the last line of a whole log is a whole line.
+#: Text formats with one frame in each line: a complete log ends with a newline.
 LINE_LOGS = (".log", ".asc", ".trc")
 BLF_HEADER_BYTES = 144
-#: What python-can's readers raise on a file they do not understand.
+#: Exceptions that python-can's readers raise for an invalid file.
 UNREADABLE = (
     ValueError,
     IndexError,
@@ -45,14 +45,22 @@ UNREADABLE = (
 
 
 class LogUnreadable(BusError):  # noqa: N818
-    """The log is missing, empty, broken off or in no format that keeps CAN FD frames."""
+    """Error of a log that is missing, empty, truncated, or in a format without CAN FD frames."""
 
 
 class ReplayBus:
-    """A log that python-can's LogReader opens: .log (candump -L), .asc, .blf, .mf4, .trc, also with .gz behind.
+    """Replay of a log in a format of python-can's LogReader: .log (candump -L), .asc, .blf, .mf4, .trc, also with .gz.
 
-    `cycle_id`: `receive()` stops before a frame with this identifier, unless it comes first. `ended` is True when all
-    frames were returned; `dropped` counts records that are no legal CAN frame. Raises `LogUnreadable`.
+    Args:
+        path: Log file.
+        cycle_id: Identifier of the first frame of a cycle. `receive()` stops before it, unless it is the first frame returned.
+        capacity: Largest number of frames that one `receive()` returns.
+
+    Attributes:
+        dropped: Number of records of the log that are not valid CAN frames.
+
+    Raises:
+        LogUnreadable: If the log is missing, empty, truncated or in an unknown format.
     """
 
     def __init__(self, path: str | Path, cycle_id: int | None = None, capacity: int = 1024) -> None:
@@ -69,23 +77,37 @@ class ReplayBus:
         self._next = self._read()
         if self._next is None:
             self.close()
-            raise LogUnreadable(f"{path} holds no CAN frame: it is empty, or it is no {Path(path).suffix} log")
+            raise LogUnreadable(f"{path} contains no CAN frame: it is empty, or it is not a {Path(path).suffix} log")
 
     @property
     def ended(self) -> bool:
-        """Whether every frame of the log was returned."""
+        """Return whether every frame of the log was returned."""
         return self._next is None
 
     def send(self, frames: Frames) -> None:
-        """Refuse: raises `BusError`."""
-        raise BusError(
-            f"{self.name} is a recording: nothing can be sent to it; open a real or an emulated bus to command"
-        )
+        """Raise `BusError`, because a log cannot be sent to.
+
+        Args:
+            frames: Ignored.
+
+        Raises:
+            BusError: Always.
+        """
+        raise BusError(f"{self.name} is a recording: nothing can be sent to it; open a real or an emulated bus to send")
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Fill `frames[:n]` with the next frames of the log, 0 at its end; never waits. Shape (m,), n <= m.
+        """Write the next frames of the log to `frames[:n]` and return n, without waiting.
 
-        Raises `LogUnreadable` where the log breaks off.
+        Args:
+            frames: Buffer for the frames, shape (m,) with m >= n.
+            timeout: Ignored.
+
+        Returns:
+            Number of frames n; 0 at the end of the log.
+
+        Raises:
+            BusDown: If the log was closed.
+            LogUnreadable: If the rest of the log cannot be read.
         """
         if self._closed:
             raise BusDown(f"{self.name} is closed")
@@ -127,15 +149,15 @@ def _open(path: Path) -> can.io.generic.MessageReader:
         raise LogUnreadable(f"{path}: python-can's {kind} logs do not keep CAN FD frames; record .log, .asc or .blf")
     if kind not in can.io.player.MESSAGE_READERS:
         raise LogUnreadable(
-            f"{path}: unknown log format {kind or 'without suffix'!r}; use .log (candump -L), .asc or .blf"
+            f"{path}: the log format must be .log (candump -L), .asc or .blf, got {kind or 'no suffix'!r}"
         )
     try:
         size = path.stat().st_size
         plain = kind == path.suffix.lower()
         if plain and kind in LINE_LOGS and size and _bytes(path, -1, os.SEEK_END) != b"\n":
-            raise LogUnreadable(f"{path} breaks off within its last line: remove that line, or copy the log again")
+            raise LogUnreadable(f"{path} is truncated within its last line: remove that line, or copy the log again")
         if plain and kind == ".blf" and (size < BLF_HEADER_BYTES or _bytes(path, 4, os.SEEK_SET) != b"LOGG"):
-            raise LogUnreadable(f"{path} is empty or no .blf log: it has no BLF header")
+            raise LogUnreadable(f"{path} is empty or not a .blf log: it has no BLF header")
         reader = can.LogReader(path)
     except UNREADABLE as error:
         reason = os.strerror(errno.ENOENT) if isinstance(error, FileNotFoundError) else error
@@ -143,13 +165,13 @@ def _open(path: Path) -> can.io.generic.MessageReader:
     if isinstance(reader, can.BLFReader) and reader.file_size > size:
         reader.stop()
         raise LogUnreadable(
-            f"{path} breaks off: its header says {reader.file_size} bytes and it has {size}; copy it again"
+            f"{path} is truncated: it must have {reader.file_size} bytes as its header states, got {size}; copy it again"
         )
     return reader
 
 
 def _bytes(path: Path, count: int, whence: int) -> bytes:
-    """The first `count` bytes of a file, or the last `-count`."""
+    """Return the first `count` bytes of a file, or its last `-count` bytes if `count` is negative."""
     with path.open("rb") as file:
         file.seek(min(count, 0), whence)
         return file.read(abs(count))

@@ -1,7 +1,7 @@
-"""A Linux CAN interface (`can0`, `vcan0`) as a bus: one system call moves a whole cycle's frames.
+"""Bus on a Linux CAN interface (`can0`, `vcan0`): one system call moves all frames of a cycle.
 
-`recvmmsg` fills a block of `struct canfd_frame` with nanosecond time stamps and the drop counter beside it, `sendmmsg`
-empties one; every structure the kernel reads or writes is allocated once. Sources: linux/can/raw.h, recvmmsg(2),
+`recvmmsg` writes a block of `struct canfd_frame`, with time stamps [ns] and the drop counter as control messages. `sendmmsg`
+sends such a block. Every structure that the kernel reads or writes is allocated once. Sources: linux/can/raw.h, recvmmsg(2),
 Documentation/networking/can.rst.
 """
 
@@ -30,18 +30,18 @@ SO_RXQ_OVFL: Final = 40
 SIOCGIFFLAGS: Final = 0x8913
 SIOCGIFMTU: Final = 0x8921
 IFF_UP: Final = 1
-#: Error frames that change what the controller can do (linux/can/error.h): TX timeout, controller, bus-off, restarted.
+#: Classes of received error frames (linux/can/error.h): TX timeout, controller state, bus-off, restarted.
 ERROR_FRAMES = 0x0001 | 0x0004 | 0x0040 | 0x0100
 LINK_LOST = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
 NO_ROOM = (errno.ENOBUFS, errno.EAGAIN)
 
-#: What we take of a received header word: programs and drivers leave a DLC or worse in the reserved bytes; and older
-#: kernels tell CAN FD by the size alone.
+#: Mask of the used fields of a received header word: some programs and drivers leave a DLC or garbage in the reserved bytes.
 HEADER_FIELDS = np.uint64(0x0000_FFFF_FFFF_FFFF)
+#: FDF flag in a header word, which must be set here because older kernels mark a CAN FD frame only by its size.
 FDF_IN_HEADER = np.uint64(FLAG_FDF << 40)
 
 IOVEC = np.dtype([("base", "u8"), ("length", "u8")])
-#: struct mmsghdr of 64-bit Linux.
+#: `struct mmsghdr` of 64-bit Linux.
 MMSGHDR = np.dtype(
     [
         ("name", "u8"),
@@ -54,7 +54,7 @@ MMSGHDR = np.dtype(
         ("length", "u8"),
     ]
 )
-#: The control messages of one frame in the order the kernel writes them; the second only once frames were lost.
+#: Control messages of one frame, in the order in which the kernel writes them. The drop counter follows only after a loss.
 CONTROL = np.dtype(
     [
         ("stamp_length", "u8"),
@@ -73,13 +73,22 @@ STAMP_ONLY = 32  # bytes of control data without the drop counter
 
 
 class SocketCanBus:
-    """A raw CAN FD socket bound to one interface; does not receive its own frames.
+    """Raw CAN FD socket bound to one interface.
 
-    `capacity` frames at most go in one system call and come from one `receive()`. `receive_buffer` [bytes] is asked of
-    the kernel, which without CAP_NET_ADMIN grants up to net.core.rmem_max; a frame takes about 1 kB of it. `stamps` are
-    CLOCK_REALTIME, taken when the frame left the driver. Error frames about the state of the controller are received.
+    It does not receive its own frames. It receives error frames about the state of the CAN controller. Time stamps are
+    CLOCK_REALTIME, taken by the kernel when the driver delivers the frame.
 
-    Raises `BusAbsent` with the command to type.
+    Args:
+        channel: Name of the interface, such as `can0`.
+        capacity: Largest number of frames in one system call, and of those that one `receive()` returns.
+        receive_buffer: Requested size of the kernel's receive buffer [bytes]; a frame takes about 1 kB. Without CAP_NET_ADMIN
+            the kernel grants at most net.core.rmem_max.
+
+    Attributes:
+        dropped: Number of frames lost because the receive buffer was full.
+
+    Raises:
+        BusAbsent: If the interface cannot be used; the message contains the command that helps.
     """
 
     def __init__(self, channel: str, capacity: int = 256, receive_buffer: int = 1 << 22) -> None:
@@ -98,7 +107,7 @@ class SocketCanBus:
         self._sendmmsg.argtypes = [ctypes.c_int, ctypes.c_size_t, ctypes.c_uint, ctypes.c_int]
         self._ppoll.argtypes = [ctypes.c_size_t, ctypes.c_ulong, ctypes.c_size_t, ctypes.c_void_p]
 
-        # Receive: frames, their headers, their control messages.
+        # Receive buffers: frames, their headers and their control messages.
         self._rx = new_frames(capacity)
         self._rx_memory = self._rx.view(np.uint8).data
         self._rx_words = as_words(self._rx)[:, 0]
@@ -116,7 +125,7 @@ class SocketCanBus:
         self._patience = np.zeros(2, np.int64)  # struct timespec
         self._patience_address = _address(self._patience)
 
-        # Send: frames and their headers; a classic frame is the first 16 bytes of its record.
+        # Transmit buffers: frames and their headers. A classic frame uses the first 16 bytes of its record.
         self._tx = new_frames(capacity)
         self._tx_memory = self._tx.view(np.uint8).data
         self._tx_flags = self._tx["flags"]
@@ -126,7 +135,16 @@ class SocketCanBus:
         self._tx_pattern = b""
 
     def send(self, frames: Frames) -> None:
-        """Hand the frames to the kernel; raises `BusFull`, `BusDown`, `ValueError`. Shape (n,)."""
+        """Pass the frames to the kernel.
+
+        Args:
+            frames: Frames to send, shape (n,).
+
+        Raises:
+            BusFull: If the transmit queue accepted only a part of the frames.
+            BusDown: If the bus is closed or the interface is down.
+            ValueError: If a frame is not a valid CAN frame.
+        """
         if self._closed:
             raise BusDown(f"{self.name} is closed")
         memory, headers = self._batches.to_send(frames)
@@ -140,15 +158,27 @@ class SocketCanBus:
                 self._tx_pattern = pattern
             sent = 0
             while sent < count:
-                # A batch cut short says so by its count; the reason comes with the next call.
+                # sendmmsg returns a smaller count if a frame fails. Only the next call returns the error code.
                 address = self._tx_address + sent * MMSGHDR.itemsize
-                taken = self._sendmmsg(self._file, address, count - sent, socket.MSG_DONTWAIT)
-                if taken < 0:
-                    raise self._refusal(ctypes.get_errno(), start + sent, total)
-                sent += taken
+                accepted = self._sendmmsg(self._file, address, count - sent, socket.MSG_DONTWAIT)
+                if accepted < 0:
+                    raise self._send_error(ctypes.get_errno(), start + sent, total)
+                sent += accepted
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Fill `frames[:n]` from the kernel's queue; raises `BusDown`. Shape (m,), n <= m; `timeout` [s]."""
+        """Move frames from the kernel's queue to `frames[:n]` and return n, see `Bus.receive`.
+
+        Args:
+            frames: Receive buffer, shape (m,) with m >= n.
+            timeout: Longest wait for the first frame [s].
+
+        Returns:
+            Number of received frames n.
+
+        Raises:
+            BusDown: If the bus is closed or the interface is down.
+            BusError: If the kernel reports another error.
+        """
         if self._closed:
             raise BusDown(f"{self.name} is closed")
         memory = self._batches.to_fill(frames)
@@ -170,7 +200,7 @@ class SocketCanBus:
         return int(count)
 
     def fileno(self) -> int:
-        """File descriptor, to wait for several buses at once."""
+        """Return the file descriptor of the socket, to wait for several buses together."""
         return self._file
 
     def close(self) -> None:
@@ -179,7 +209,19 @@ class SocketCanBus:
         self._socket.close()
 
     def _wait(self, room: int, timeout: float) -> int:
-        """What `recvmmsg` returns after an empty queue; 0 when nothing came in time or a signal interrupted."""
+        """Wait for a frame after an empty queue, then receive.
+
+        Args:
+            room: Largest number of frames to receive.
+            timeout: Longest wait [s].
+
+        Returns:
+            Number of received frames; 0 after the timeout or a signal.
+
+        Raises:
+            BusDown: If the interface is down.
+            BusError: If the kernel reports another error.
+        """
         code = ctypes.get_errno()
         if code in NO_ROOM and timeout > 0.0:
             fraction, whole = math.modf(timeout)
@@ -198,7 +240,7 @@ class SocketCanBus:
         raise BusError(f"{self.name} cannot receive: {os.strerror(code)}")
 
     def _widen_classic(self, count: int) -> None:
-        """Clear what a 16-byte `can_frame` left of the record it was written over, and mark the others as CAN FD."""
+        """Clear old bytes in the records of classic frames (16 bytes instead of 72), and mark the others as CAN FD."""
         for frame, length in zip(self._rx[:count], self._rx_lengths[:count].tolist(), strict=True):
             frame["res"] = 0
             if length > CLASSIC_BYTES:
@@ -208,7 +250,7 @@ class SocketCanBus:
                 frame["data"][8:] = 0
 
     def _read_control(self, count: int) -> None:
-        """Time stamps and the drop counter of the frames just received; then make room for the next control data."""
+        """Read time stamps and drop counter of the received frames, and reset the control buffers for the next call."""
         stamps = self.stamps[:count]
         np.multiply(self._seconds[:count], 1_000_000_000, out=stamps)
         np.add(stamps, self._nanoseconds[:count], out=stamps)
@@ -219,12 +261,12 @@ class SocketCanBus:
             self._lost_before = lost
         used.fill(CONTROL.itemsize)
 
-    def _refusal(self, code: int, sent: int, total: int) -> BusError:
+    def _send_error(self, code: int, sent: int, total: int) -> BusError:
         reason = os.strerror(code)
         if code in NO_ROOM:
             return BusFull(
-                f"{self.name} took {sent} of {total} frames, its transmit queue is full: is another node there to "
-                f"acknowledge? `ip link set {self.name} txqueuelen 1000` gives it room",
+                f"{self.name} accepted {sent} of {total} frames, its transmit queue is full: connect another node, which "
+                f"acknowledges frames, or enlarge the queue with `ip link set {self.name} txqueuelen 1000`",
                 sent,
             )
         if code in LINK_LOST:
@@ -233,7 +275,14 @@ class SocketCanBus:
 
 
 def require_channel(channel: str) -> None:
-    """Make sure that `channel` is a CAN FD interface that is up; raises `BusAbsent` with the command to type."""
+    """Check that a channel is a CAN FD interface that is up.
+
+    Args:
+        channel: Name of the interface.
+
+    Raises:
+        BusAbsent: If it is not; the message contains the command that helps.
+    """
     doctor = "run `atalante doctor`"
     create = f"ip link add {channel} type vcan && ip link set {channel} mtu 72 txqueuelen 1000 up"
     try:
@@ -250,13 +299,13 @@ def require_channel(channel: str) -> None:
             raise BusAbsent(
                 f"there is no interface {channel}: plug the adapter in, or type `{create}`; {doctor}"
             ) from error
-        (flags,) = struct.unpack_from("<H", _ask(raw, SIOCGIFFLAGS, channel))
-        (mtu,) = struct.unpack_from("<i", _ask(raw, SIOCGIFMTU, channel))
+        (flags,) = struct.unpack_from("<H", _ioctl(raw, SIOCGIFFLAGS, channel))
+        (mtu,) = struct.unpack_from("<i", _ioctl(raw, SIOCGIFMTU, channel))
         try:
             raw.bind((channel,))
         except OSError as error:
             raise BusAbsent(
-                f"{channel} is no CAN interface: `ip -br link show type can` lists those; {doctor}"
+                f"{channel} is not a CAN interface: `ip -br link show type can` lists CAN interfaces; {doctor}"
             ) from error
     if mtu < FRAME_BYTES:
         raise BusAbsent(
@@ -268,8 +317,8 @@ def require_channel(channel: str) -> None:
         raise BusAbsent(f"{channel} is down: type `ip link set {channel} up`; {doctor}")
 
 
-def _ask(any_socket: socket.socket, request: int, channel: str) -> bytes:
-    """The value part of `struct ifreq` (netdevice(7))."""
+def _ioctl(any_socket: socket.socket, request: int, channel: str) -> bytes:
+    """Return the value part of `struct ifreq` after an ioctl on an interface (netdevice(7))."""
     return fcntl.ioctl(any_socket, request, struct.pack("<16s24x", channel.encode()))[16:]
 
 
@@ -288,7 +337,7 @@ def _bound_socket(channel: str, receive_buffer: int) -> socket.socket:
 
 
 def _headers(frames: Frames, control: Frames | None) -> tuple[Frames, Frames]:
-    """One `iovec` and one `mmsghdr` for each frame; both must live as long as the kernel is handed the headers."""
+    """Create one `iovec` and one `mmsghdr` for each frame. Keep both while the kernel uses the headers."""
     index = np.arange(len(frames), dtype=np.uint64)
     vectors = np.zeros(len(frames), IOVEC)
     vectors["base"] = _address(frames) + index * FRAME_BYTES

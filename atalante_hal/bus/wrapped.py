@@ -1,4 +1,4 @@
-"""A bus around a bus: what passes is seen, changed or kept back on its way."""
+"""Base class of a bus that wraps another bus, to observe, change or delay its frames."""
 
 from __future__ import annotations
 
@@ -7,34 +7,38 @@ from atalante_hal.wire.frame import Frames
 
 
 class WrappedBus:
-    """The bus it is given, see `Bus`; a subclass says what becomes of the frames. `stamps` and `dropped` stay the wire's own."""
+    """Bus that passes every call to the wrapped bus; a subclass overrides `send` or `receive`.
+
+    Args:
+        bus: Wrapped bus. `close` closes it, too.
+    """
 
     def __init__(self, bus: Bus) -> None:
         self.bus = bus
 
     @property
     def name(self) -> str:
-        """The channel, as messages to the user name it."""
+        """Return the name of the wrapped bus."""
         return self.bus.name
 
     @property
     def stamps(self) -> Stamps:
-        """Receive times of the frames as they came from the wire. Shape (capacity,) int64 [ns]."""
+        """Return the receive times at the wrapped bus. Shape (capacity,) int64 [ns]."""
         return self.bus.stamps
 
     @property
     def dropped(self) -> int:
-        """Frames the wire itself lost."""
+        """Return the number of frames that the wrapped bus lost."""
         return self.bus.dropped
 
     def send(self, frames: Frames) -> None:
-        """As `Bus.send`."""
+        """Send frames on the wrapped bus, see `Bus.send`."""
         self.bus.send(frames)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """As `Bus.receive`."""
+        """Receive frames from the wrapped bus, see `Bus.receive`."""
         return self.bus.receive(frames, timeout)
 
     def close(self) -> None:
-        """Leave the wire."""
+        """Close the wrapped bus."""
         self.bus.close()

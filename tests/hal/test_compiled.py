@@ -110,7 +110,7 @@ def test_tells_what_takes_long(
     caplog.set_level("INFO", logger=module.__name__)
     for _ in range(2):
         assert compiled(_changed(_told))(2.0) == 8.0
-    assert [record.getMessage() for record in caplog.records] == [f"{__name__}._told is compiled"]
+    assert [record.getMessage() for record in caplog.records] == [f"compiling {__name__}._told"]
 
 
 def _told(x: float) -> float:

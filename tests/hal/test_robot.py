@@ -57,10 +57,18 @@ def test_the_right_leg_mirrors_the_left():
         ("floor = 0.3", "flor = 0.3", r"derating\.flor is unknown; valid keys are start, end, floor"),
         ("end = 115.0", "end = 90.0", r"derating\.start must be below derating\.end \(90\.0\), got 90\.0"),
         ("[thresholds]", "[limits]", "limits"),
-        ("supply_under = 36.0", "supply_under = 42.0", r"supply_under must be below thresholds\.supply_low \(42\.0\), got 42\.0"),
+        (
+            "supply_under = 36.0",
+            "supply_under = 42.0",
+            r"supply_under must be below thresholds\.supply_low \(42\.0\), got 42\.0",
+        ),
         ("supply_low = 42.0", "supply_low = 42000", r"thresholds\.supply_low must be 1 number from 5 to 100 \(V\)"),
         ("derated_imbalance = 0.5", "", r"thresholds\.derated_imbalance is missing"),
-        ("full_assist_ramp = 1.0", "full_assist_ramp = 0.0", r"full_assist_ramp must be 1 number from 0\.01 to 60 \(s\)"),
+        (
+            "full_assist_ramp = 1.0",
+            "full_assist_ramp = 0.0",
+            r"full_assist_ramp must be 1 number from 0\.01 to 60 \(s\)",
+        ),
         ("surplus_frames = 12", "surplus_frames = -1", r"surplus_frames must be 1 number from 1 to 100 \(frames\)"),
     ],
 )

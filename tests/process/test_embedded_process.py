@@ -92,7 +92,7 @@ def test_a_killed_robot_ends_the_run_in_one_sentence(network: Network, robot: Ro
 
         watch = Watch(rig, StopRequest(), kill, lambda state: "")
         rig.run(controller, until=watch)
-        with pytest.raises(Failed, match="embedded: the other end is gone"):
+        with pytest.raises(Failed, match="embedded: the other end is closed"):
             watch.conclude()
 
 

@@ -225,7 +225,7 @@ def test_every_known_error_exists() -> None:
         (
             ["jog", "left_SK", "--to", "5", "-i", "socketcan", "-c", "a,b"],
             2,
-            "does not say which bus is on which channel",
+            "must assign a bus to each channel",
         ),
         (["jog", "left_SK", "--to", "5", "-i", "socketcan"], 2, "socketcan needs a channel: -c vcan0"),
         (["status", "-i", "socketcan", "-c", "nocan7"], 3, "atalante doctor"),

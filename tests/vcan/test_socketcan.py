@@ -173,10 +173,10 @@ def test_an_interface_that_is_gone_is_down(spare_vcan: str) -> None:
 def test_a_full_transmit_queue_says_how_many_went_out(spare_vcan: str) -> None:
     as_root("tc", "qdisc", "add", "dev", spare_vcan, "root", "netem", "delay", "100s", "limit", "8")
     bus = SocketCanBus(spare_vcan)
-    with pytest.raises(BusFull, match="took 8 of 20 frames, its transmit queue is full") as refusal:
+    with pytest.raises(BusFull, match="accepted 8 of 20 frames, its transmit queue is full") as refusal:
         bus.send(random_frames(20))
     assert refusal.value.sent == 8
-    with pytest.raises(BusFull, match="took 0 of 1 frames"):
+    with pytest.raises(BusFull, match="accepted 0 of 1 frames"):
         bus.send(random_frames(1))
     bus.close()
 
@@ -184,7 +184,7 @@ def test_a_full_transmit_queue_says_how_many_went_out(spare_vcan: str) -> None:
 def test_opening_says_what_to_type(spare_vcan: str) -> None:
     with pytest.raises(BusAbsent, match=r"no interface vcan99: .*`ip link add vcan99 type vcan && .*atalante doctor"):
         SocketCanBus("vcan99")
-    with pytest.raises(BusAbsent, match="lo is no CAN interface"):
+    with pytest.raises(BusAbsent, match="lo is not a CAN interface"):
         SocketCanBus("lo")
     as_root("ip", "link", "set", spare_vcan, "down")
     with pytest.raises(BusAbsent, match=f"{spare_vcan} is down: type `ip link set {spare_vcan} up`"):

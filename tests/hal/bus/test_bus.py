@@ -221,7 +221,7 @@ class FrameSender:
         self.sender.send(frames)
         receive_all(self.receiver, 3)
         frames[2] = (can_id, length, flags, 0, 0)
-        with pytest.raises(ValueError, match=r"frame 2 .*is no CAN frame: with FDF"):
+        with pytest.raises(ValueError, match=r"frame 2 .*is not a valid CAN frame: with FDF"):
             self.sender.send(frames)
         assert self.receiver.receive(new_frames(3), 0.002) == 0
 
@@ -400,7 +400,7 @@ def test_pair_refuses_whole_batches_when_the_peer_does_not_read() -> None:
     sent = random_frames(4)
     one.send(sent)
     one.send(sent)
-    with pytest.raises(BusFull, match="8 frames waiting") as refusal:
+    with pytest.raises(BusFull, match="8 frames were not received") as refusal:
         one.send(sent)
     assert refusal.value.sent == 0
     assert receive_all(other, 3).tobytes() == sent[:3].tobytes()
@@ -433,7 +433,7 @@ def test_virtual_refuses_and_counts_what_another_program_made_up() -> None:
 def test_virtual_full_says_how_many_went_out() -> None:
     listener = PythonCanBus("virtual", "full", rx_queue_size=5)
     bus = PythonCanBus("virtual", "full")
-    with pytest.raises(BusFull, match="took 5 of 8 frames") as refusal:
+    with pytest.raises(BusFull, match="accepted 5 of 8 frames") as refusal:
         bus.send(random_frames(8))
     assert refusal.value.sent == 5
     bus.close()
@@ -445,7 +445,7 @@ def test_virtual_full_says_how_many_went_out() -> None:
     [
         ("pigeon", {}, "no CAN interface 'pigeon'; use one of .*socketcan.*virtual"),
         ("serial", {}, "cannot open serial:x for CAN FD: .*atalante doctor"),
-        ("virtual", {"protocol": can.CanProtocol.CAN_20}, "virtual:x carries classic CAN only"),
+        ("virtual", {"protocol": can.CanProtocol.CAN_20}, "virtual:x must support CAN FD, got classic CAN only"),
     ],
 )
 def test_opening_errors_say_what_is_valid(interface: str, options: dict[str, object], sentence: str) -> None:
@@ -489,9 +489,9 @@ def broken_logs(folder: Path) -> dict[str, tuple[Path, str]]:
     whole = {suffix: write_log(folder / f"whole{suffix}", random_frames(400)) for suffix in (".log", ".asc", ".blf")}
     cases = {
         "missing": (folder / "nowhere.log", "nowhere.log cannot be opened as a CAN log: No such file"),
-        "folder": (folder, "unknown log format"),
-        "suffix": (folder / "run.pcap", "unknown log format '.pcap'; use .log"),
-        "no suffix": (folder / "run", "unknown log format"),
+        "folder": (folder, "the log format must be"),
+        "suffix": (folder / "run.pcap", "the log format must be .log .*, got '.pcap'"),
+        "no suffix": (folder / "run", "the log format must be"),
         "csv": (folder / "run.csv", "do not keep CAN FD frames; record .log, .asc or .blf"),
         "db": (folder / "run.db", "do not keep CAN FD frames"),
     }
@@ -501,9 +501,9 @@ def broken_logs(folder: Path) -> dict[str, tuple[Path, str]]:
         cut.write_bytes(content[: len(content) * 2 // 3 - (content[len(content) * 2 // 3 - 1] == ord("\n"))])
         empty.write_bytes(b"")
         noise.write_bytes(np.random.default_rng(1).bytes(4000) + b"\n")
-        cases[f"cut {suffix}"] = (cut, "cut.* breaks off")
+        cases[f"cut {suffix}"] = (cut, "cut.* is truncated")
         cases[f"empty {suffix}"] = (empty, "empty")
-        cases[f"noise {suffix}"] = (noise, "cannot be read beyond frame 0|no .blf log")
+        cases[f"noise {suffix}"] = (noise, "cannot be read beyond frame 0|not a .blf log")
     return cases
 
 
@@ -560,11 +560,11 @@ def test_a_channel_for_each_bus_in_any_order() -> None:
     [
         ("", "empty entry; write one channel for all"),
         ("left_leg=can0,,right_leg=can1", "empty entry"),
-        ("can0,can1", "does not say which bus"),
-        ("left_leg=can0,can1", "'can1' in the channel map is not BUS=CHANNEL"),
-        ("left_leg=", "is not BUS=CHANNEL"),
+        ("can0,can1", "must assign a bus to each channel"),
+        ("left_leg=can0,can1", "must be BUS=CHANNEL, got 'can1'"),
+        ("left_leg=", "must be BUS=CHANNEL"),
         ("left_arm=can0", "no bus 'left_arm'; the buses are left_leg, right_leg, left_sense, right_sense"),
-        ("left_leg=can0,left_leg=can1", "names left_leg twice: can0 and can1"),
+        ("left_leg=can0,left_leg=can1", "assigns left_leg twice: to can0 and to can1"),
         ("left_leg=can0,right_sense=can1", "no channel for right_leg, left_sense; write left_leg=can0,right_leg=can1"),
     ],
 )
@@ -650,7 +650,7 @@ def test_joined_refuses_a_frame_that_has_no_bus_and_sends_nothing(network: Netwo
     joined, far = four_pairs(network)
     frames = frames_of(network, "SYNC_LEFT_LEG", "SYNC_RIGHT_LEG")
     frames["can_id"][1] = 0x7FE
-    with pytest.raises(ValueError, match=r"frame 1 \(id 0x7FE\) is no message of the network"):
+    with pytest.raises(ValueError, match=r"frame 1 \(id 0x7FE\) is not a message of the network"):
         joined.send(frames)
     assert far["left_leg"].receive(new_frames(1)) == 0
 
@@ -662,7 +662,7 @@ def test_joined_serves_the_other_channels_when_one_is_full_or_gone(network: Netw
         joined.send(syncs)
         for bus in BUSES[1:]:
             receive_all(far[bus], 1)
-    with pytest.raises(BusFull, match="left_leg peer has 8 frames waiting") as refusal:
+    with pytest.raises(BusFull, match="left_leg peer is full, 8 frames were not received") as refusal:
         joined.send(syncs)
     assert refusal.value.sent == 3
     for bus in BUSES[1:]:
@@ -675,5 +675,5 @@ def test_joined_serves_the_other_channels_when_one_is_full_or_gone(network: Netw
 
 
 def test_joined_needs_a_channel_for_every_bus(network: Network) -> None:
-    with pytest.raises(ValueError, match="no channel given for right_leg; the buses are"):
+    with pytest.raises(ValueError, match="buses must have an entry for each of .*; right_leg is missing"):
         JoinedBus(network, {"left_leg": lockstep_pair()[0]})

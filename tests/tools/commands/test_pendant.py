@@ -566,7 +566,7 @@ def test_xi_takes_over_and_sets_the_factor(world: World, monkeypatch: pytest.Mon
             ["stop", "-i", "embedded"],
             "this command needs a CAN bus, got -i embedded: use for example -i socketcan -c vcan0",
         ),
-        (["stop", "-c", "left_leg=a,b"], "'b' in the channel map is not BUS=CHANNEL"),
+        (["stop", "-c", "left_leg=a,b"], "must be BUS=CHANNEL, got 'b'"),
     ],
 )
 def test_an_invalid_command_line_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
