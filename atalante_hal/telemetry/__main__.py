@@ -1,8 +1,8 @@
-"""The telemetry process: `python -m atalante_hal.telemetry ORDER`, started by `process.TelemetryProcess` and nobody else.
+"""Telemetry process: `python -m atalante_hal.telemetry ORDER`, started only by `process.TelemetryProcess`.
 
-ORDER is JSON: the configuration, the inherited descriptors of the rings, the number of processes before this one, and the
-endpoint of the last of them. One JSON line on stdout says that everything is open (or what could not be had), another at the
-end what became of it.
+ORDER is a JSON object with the configuration, the inherited descriptors of the rings, the number of telemetry processes that
+this one replaces, and the endpoint of the last of them. The process prints one JSON line when everything is open or opening has
+failed, and another line with a summary at the end.
 """
 
 from __future__ import annotations
@@ -30,20 +30,25 @@ if TYPE_CHECKING:
 _INSTALL = "install it with `pip install 'atalante-hal[telemetry]'`"
 
 
-#: Zenoh needs ten seconds to end a session with a stopped subscriber; everything that matters is on the disk by then [s].
-_LAST_WORDS = 1.0
+#: Longest time to end the Zenoh session [s]. With a stopped subscriber Zenoh needs 10 s; the files are closed before.
+_SESSION_END = 1.0
 
 
 class Outlets:
-    """The sinks that a configuration asks for, opened; those that may be refused come before the one with a socket.
+    """Open sinks of a configuration: CAN log, recorder and publisher.
+
+    The files are opened first, so that no socket is open if a file fails.
 
     Args:
-        restarts: telemetry processes that this one replaces.
-        before: endpoint of the last of them.
+        config: Telemetry configuration.
+        records: Reader of the ring of cycle records.
+        frames: Reader of the ring of CAN frames; None without a CAN log.
+        restarts: Number of telemetry processes that this one replaces.
+        before: Endpoint of the last of them; None if there is none.
 
     Raises:
-        SinkError: a file or an endpoint that was asked for cannot be had. Whatever is only a default (publishing on a free
-            port of the loopback) becomes a notice instead, as does every endpoint of a restart: the recording goes on.
+        SinkError: If a requested file or endpoint cannot be opened. A failure of the default endpoint (a free port of the
+            loopback) or of any endpoint after a restart is only a notice, so that the recording continues.
     """
 
     def __init__(
@@ -86,16 +91,23 @@ class Outlets:
 
     @property
     def endpoint(self) -> str | None:
-        """Where subscribers connect."""
+        """Return the endpoint to which subscribers connect; None if nothing is published."""
         return self.publisher.endpoint if self.publisher is not None else None
 
     def sinks(self, config: TelemetryConfig) -> list[tuple[MessageSink, int]]:
-        """Recorder and publisher with the cycles between two messages of a stream."""
+        """Return recorder and publisher, each with the number of cycles between two messages of a stream.
+
+        Args:
+            config: Telemetry configuration with the rates.
+
+        Returns:
+            (sink, cycles) of each open sink.
+        """
         pairs = ((self.recorder, config.record_rate), (self.publisher, config.stream_rate))
         return [(sink, CYCLES_PER_SECOND // rate) for sink, rate in pairs if sink is not None]
 
     def close_files(self) -> None:
-        """Finish recording and CAN log; what fails becomes a notice."""
+        """Close recording and CAN log; a failure becomes a notice."""
         for file in (self.recorder, self.can_log):
             if file is not None:
                 try:
@@ -104,7 +116,7 @@ class Outlets:
                     self.notices.append(str(error))
 
     def summary(self) -> dict[str, int]:
-        """Return what went where: published and recorded messages, logged frames, and whether the recording has its end."""
+        """Return the numbers of published and recorded messages and logged frames, and whether the recording is complete."""
         return {
             "published": self.publisher.messages if self.publisher is not None else 0,
             "recorded": self.recorder.messages if self.recorder is not None else 0,
@@ -139,35 +151,42 @@ def _open_publisher(config: TelemetryConfig, streams: list[tuple[str, str]], bef
     return Publisher(config.robot, streams, config.listen, config.access, before)
 
 
-def _say(line: dict[str, Any]) -> None:
-    """One JSON line for the process that started this one; it may be gone."""
+def _print_line(line: dict[str, Any]) -> None:
+    """Print one JSON line for the process that started this one, which may have ended."""
     with contextlib.suppress(BrokenPipeError):
         os.write(sys.stdout.fileno(), json.dumps(line).encode() + b"\n")
 
 
-def _be_ordinary() -> None:
-    """Do not compete with the loop, whose real-time priority a child inherits."""
+def _leave_realtime() -> None:
+    """Leave the real-time priority inherited from the loop, so that this process does not compete with it."""
     if os.sched_getscheduler(0) != os.SCHED_OTHER:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def main(order: str) -> int:
-    """Run until the rings are closed or SIGTERM comes. Returns the exit code."""
+    """Run until the rings are closed or SIGTERM arrives.
+
+    Args:
+        order: JSON object, see above.
+
+    Returns:
+        Exit code: 0, or 1 if a sink could not be opened.
+    """
     stop: list[int] = []
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda number, _: stop.append(number))
     logging.basicConfig(level=logging.WARNING)
-    _be_ordinary()
-    ordered = json.loads(order)
-    config = TelemetryConfig.from_json(ordered["config"])
-    fds: dict[str, int] = ordered["rings"]
+    _leave_realtime()
+    arguments = json.loads(order)
+    config = TelemetryConfig.from_json(arguments["config"])
+    fds: dict[str, int] = arguments["rings"]
     with contextlib.ExitStack() as stack:
         records, events = (stack.enter_context(RingReader(fds[name])) for name in ("records", "events"))
         frames = stack.enter_context(RingReader(fds["frames"])) if "frames" in fds else None
         try:
-            outlets = Outlets(config, records, frames, ordered["restarts"], ordered["endpoint"])
+            outlets = Outlets(config, records, frames, arguments["restarts"], arguments["endpoint"])
         except SinkError as error:
-            _say({"error": str(error)})
+            _print_line({"error": str(error)})
             return 1
         service = Service(
             records,
@@ -179,7 +198,7 @@ def main(order: str) -> int:
             can_log=outlets.can_log,
             recorder=outlets.recorder,
         )
-        _say({"endpoint": outlets.endpoint, "notices": outlets.notices})
+        _print_line({"endpoint": outlets.endpoint, "notices": outlets.notices})
         while outlets.notices:
             service.report("TELEMETRY_DOWN", outlets.notices.pop(0), "warning")
         try:
@@ -188,8 +207,8 @@ def main(order: str) -> int:
             outlets.close_files()
             service.settle()
         losses = {"lost": records.lost, "frames_lost": frames.lost if frames is not None else 0}
-        _say({**outlets.summary(), **losses, "notices": [*outlets.notices, *service.notices]})
-        signal.setitimer(signal.ITIMER_REAL, _LAST_WORDS)  # SIGALRM ends the process wherever it waits
+        _print_line({**outlets.summary(), **losses, "notices": [*outlets.notices, *service.notices]})
+        signal.setitimer(signal.ITIMER_REAL, _SESSION_END)  # SIGALRM then ends the process, even inside Zenoh
         if outlets.publisher is not None:
             outlets.publisher.close()
     return 0

@@ -1,7 +1,7 @@
-"""Who may subscribe: TLS and users of the publisher's endpoint, and the telemetry file that asks for them.
+"""Access to the telemetry endpoint: TLS, certificates and users, and the telemetry file that configures them.
 
-`telemetry file -> TelemetryConfig -> publisher`. Without any of it the endpoint is open to whoever reaches it, which on the
-default loopback is this machine. What a subscriber may do is the same for all: listen (access control, see `publisher`).
+`telemetry file -> TelemetryConfig -> publisher`. Without these settings every client that reaches the endpoint may subscribe. On
+the default endpoint (loopback) these are the processes of this machine. A subscriber can only receive, see `publisher`.
 """
 
 from __future__ import annotations
@@ -12,63 +12,63 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-#: Keys of a telemetry file; the last four are files, relative to it.
+#: Keys of a telemetry file: texts, and paths relative to the file.
 _TEXTS, _FILES = ("robot", "listen"), ("certificate", "private_key", "client_ca", "users")
 
 
-#: Protocols of an endpoint that a certificate protects, and of one without; the first of each is the default.
+#: Protocols of an endpoint with a certificate, and of one without; the first of each is the default.
 _PROTECTED, _UNPROTECTED = ("tls", "quic"), ("tcp",)
-#: One endpoint: protocol, host, port. A Zenoh endpoint may go on with `?` and `#`, which override TLS settings of the files.
+#: One endpoint: protocol, host, port. Zenoh's suffixes `?` and `#` are not allowed, because they override TLS settings.
 _ENDPOINT = re.compile(r"(?P<protocol>[^/]+)/(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):(?P<port>[0-9]{1,5})", re.ASCII)
 _LARGEST_PORT = 65535
 
 
 class AccessError(RuntimeError):
-    """The telemetry file or what it names is not right; the message names the key and what is valid."""
+    """Error in the telemetry file or in a file it names; the message names the key and its valid values."""
 
     code = "CONFIG_INVALID"
 
 
 @dataclass(frozen=True)
 class Access:
-    """Files that decide who may subscribe; none: everybody who reaches the endpoint."""
+    """Files that restrict access to the endpoint. Without any, every client that reaches it may subscribe."""
 
-    certificate: Path | None = None  # PEM, of the publisher: the endpoint speaks TLS
-    private_key: Path | None = None  # PEM, of that certificate; for this user's eyes only
-    client_ca: Path | None = None  # PEM: subscribers need a certificate that this authority signed
-    users: Path | None = None  # a line "name:password" each; for this user's eyes only
+    certificate: Path | None = None  # PEM, certificate of the publisher: the endpoint uses TLS
+    private_key: Path | None = None  # PEM, key of that certificate; readable only by this user
+    client_ca: Path | None = None  # PEM, authority that must have signed the certificate of each subscriber
+    users: Path | None = None  # one line "name:password" for each user; readable only by this user
 
     def __post_init__(self) -> None:
         if (self.certificate is None) != (self.private_key is None):
-            raise AccessError("certificate and private_key belong together: give both or none")
+            raise AccessError("certificate and private_key must be given together, got only one: give both or none")
         if self.client_ca is not None and self.certificate is None:
-            raise AccessError("client_ca asks subscribers for certificates, which needs a certificate of our own")
+            raise AccessError("client_ca requires certificate and private_key of the publisher: give them, too")
         for name in _FILES:
             path = getattr(self, name)
             if path is not None and not path.is_file():
-                raise AccessError(f"{name} is a file that can be read, not {path}")
+                raise AccessError(f"{name} must be a readable file, got {path}")
         for name in ("private_key", "users"):
             path = getattr(self, name)
             if path is not None and path.stat().st_mode & 0o077:
-                raise AccessError(f"{name} {path} can be read by others; type: chmod 600 {path}")
+                raise AccessError(f"{name} {path} must be readable only by its owner; type: chmod 600 {path}")
         if self.users is not None:
             lines = self.users.read_text(encoding="utf-8").splitlines()
             if not lines or not all(name and password for name, _, password in (line.partition(":") for line in lines)):
-                raise AccessError(f"users {self.users} has a line name:password for each user, and nothing else")
+                raise AccessError(f"users {self.users} must contain only lines name:password, one for each user")
 
     @property
     def protocols(self) -> tuple[str, ...]:
-        """Protocols that the endpoint may speak, first parts of a Zenoh locator; the first is the default."""
+        """Return the allowed protocols of the endpoint (first part of a Zenoh locator); the first is the default."""
         return _PROTECTED if self.certificate is not None else _UNPROTECTED
 
     def check_endpoint(self, listen: str) -> None:
-        """Accept one endpoint that speaks a protocol the files protect, and nothing else.
+        """Check that an endpoint uses an allowed protocol and has no further options.
 
         Args:
             listen: Zenoh endpoint, PROTOCOL/HOST:PORT.
 
         Raises:
-            AccessError: it is another protocol, not one plain endpoint, or its port is 0 or too large.
+            AccessError: If the protocol is not allowed, the text is not PROTOCOL/HOST:PORT, or the port is not 1 to 65535.
         """
         found = _ENDPOINT.fullmatch(listen)
         if found and found["protocol"] in self.protocols and 0 < int(found["port"]) <= _LARGEST_PORT:
@@ -81,7 +81,7 @@ class Access:
         raise AccessError(f"listen must be {valid}, got {listen!r}")
 
     def transport(self) -> dict[str, Any]:
-        """The part of Zenoh's configuration under `transport`."""
+        """Return the section `transport` of the Zenoh configuration."""
         link: dict[str, Any] = {}
         if self.certificate is not None:
             link["tls"] = {"listen_certificate": str(self.certificate), "listen_private_key": str(self.private_key)}
@@ -92,12 +92,17 @@ class Access:
 
 
 def load_telemetry_file(path: Path) -> dict[str, Any]:
-    """What a telemetry file (TOML) sets, by the names of `TelemetryConfig`.
+    """Read a telemetry file and check it.
 
-    Keys: `robot` (name), `listen` (Zenoh endpoint), `certificate`, `private_key`, `client_ca`, `users` (files).
+    Args:
+        path: TOML file with the keys `robot` (name), `listen` (Zenoh endpoint), `certificate`, `private_key`, `client_ca` and
+            `users` (files); all are optional.
+
+    Returns:
+        Value of each key that is set, by the names of `TelemetryConfig`.
 
     Raises:
-        AccessError: the file cannot be read, an unknown key, a value that is no text, a file that is not there.
+        AccessError: If a file cannot be read, a key is unknown or a value is not valid.
     """
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -109,7 +114,7 @@ def load_telemetry_file(path: Path) -> dict[str, Any]:
         if key not in (*_TEXTS, *_FILES):
             raise AccessError(f"{path}: {key} is unknown; valid keys are {', '.join((*_TEXTS, *_FILES))}")
         if not isinstance(value, str) or not value:
-            raise AccessError(f"{path}: {key} is a text that is not empty, not {value!r}")
+            raise AccessError(f"{path}: {key} must be a text that is not empty, got {value!r}")
     files = {key: path.parent / document[key] for key in _FILES if key in document}
     try:
         access = Access(**files)

@@ -1,8 +1,8 @@
 """CAN log: every frame the HAL sent and received, in the formats of python-can's Logger.
 
-The suffix chooses the format: `.log` (candump), `.asc`, `.blf`, also `.log.gz` and `.asc.gz`. Each network bus is a channel: by
-name in `.log` (left_leg), by number from 1 in the order of the DBC in `.asc` and `.blf`. Byte for byte the same for the
-same frames is `.log` alone (and `.blf`, which dates from the first frame); `.asc` and `.gz` carry the date of the writing.
+The suffix determines the format: `.log` (candump), `.asc`, `.blf`, `.log.gz` or `.asc.gz`. Each bus of the network is a channel:
+its name in `.log` (left_leg), its number in the order of the DBC, from 1, in the others. The same frames give identical files in
+`.log` and `.blf`, but not in `.asc` and `.gz`, which contain the date of writing.
 """
 
 from __future__ import annotations
@@ -21,15 +21,21 @@ from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_E
 
 #: Formats of python-can that keep CAN FD frames whole.
 FORMATS = (".log", ".asc", ".blf", ".log.gz", ".asc.gz")
-#: Channel of a frame whose id is not in the DBC.
+#: Channel of frames whose identifier is not in the DBC.
 FOREIGN = "foreign"
 
 
 def check_format(path: Path) -> str:
-    """The suffix that decides about the format.
+    """Check the format of a CAN log.
+
+    Args:
+        path: Path of the log.
+
+    Returns:
+        Suffix that determines the format.
 
     Raises:
-        SinkError: python-can has no writer for it, or one that loses CAN FD frames.
+        SinkError: If python-can cannot write all CAN FD frames in this format.
     """
     name = path.name.lower()
     for suffix in sorted(FORMATS, key=len, reverse=True):
@@ -37,20 +43,20 @@ def check_format(path: Path) -> str:
             return suffix
     raise SinkError(
         "RECORD_STOPPED",
-        f"a CAN log {path.name} cannot keep every CAN FD frame; end its name in one of {', '.join(FORMATS)}",
+        f"the format of the CAN log {path.name} cannot store CAN FD frames; end its name in one of {', '.join(FORMATS)}",
     )
 
 
 class CanLog(Closing):
-    """Writes frames to a log file.
+    """Writer of a CAN log file.
 
     Args:
-        path: of the file; its folder is made.
-        buses: network buses, in the order of the DBC.
-        bus_of: frame id -> its network bus.
+        path: Path of the file; missing folders are created.
+        buses: Buses of the network, in the order of the DBC.
+        bus_of: Bus of each frame identifier.
 
     Raises:
-        SinkError: the format is not valid, or the file cannot be made.
+        SinkError: If the format is not valid or the file cannot be created.
     """
 
     def __init__(self, path: Path, buses: Sequence[str], bus_of: Mapping[int, str]) -> None:
@@ -66,19 +72,24 @@ class CanLog(Closing):
             self._logger = can.Logger(path)
             self._open = True
         except OSError as error:
-            raise SinkError("RECORD_STOPPED", f"the CAN log {path} cannot be made: {error.strerror}") from error
+            raise SinkError("RECORD_STOPPED", f"the CAN log {path} cannot be created: {error.strerror}") from error
 
     def write(self, frames: Frames, stamps: npt.NDArray[np.int64], sent: npt.NDArray[np.uint8]) -> None:
-        """Add frames. Shapes (n,): `FRAME` records, times [ns], 1 where sent.
+        """Append frames to the log.
+
+        Args:
+            frames: `FRAME` records, shape (n,).
+            stamps: Time of each frame, shape (n,) [ns].
+            sent: 1 for a sent frame, 0 for a received one, shape (n,).
 
         Raises:
-            SinkError: the disk is full or gone.
+            SinkError: If the file cannot be written.
         """
         foreign = self._channels[FOREIGN]
         columns = (frames[name].tolist() for name in ("can_id", "len", "flags"))
         data = frames["data"].tobytes()
         try:
-            for place, (can_id, length, flags, stamp, is_sent) in enumerate(
+            for index, (can_id, length, flags, stamp, is_sent) in enumerate(
                 zip(*columns, stamps.tolist(), sent.tolist(), strict=True)
             ):
                 is_fd = bool(flags & FLAG_FDF)
@@ -91,7 +102,7 @@ class CanLog(Closing):
                         is_error_frame=bool(can_id & ID_ERROR),
                         channel=self._channel_of.get(can_id, foreign),
                         dlc=length,
-                        data=None if can_id & ID_REMOTE else data[64 * place : 64 * place + length],
+                        data=None if can_id & ID_REMOTE else data[64 * index : 64 * index + length],
                         is_fd=is_fd,
                         is_rx=not is_sent,
                         bitrate_switch=is_fd and bool(flags & FLAG_BRS),
@@ -103,7 +114,11 @@ class CanLog(Closing):
         self.frames += len(frames)
 
     def close(self) -> None:
-        """Finish the file; raises as `write`. A second call does nothing."""
+        """Close the file; a second call has no effect.
+
+        Raises:
+            SinkError: If the rest of the log cannot be written.
+        """
         if self._open:
             self._open = False
             try:
@@ -113,6 +128,6 @@ class CanLog(Closing):
 
     def _failed(self, error: OSError) -> SinkError:
         self._open = False
-        with contextlib.suppress(OSError):  # what the buffer still holds does not fit either
+        with contextlib.suppress(OSError):  # the buffered rest cannot be written either
             self._logger.stop()
         return SinkError("RECORD_STOPPED", f"the CAN log {self.path} stopped: {error.strerror}")

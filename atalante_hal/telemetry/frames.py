@@ -1,8 +1,8 @@
-"""CAN frames as records of a ring of their own: everything the HAL sends and receives, for a CAN log.
+"""CAN frames of the HAL as records of a separate ring, for a CAN log.
 
-The HAL hands its arrays to a `RingTap`, which copies their bytes (one copy a batch) into a record of up to 64 frames; the
-record goes into the ring when it is full, every second or third cycle. Which network bus a frame belongs to is not noted: ids are
-unique network-wide, so the telemetry process looks it up.
+The HAL passes its frame arrays to a `RingTap`. It copies them, one copy for each batch, into a record of up to 64 frames, and
+writes a full record to the ring every second or third cycle. The record does not contain the bus of a frame. The telemetry
+process derives it from the identifier, which is unique in the network.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from atalante_hal.telemetry.ring import RingWriter
 from atalante_hal.wire.frame import FRAME, FRAME_BYTES, Frames
 
 FRAMES_PER_RECORD = 64
-#: Stamps are counted from `base_ns`.
+#: Record of the ring. The time of a frame is `base_ns` plus its stamp [ns]; `sent` is 1 for sent frames.
 FRAME_RECORD = np.dtype(
     [
         ("count", "<i8"),
@@ -32,12 +32,13 @@ Stamps = npt.NDArray[np.int64]
 
 
 class RingTap:
-    """Sees every frame the HAL sends and receives (`hal.FrameTap`) and puts it into a ring.
+    """`transceiver.FrameTap` that writes every frame the HAL sends or receives to a ring.
 
     Args:
-        ring: of `FRAME_RECORD` records.
-        now: time of a frame that is sent [ns]; the virtual time in lock-step.
-        stamps: times of the frames last received [ns], e.g. `lambda: bus.stamps`; without it they get `now()`, too.
+        ring: Ring of `FRAME_RECORD` records.
+        now: Function that returns the time of a sent frame [ns]; virtual time in lock-step.
+        stamps: Function that returns the times of the frames received last [ns], e.g. `lambda: bus.stamps`. Without it, received
+            frames also get the time `now()`.
     """
 
     def __init__(
@@ -52,16 +53,29 @@ class RingTap:
         self._used = 0
 
     def begin_run(self, base_ns: int) -> None:
-        """Stamps count from here on from `base_ns`: 0 for wall time, the start of the run for virtual time."""
+        """Set the zero of the time stamps of all following frames.
+
+        Args:
+            base_ns: Time of stamp 0 [ns]: 0 on the wall clock, the start of the run in virtual time.
+        """
         self.flush()
         self._base[0] = base_ns
 
     def sent(self, frames: Frames) -> None:
-        """Frames just handed to the bus. Shape (n,)."""
+        """Store frames that were just passed to the bus.
+
+        Args:
+            frames: Sent frames, shape (n,).
+        """
         self._add(frames, len(frames), 1, None)
 
     def received(self, frames: Frames, count: int) -> None:
-        """`frames[:count]` as they came from the bus."""
+        """Store frames that were just received.
+
+        Args:
+            frames: Receive buffer, shape (m,).
+            count: Number of received frames at its start.
+        """
         self._add(frames, count, 0, self._stamps_of_batch() if self._stamps_of_batch is not None else None)
 
     def _add(self, frames: Frames, count: int, sent: int, stamps: Stamps | None) -> None:
@@ -81,7 +95,7 @@ class RingTap:
             done += fit
 
     def flush(self) -> None:
-        """Put what has been gathered into the ring."""
+        """Write the collected frames to the ring."""
         if self._used:
             self._count[0] = self._used
             self._ring.write(self._record)
@@ -89,7 +103,14 @@ class RingTap:
 
 
 def batches(records: npt.NDArray[np.uint8]) -> Iterator[tuple[Frames, Stamps, npt.NDArray[np.uint8]]]:
-    """Frames, times [ns] and directions (1: sent) of each record that a reader of the ring got. Shapes (n,)."""
+    """Yield the frames of each record of the ring.
+
+    Args:
+        records: Records as `RingReader.read` returns them, shape (k, record size) bytes.
+
+    Yields:
+        Frames, times [ns] and directions (1: sent, 0: received) of one record, each of shape (n,).
+    """
     for record in records:
         found = record.view(FRAME_RECORD)[0]
         count = int(found["count"])

@@ -1,4 +1,4 @@
-"""From the telemetry record to protobuf: one stream a message type, each with its key, made for one layout.
+"""Conversion of telemetry records to protobuf: one stream for each message type, with its own key.
 
 ring -> record -> [streams] -> bytes -> publisher and recorder
 """
@@ -19,25 +19,25 @@ from atalante_hal.telemetry.schema import message_class
 
 #: Assisted joints by stance: sagittal hip and knee of the swing leg. 0: left stance, 1: right stance.
 ASSISTED = (("right_SH", "right_SK"), ("left_SH", "left_SK"))
-#: Field of `Guide` <- field of the controller.
+#: Field of the message `Guide` -> field of the controller.
 _GUIDE_FIELDS = {"error": "error", "bound": "q_bound", "h": "h", "lambda": "lambda", "desired_position": "q_des"}
 _GUIDE_OTHERS = ("filter_active", "step", "phase", "stance")
 
 
 @dataclass(slots=True)
 class Sample:
-    """One record on its way to messages."""
+    """Record of one cycle, with its time and run, from which messages are encoded."""
 
-    values: list[float]  # the record, by its layout
+    values: list[float]  # values of the record, in the order of its layout
     cycle: int
     timestamp: int  # ns
-    run: int = 0
+    run: int = 0  # number of the run in the session
     run_name: str = ""
 
 
 @dataclass(frozen=True)
 class Stream:
-    """One message type made from records: its key, its type, and how a sample becomes its bytes."""
+    """Message type that is encoded from records: key, type name and encoder."""
 
     key: str
     message: str
@@ -45,39 +45,50 @@ class Stream:
 
 
 class Encoder:
-    """Everything that becomes of the records of one layout.
+    """Encoder of all messages for records of one layout.
 
     Args:
-        layout: of the records.
-        diagnostics: names of the bits of the field "diagnostics", lowest first.
+        layout: Layout of the records.
+        diagnostics: Names of the bits of the field "diagnostics", lowest bit first.
     """
 
     def __init__(self, layout: Layout, diagnostics: Sequence[str] = ()) -> None:
         self.cycle_at, self.time_at = layout["cycle"].start, layout["time"].start
-        #: The streams that a record of this layout can fill.
+        #: Streams whose fields are in this layout.
         self.streams = _streams(layout, diagnostics)
         self.window = LoopWindow(layout)
 
     @property
     def keys(self) -> list[tuple[str, str]]:
-        """(key, message type) of everything made from records."""
+        """Return (key, message type) of every stream, including the loop statistics."""
         return [*((stream.key, stream.message) for stream in self.streams), (self.window.key, self.window.message)]
 
     def sample(
         self, record: npt.NDArray[np.float64], cycle: int, start_ns: int, run: int = 0, run_name: str = ""
     ) -> Sample:
-        """A record ready for the streams. Shape (layout.size,).
+        """Create the sample of a record.
 
         Args:
-            start_ns: log time of cycle 0 of the run.
+            record: Values of the record, shape (layout.size,).
+            cycle: Cycle number.
+            start_ns: Log time of cycle 0 of the run [ns].
+            run: Number of the run in the session.
+            run_name: Name of the run.
+
+        Returns:
+            Sample for the streams.
         """
         return Sample(record.tolist(), cycle, start_ns + round(float(record[self.time_at]) * 1e9), run, run_name)
 
     def event(self, event: Event, timestamp: int) -> bytes:
-        """Bytes of an `Event` message.
+        """Encode an `Event` message.
 
         Args:
-            timestamp: ns.
+            event: Event to encode.
+            timestamp: Log time of the event [ns].
+
+        Returns:
+            Bytes of the message.
         """
         message = message_class("Event")(
             severity=SEVERITIES.index(event.severity),
@@ -109,7 +120,7 @@ def _streams(layout: Layout, diagnostics: Sequence[str]) -> tuple[Stream, ...]:
 
 
 def _begin(message: Any, sample: Sample) -> None:
-    """Set what every message begins with."""
+    """Set the fields that every message has: timestamp and cycle."""
     message.timestamp.seconds, message.timestamp.nanos = divmod(sample.timestamp, 1_000_000_000)
     message.cycle = sample.cycle & 0xFFFFFFFF
 
@@ -238,7 +249,11 @@ def _system_state(layout: Layout, diagnostics: Sequence[str]) -> Callable[[Sampl
 
 
 class LoopWindow:
-    """Statistics of the cycles between two `LoopStatistics` messages."""
+    """Statistics of the cycles since the last `LoopStatistics` message.
+
+    Args:
+        layout: Layout of the records.
+    """
 
     key = "loop"
     message = "LoopStatistics"
@@ -253,7 +268,11 @@ class LoopWindow:
         self._cycles, self._cost_sum, self._cost_max, self._lateness_max = 0, 0.0, 0.0, 0.0
 
     def add(self, records: npt.NDArray[np.float64]) -> None:
-        """Take in the records of some cycles. Shape (n, layout.size)."""
+        """Add the records of consecutive cycles.
+
+        Args:
+            records: Values of the records, shape (n, layout.size).
+        """
         if len(records):
             self._cycles += len(records)
             self._cost_sum += float(records[:, self._cost].sum())
@@ -261,25 +280,29 @@ class LoopWindow:
             self._lateness_max = max(self._lateness_max, float(records[:, self._lateness].max()))
 
     def encode(self, sample: Sample, lost: int) -> bytes:
-        """The message up to this sample, whose counts it takes; the next window begins.
+        """Encode the message up to a sample and begin the next window.
 
         Args:
-            lost: cycles that telemetry has not seen so far.
+            sample: Last sample of the window; its counters are copied to the message.
+            lost: Number of cycles that telemetry has lost so far.
+
+        Returns:
+            Bytes of the message.
         """
         message = self._message
         _begin(message, sample)
         message.cycles = self._cycles
         message.cost_mean = self._cost_sum / self._cycles * 1e-6 if self._cycles else 0.0
         message.cost_max, message.lateness_max = self._cost_max * 1e-6, self._lateness_max * 1e-6
-        for name, place in self._counts:
-            setattr(message, name, int(sample.values[place]))
+        for name, index in self._counts:
+            setattr(message, name, int(sample.values[index]))
         message.telemetry_lost = lost
         self._clear()
         return bytes(message.SerializeToString())
 
 
 def _named(repeated: Any, names: Sequence[str]) -> list[Any]:
-    """One sub-message a name."""
+    """Add one sub-message for each name and return them."""
     for name in names:
         repeated.add(name=name)
     return list(repeated)

@@ -1,6 +1,6 @@
-"""The protobuf messages of `messages.proto`, loaded from the committed descriptor set.
+"""Protobuf messages of `messages.proto`, loaded from the committed descriptor set.
 
-Generated `_pb2` modules break across protobuf releases; a descriptor set read through `message_factory` does not.
+Generated `_pb2` modules depend on the protobuf release. A descriptor set read through `message_factory` does not.
 """
 
 from __future__ import annotations
@@ -25,20 +25,33 @@ def _pool() -> Any:
 
 @cache
 def descriptor_set() -> bytes:
-    """The serialised FileDescriptorSet, with its imports: the schema that MCAP channels carry."""
+    """Return the serialised FileDescriptorSet with its imports: the schema of the MCAP channels."""
     return DESCRIPTORS.read_bytes()
 
 
 @cache
 def message_class(name: str) -> Any:
-    """Class of a message of this package, e.g. `message_class("JointStates")`.
+    """Return the class of a protobuf message.
+
+    Args:
+        name: Name of the message without its package, e.g. "JointStates".
+
+    Returns:
+        Message class.
 
     Raises:
-        KeyError: there is no message of that name.
+        KeyError: If there is no message of that name.
     """
     return message_factory.GetMessageClass(_pool().FindMessageTypeByName(f"{PACKAGE}.{name}"))
 
 
 def encoding(name: str) -> str:
-    """Zenoh encoding tag of a message, e.g. application/protobuf;atalante.v1.JointStates."""
+    """Return the Zenoh encoding of a message, e.g. application/protobuf;atalante.v1.JointStates.
+
+    Args:
+        name: Name of the message without its package.
+
+    Returns:
+        Encoding text.
+    """
     return f"application/protobuf;{PACKAGE}.{name}"

@@ -1,4 +1,4 @@
-"""Where messages go: what publisher and recorder have in common, and how a sink says that it is done for."""
+"""Protocol of the message sinks (publisher and recorder), and the error with which a sink fails."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ EVENTS = "events"
 
 
 class SinkError(RuntimeError):
-    """A sink cannot be opened or cannot go on; the message says why and what is valid.
+    """Error of a sink that cannot be opened or can no longer be used.
 
     Args:
-        code: of the event that reports it, e.g. RECORD_STOPPED.
+        code: Code of the event that reports the error, e.g. RECORD_STOPPED.
+        message: Cause and remedy, one sentence.
     """
 
     def __init__(self, code: str, message: str) -> None:
@@ -22,20 +23,35 @@ class SinkError(RuntimeError):
 
 
 class MessageSink(Protocol):
-    """Takes messages of several keys."""
+    """Receiver of encoded messages with several keys."""
 
     def put(self, key: str, payload: bytes, timestamp: int, cycle: int) -> None:
-        """Take one message.
+        """Store or publish one message.
 
         Args:
-            timestamp: log time [ns].
+            key: Key of the stream.
+            payload: Encoded message.
+            timestamp: Log time [ns].
+            cycle: Cycle number.
 
         Raises:
-            SinkError: nothing more can be taken.
+            SinkError: If the sink can no longer be used.
         """
 
     def begin_run(self, number: int, about: Mapping[str, object]) -> None:
-        """A run begins; raises as `put`."""
+        """Begin a run; all following messages belong to it.
+
+        Args:
+            number: Number of the run in the session, from 0.
+            about: Metadata of the run.
+
+        Raises:
+            SinkError: If the sink can no longer be used.
+        """
 
     def close(self) -> None:
-        """Finish; raises as `put`. A second call does nothing."""
+        """Close the sink; a second call has no effect.
+
+        Raises:
+            SinkError: If the sink could not be closed properly.
+        """

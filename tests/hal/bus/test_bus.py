@@ -563,7 +563,7 @@ def test_a_channel_for_each_bus_in_any_order() -> None:
         ("can0,can1", "must assign a bus to each channel"),
         ("left_leg=can0,can1", "must be BUS=CHANNEL, got 'can1'"),
         ("left_leg=", "must be BUS=CHANNEL"),
-        ("left_arm=can0", "no bus 'left_arm'; the buses are left_leg, right_leg, left_sense, right_sense"),
+        ("left_arm=can0", "must be one of left_leg, right_leg, left_sense, right_sense, got 'left_arm'"),
         ("left_leg=can0,left_leg=can1", "assigns left_leg twice: to can0 and to can1"),
         ("left_leg=can0,right_sense=can1", "no channel for right_leg, left_sense; write left_leg=can0,right_leg=can1"),
     ],
@@ -675,5 +675,5 @@ def test_joined_serves_the_other_channels_when_one_is_full_or_gone(network: Netw
 
 
 def test_joined_needs_a_channel_for_every_bus(network: Network) -> None:
-    with pytest.raises(ValueError, match="buses must have an entry for each of .*; right_leg is missing"):
+    with pytest.raises(ValueError, match="; right_leg is missing"):
         JoinedBus(network, {"left_leg": lockstep_pair()[0]})

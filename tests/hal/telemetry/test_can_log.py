@@ -112,7 +112,7 @@ class TestFormats:
 
     def test_a_file_that_cannot_be_made_is_a_sentence(self, network: atalante_dbc.Network, tmp_path: Path) -> None:
         (tmp_path / "file").touch()
-        with pytest.raises(SinkError, match="cannot be made"):
+        with pytest.raises(SinkError, match="cannot be created"):
             open_log(tmp_path / "file" / "run.log", network)
 
     def test_a_full_disk_is_a_sentence(self, network: atalante_dbc.Network, tmp_path: Path) -> None:
