@@ -1,10 +1,11 @@
-"""The telemetry process as the loop's process sees it: a context manager around two or three rings and a child.
+"""Telemetry as used by the loop's process: a context manager that owns the rings and the telemetry subprocess.
 
-The child is a fresh interpreter (`python -m atalante_hal.telemetry`, see `service`), never a fork, in a process group of
-its own: the terminal's Ctrl-C goes to the loop, which then closes the rings. It may be killed, stopped or starved at any
-time: `write` never waits for it, except in lock-step with a recording or a CAN log, and there not for long. A loop that
-calls `tend` now and then gets a new child for one that died or hangs: same rings, the same endpoint or, if that is taken,
-another one as at the first start, files of its own beside those of the first.
+The subprocess is a new interpreter (`python -m atalante_hal.telemetry`, see `service`), not a fork. It has its own process group,
+so Ctrl-C in the terminal ends only the loop, which then closes the rings. The subprocess may be killed or stopped at any time.
+`write` never waits for it, except in lock-step with a recording or a CAN log, and then at most for the configured patience.
+
+If the loop calls `tend` a few times a second, a subprocess that ended or hangs is replaced. The new one reads the same rings and
+listens on the same endpoint, or on another one if that is taken. It writes new files beside the first ones.
 """
 
 from __future__ import annotations
@@ -33,56 +34,57 @@ from atalante_hal.telemetry.ring import RingWriter
 
 CYCLES_PER_SECOND = 1000
 CYCLE_NS = 1_000_000_000 // CYCLES_PER_SECOND
-#: Between the last record of a run in lock-step and the first of the next [ns], so that a plot shows where one ends.
+#: Gap in log time between two runs in lock-step [ns], so that a plot shows where a run ends.
 RUN_GAP_NS = 1_000_000_000
 
 
-#: A child that takes nothing for so long while there is something [s] hangs; so many are replaced in a session.
+#: Time without progress after which the subprocess counts as hung, while records wait in the ring [s].
 HANGS_AFTER = 2.0
+#: Largest number of restarts in a session.
 RESTARTS = 3
-#: For the child to leave its Zenoh session after it has said what became of its files [s].
-_LAST_WORDS = 2.0
-#: For a child that replaces another to be ready [s].
+#: Time for the subprocess to end its Zenoh session after its summary [s].
+_SESSION_END = 2.0
+#: Time for a replacement subprocess to become ready [s].
 _RESTART = 30.0
 
 
-#: Fields of the configuration that are files.
+#: Fields of the configuration that are paths.
 _PATHS = ("recording", "can_log", "certificate", "private_key", "client_ca", "users")
 
 
 class TelemetryError(RuntimeError):
-    """Telemetry cannot start as asked; the message says why and what is valid."""
+    """Error on starting the telemetry; the message names the cause and the valid values."""
 
 
 @dataclass(frozen=True)
 class TelemetryConfig:
-    """What leaves the robot, and where to."""
+    """Configuration of the telemetry: what is published, recorded and logged, and where."""
 
-    robot: str = "exo"  # one chunk of the Zenoh keys atalante/<robot>/...
-    publish: bool = True  # on Zenoh
+    robot: str = "exo"  # name of the robot in the Zenoh keys atalante/<robot>/...
+    publish: bool = True  # publish on Zenoh
     listen: str | None = None  # Zenoh endpoint; None: first free port from tcp/127.0.0.1:7447 on
-    stream_rate: int = 100  # Hz of robot time, messages of each stream
+    stream_rate: int = 100  # Hz of robot time, published messages of each stream
     loop_rate: int = 10  # Hz of robot time, loop statistics
-    recording: Path | None = None  # MCAP file
-    record_rate: int = 100  # Hz of robot time; 1000 is every cycle
-    can_log: Path | None = None  # every frame, format by suffix
-    lock_step: bool = False  # virtual time; the loop waits for a recorder and a CAN log
-    slots: int = 1024  # records a ring holds: cycles that telemetry may be late
-    patience: float = 5.0  # s, longest wait of the loop for a recorder in lock-step, once
-    certificate: Path | None = None  # these four: see `access.Access`
-    private_key: Path | None = None
-    client_ca: Path | None = None
-    users: Path | None = None
+    recording: Path | None = None  # MCAP file; None: no recording
+    record_rate: int = 100  # Hz of robot time, recorded messages of each stream; 1000: every cycle
+    can_log: Path | None = None  # log of every CAN frame, format by suffix; None: no CAN log
+    lock_step: bool = False  # True: virtual time, and the loop waits for recorder and CAN log
+    slots: int = 1024  # capacity of each ring in records, one a cycle
+    patience: float = 5.0  # s, longest wait of the loop for the recorder in lock-step
+    certificate: Path | None = None  # TLS certificate, see `access.Access`
+    private_key: Path | None = None  # key of the certificate, see `access.Access`
+    client_ca: Path | None = None  # authority of the subscribers' certificates, see `access.Access`
+    users: Path | None = None  # users and passwords, see `access.Access`
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9_-]+", self.robot):
-            raise TelemetryError(f"the robot's name {self.robot!r} is not valid; use letters, digits, - and _")
+            raise TelemetryError(f"robot must be a name of letters, digits, - and _, got {self.robot!r}")
         for name in ("stream_rate", "loop_rate", "record_rate"):
             rate = getattr(self, name)
             if rate < 1 or CYCLES_PER_SECOND % rate:
                 raise TelemetryError(
-                    f"{name.replace('_', ' ')} {rate} Hz is not valid; it must divide {CYCLES_PER_SECOND}, "
-                    "as 1, 10, 50, 100, 200, 250, 500 and 1000 do"
+                    f"{name.replace('_', ' ')} must be a divisor of {CYCLES_PER_SECOND} Hz, such as 10, 50, 100, 200, 250, "
+                    f"500 or 1000, got {rate} Hz"
                 )
         try:
             access = self.access
@@ -93,56 +95,63 @@ class TelemetryConfig:
 
     @property
     def access(self) -> Access:
-        """Who may subscribe."""
+        """Return the files that restrict access to the endpoint."""
         return Access(self.certificate, self.private_key, self.client_ca, self.users)
 
     def to_json(self) -> dict[str, Any]:
-        """As what `json.dumps` takes."""
+        """Return the configuration as JSON types."""
         return {name: str(value) if isinstance(value, Path) else value for name, value in asdict(self).items()}
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> TelemetryConfig:
-        """The inverse of `to_json`."""
+        """Create a configuration from the values that `to_json` returned.
+
+        Args:
+            values: Value of each field, as JSON types.
+
+        Returns:
+            The configuration.
+        """
         paths = {name: Path(values[name]) for name in _PATHS if values[name] is not None}
         return cls(**{**values, **paths})
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What became of the recording of a session."""
+    """Result of the recording of a session."""
 
-    files: tuple[str, ...]  # names, in order: one of the first child and one of each child that replaced another
-    complete: bool  # one file with its index, and no cycle is missing
-    missing_cycles: int  # of the loop, in no file; at 100 Hz the cycles between two messages belong to the second one
+    files: tuple[str, ...]  # file names in order; each restart of the subprocess begins a new file
+    complete: bool  # True: one file with its index and without missing cycles
+    missing_cycles: int  # cycles in no file; at 100 Hz the cycles between two messages count with the second message
 
 
 @dataclass(frozen=True)
 class TelemetrySummary:
-    """What became of a session; `complete` is False when a child died and could not say."""
+    """Result of a telemetry session."""
 
-    complete: bool = False
+    complete: bool = False  # False: a subprocess ended without its summary, so the numbers are incomplete
     published: int = 0  # messages
     recorded: int = 0  # messages
     frames_logged: int = 0
-    lost: int = 0  # cycles that telemetry did not see
-    frames_lost: int = 0  # records of the frame ring, one a cycle
-    restarts: int = 0  # children that died or hung and were replaced
-    notices: tuple[str, ...] = field(default=())  # what went wrong, one sentence each
-    recording: Recording | None = None  # None: no recording was asked for
+    lost: int = 0  # cycles that telemetry lost
+    frames_lost: int = 0  # records lost in the ring of CAN frames, about one a cycle
+    restarts: int = 0  # restarts of the subprocess after it ended or hung
+    notices: tuple[str, ...] = field(default=())  # faults of the session, one sentence each
+    recording: Recording | None = None  # None: no recording was requested
 
 
 class TelemetryProcess(Closing):
-    """The telemetry of one session: rings to write, and the child that empties them.
+    """Telemetry of one session: the rings, which the loop writes, and the subprocess, which reads them.
 
-    Use it as a context manager around every run of the session, or call `start` and `close`.
+    Use it as a context manager around all runs of the session, or call `start` and `close`.
 
     Args:
-        config: what leaves, and where to.
-        layout: of the records that `write` gets.
-        bus_of: frame id -> network bus, for the CAN log.
-        buses: network buses in the order of the DBC, for the CAN log.
-        diagnostics: names of the bits of the field "diagnostics", lowest first.
-        about: metadata of the recording (hashes, versions, seed).
+        config: Configuration of the telemetry.
+        layout: Layout of the records passed to `write`.
+        bus_of: Bus of each frame identifier, for the CAN log.
+        buses: Buses of the network in the order of the DBC, for the CAN log.
+        diagnostics: Names of the bits of the field "diagnostics", lowest bit first.
+        about: Metadata of the recording (hashes, versions, seed).
     """
 
     def __init__(
@@ -156,19 +165,19 @@ class TelemetryProcess(Closing):
         about: Mapping[str, object] | None = None,
     ) -> None:
         self.config, self.layout = config, layout
-        self.endpoint: str | None = None  # where subscribers connect, once started; a restart may change it
-        self.notices: tuple[str, ...] = ()  # of the start, one sentence each
+        self.endpoint: str | None = None  # endpoint for subscribers after the start; a restart may change it
+        self.notices: tuple[str, ...] = ()  # faults of the start, one sentence each
         self._start_ns = 0 if config.lock_step else time.time_ns()
         self._runs = 0
         self._closed = False
         self._tap: RingTap | None = None
         self._child: subprocess.Popen[bytes] | None = None
         self._restarts = 0
-        self._mishaps: list[str] = []  # of children, one sentence each
-        self._recordings: list[str] = []  # names of the files that were begun
-        self._last_endpoint: str | None = None  # not None once something was published
+        self._mishaps: list[str] = []  # faults of subprocesses, one sentence each
+        self._recordings: list[str] = []  # names of the files begun so far
+        self._last_endpoint: str | None = None  # last endpoint in use; None: nothing was published so far
         self._restarting: threading.Thread | None = None
-        self._progress = (0, 0.0)  # records taken when `tend` looked, and since when [s]
+        self._progress = (0, 0.0)  # number of records read at the last progress, and its time [s]
         meta = {
             "layout": layout.to_json(),
             "diagnostics": list(diagnostics),
@@ -183,7 +192,8 @@ class TelemetryProcess(Closing):
             patience=config.patience,
             meta=meta,
         )
-        #: One cycle: copies its record, shape (layout.size,), into the ring. About 1 us, less with a memoryview of it made once.
+        #: Function that copies the record of a cycle, shape (layout.size,), to the ring. It takes about 1 us; a memoryview that
+        #: the caller created once is faster than an array.
         self.write = self.records.write
         self.events = RingWriter(EVENT_BYTES, EVENT_SLOTS)
         self.frames: RingWriter | None = None
@@ -194,19 +204,33 @@ class TelemetryProcess(Closing):
             )
 
     def start(self, timeout: float = 60.0) -> None:
-        """Start the child and wait until it has opened its files and its session.
+        """Start the subprocess and wait until it has opened its files and its Zenoh session.
+
+        Args:
+            timeout: Longest wait [s].
 
         Raises:
-            TelemetryError: a file or an endpoint that was asked for cannot be had, or the child was not ready in time [s].
+            TelemetryError: If a requested file or endpoint cannot be opened, or the subprocess is not ready in time.
         """
         try:
             self.notices = self._launch(self.config, timeout)
-        except BaseException:  # Ctrl-C while it waits, too
+        except BaseException:  # also after Ctrl-C during the wait
             self.close(0.0)
             raise
 
     def _launch(self, config: TelemetryConfig, timeout: float) -> tuple[str, ...]:
-        """Start a child and wait until it is ready; return its notices, one sentence each. Raises as `start`."""
+        """Start a subprocess and wait until it is ready.
+
+        Args:
+            config: Configuration of this subprocess.
+            timeout: Longest wait [s].
+
+        Returns:
+            Notices of the subprocess, one sentence each.
+
+        Raises:
+            TelemetryError: As `start`.
+        """
         rings = {"records": self.records, "events": self.events, "frames": self.frames}
         fds = {name: ring.fd for name, ring in rings.items() if ring is not None}
         before = {"restarts": self._restarts, "endpoint": self._last_endpoint}
@@ -218,45 +242,44 @@ class TelemetryProcess(Closing):
             pass_fds=tuple(fds.values()),
             process_group=0,
         )
-        told = self._listen(timeout)
-        if told is None:
+        report = self._read_line(timeout)
+        if report is None:
             raise TelemetryError(f"the telemetry process was not ready within {timeout:.0f} s")
-        if "error" in told:
-            raise TelemetryError(told["error"])
-        self.endpoint = told["endpoint"]
+        if "error" in report:
+            raise TelemetryError(report["error"])
+        self.endpoint = report["endpoint"]
         self._last_endpoint = self.endpoint or self._last_endpoint
         if config.recording is not None:
             self._recordings.append(config.recording.name)
-        return tuple(told["notices"])
+        return tuple(report["notices"])
 
     def tend(self) -> None:
-        """Look after the child; call it a few times a second. A dead one, or one that hangs, is replaced in the background.
+        """Check the subprocess, and replace it in the background if it has ended or hangs. Call it a few times a second.
 
-        The replacement goes on reading where the other one stopped, into files with a number. It listens on the endpoint
-        the other one had. If that is taken it does as a first child does, but does not fail: `endpoint` is then another
-        one, or None.
+        The replacement continues to read where the other one stopped, and writes numbered files. It listens on the same endpoint.
+        If that is taken, it uses another one or publishes nothing: `endpoint` then changes, or is None.
         """
         if self._closed or self._child is None or (self._restarting is not None and self._restarting.is_alive()):
             return
-        what = self._ailment(time.monotonic())
-        if not what or self._restarts > RESTARTS:
+        fault = self._fault(time.monotonic())
+        if not fault or self._restarts > RESTARTS:
             return
         self._restarts += 1
         again = self._restarts <= RESTARTS
         last = self.records.last()
         cycle = int(np.frombuffer(last)[self.layout["cycle"]][0]) if last else 0
-        text = f"telemetry {what}; it is {'started again' if again else 'left alone after so many restarts'}"
+        text = f"telemetry {fault}; it is {'restarted' if again else f'not restarted after {RESTARTS} restarts'}"
         self._mishaps.append(text)
         self.event(cycle, "TELEMETRY_DOWN", text, "error", "TELEMETRY", self._restarts)
         if again:
-            # Not in the loop: ending a child and starting another takes longer than a cycle.
+            # In a thread, because ending a subprocess and starting another takes longer than a cycle.
             self._restarting = threading.Thread(target=self._restart, daemon=True)
             self._restarting.start()
 
-    def _ailment(self, now: float) -> str:
-        """What is wrong with the child, empty if nothing."""
+    def _fault(self, now: float) -> str:
+        """Return the fault of the subprocess as a verb phrase; empty if there is none."""
         if not self.alive:
-            return "has died"
+            return "has ended"
         taken = self.records.taken
         if taken != self._progress[0] or taken == self.records.written or not self._progress[1]:
             self._progress = taken, now
@@ -278,17 +301,21 @@ class TelemetryProcess(Closing):
             self._end(self._child, 0.0)
 
     def tap(self, now: Callable[[], int] = time.time_ns, stamps: Callable[[], Stamps] | None = None) -> RingTap:
-        """What the HAL hands its frames to, for the CAN log; one for the session.
+        """Create the frame tap that the HAL uses for the CAN log; a new tap replaces the one before.
 
         Args:
-            now: time [ns] of frames that are sent; in lock-step virtual time since the start of the run.
-            stamps: times [ns] of the frames last received, such as `lambda: bus.stamps`; without it, `now()`.
+            now: Function that returns the time of a sent frame [ns]; in lock-step the virtual time since the start of the run.
+            stamps: Function that returns the times of the frames received last [ns], such as `lambda: bus.stamps`. Without
+                it, received frames also get the time `now()`.
+
+        Returns:
+            Tap for the HAL.
 
         Raises:
-            TelemetryError: the configuration asks for no CAN log.
+            TelemetryError: If the configuration has no CAN log.
         """
         if self.frames is None:
-            raise TelemetryError("there is no CAN log to tap frames for; set can_log in the telemetry configuration")
+            raise TelemetryError("a frame tap needs a CAN log: set can_log in the telemetry configuration")
         if self._tap is not None:
             self._tap.flush()
         self._tap = RingTap(self.frames, now, stamps)
@@ -296,12 +323,13 @@ class TelemetryProcess(Closing):
         return self._tap
 
     def begin_run(self, name: str, about: Mapping[str, object] | None = None) -> None:
-        """A run begins (e.g. a guide shape), its cycle time from 0: what is written from here on belongs to it.
+        """Begin a run, e.g. one guide shape; all following records belong to it.
 
-        Log time goes on: from now on the wall clock, from one second after the last record in lock-step.
+        The cycle time of a run begins at 0. Its log time begins now on the wall clock, or 1 s after the last record in lock-step.
 
         Args:
-            about: metadata of the run (shape, xi, seed).
+            name: Name of the run.
+            about: Metadata of the run (shape, xi, seed).
         """
         if not self.config.lock_step:
             self._start_ns = time.time_ns()
@@ -316,23 +344,38 @@ class TelemetryProcess(Closing):
     def event(
         self, cycle: int, code: str, text: str, severity: str = "info", node: str = "HAL", value: float = 0.0
     ) -> None:
-        """Something happened: published and recorded at once, see `events.Event`."""
+        """Publish and record an event.
+
+        Args:
+            cycle: Cycle number.
+            code: Code of the event, such as the name of a diagnostic.
+            text: One sentence.
+            severity: Severity, one of `events.SEVERITIES`.
+            node: DBC name of the node, or HAL.
+            value: Measured value; its meaning depends on the code.
+        """
         self.events.write(pack(Event(cycle, code, text, severity, node, value), max(0, self._runs - 1)))
 
     @property
     def alive(self) -> bool:
-        """Whether the child runs (or is stopped). One system call: not for every cycle."""
+        """Return whether the subprocess exists, running or stopped. It costs a system call: do not call it every cycle."""
         return self._child is not None and self._child.poll() is None
 
     @property
     def lost(self) -> int:
-        """Cycles that telemetry has not seen so far."""
+        """Return the number of cycles that telemetry has lost so far."""
         return self.records.lost
 
     def close(self, timeout: float = 10.0) -> TelemetrySummary:
-        """Let the child finish its files, then end it, by force after `timeout` [s]; does not raise for what it died of.
+        """Let the subprocess close its files, then end it and release the rings.
 
-        The rings go with it: nothing can be written afterwards. A second call does nothing.
+        Nothing can be written afterwards. A second call has no effect. A failed subprocess raises no exception here.
+
+        Args:
+            timeout: Time after which the subprocess is killed [s].
+
+        Returns:
+            Result of the session.
         """
         if self._closed:
             return TelemetrySummary()
@@ -340,33 +383,36 @@ class TelemetryProcess(Closing):
         if self._restarting is not None:
             self._restarting.join()
         rings = [ring for ring in (self.frames, self.events, self.records) if ring is not None]
-        told: dict[str, Any] | None = None
+        report: dict[str, Any] | None = None
         if self._tap is not None:
             self._tap.flush()
         for ring in rings:
             ring.finish()
         if self._child is not None:
-            told = self._listen(timeout)
-            self._end(self._child, _LAST_WORDS if told is not None else 0.0)
+            report = self._read_line(timeout)
+            self._end(self._child, _SESSION_END if report is not None else 0.0)
             self._child = None
-        summary = self._summary(told if told is not None and "error" not in told else None)
+        summary = self._summary(report if report is not None and "error" not in report else None)
         for ring in rings:
             ring.close()
         return summary
 
-    def _summary(self, told: Mapping[str, Any] | None) -> TelemetrySummary:
-        """Sum up the session when no child is left.
+    def _summary(self, report: Mapping[str, Any] | None) -> TelemetrySummary:
+        """Summarise the session after its last subprocess has ended.
 
         Args:
-            told: the last line of the child that ended by itself; None when there is none.
+            report: Last line of the last subprocess; None if it ended without one.
+
+        Returns:
+            Result of the session.
         """
-        facts = {"lost": self.records.lost, "notices": (), "finished": False, **(told or {})}
+        facts = {"lost": self.records.lost, "notices": (), "finished": False, **(report or {})}
         finished = facts.pop("finished") and not self._restarts
         notices = tuple(dict.fromkeys((*self._mishaps, *facts.pop("notices"))))
         missing = self.records.written - self.records.kept
         recording = Recording(tuple(self._recordings), finished and not missing, missing)
         return TelemetrySummary(
-            complete=told is not None and not self._restarts,
+            complete=report is not None and not self._restarts,
             restarts=self._restarts,
             notices=notices,
             recording=recording if self.config.recording is not None else None,
@@ -383,8 +429,8 @@ class TelemetryProcess(Closing):
         assert child.stdout is not None
         child.stdout.close()
 
-    def _listen(self, timeout: float) -> dict[str, Any] | None:
-        """The next line of the child as JSON; None when it says nothing within `timeout` [s] or is gone."""
+    def _read_line(self, timeout: float) -> dict[str, Any] | None:
+        """Return the next JSON line of the subprocess; None if none arrives within `timeout` [s] or it has ended."""
         assert self._child is not None
         assert self._child.stdout is not None
         if self._child.stdout.closed:
@@ -400,8 +446,8 @@ class TelemetryProcess(Closing):
                 if not read:
                     return None
                 line += read
-        told: dict[str, Any] = json.loads(line)
-        return told
+        report: dict[str, Any] = json.loads(line)
+        return report
 
     def __enter__(self) -> Self:
         self.start()
@@ -409,7 +455,7 @@ class TelemetryProcess(Closing):
 
 
 def _numbered(path: Path | None, number: int) -> Path | None:
-    """The file beside `path` of the child of that number: recording.mcap, recording-1.mcap."""
+    """Return the file of the subprocess with a given number: recording-1.mcap beside recording.mcap."""
     if path is None:
         return None
     stem, dot, suffixes = path.name.partition(".")

@@ -261,7 +261,7 @@ class Child:
     ("notices", "complete", "said"),
     [
         ((*Child.notices, "the recording stopped: disk full"), True, "the recording stopped: disk full\n"),
-        (("telemetry hangs; it is started again",), False, "telemetry hangs; it is started again\n"),
+        (("telemetry hangs; it is restarted",), False, "telemetry hangs; it is restarted\n"),
         ((), False, "the telemetry process ended unexpectedly: the recording may be truncated\n"),
         ((), True, ""),
     ],
