@@ -1,8 +1,8 @@
-"""Zenoh: the one place where telemetry meets a network socket. Telemetry leaves here, nothing enters.
+"""Zenoh publisher: the only module of the telemetry with a network socket, and only for output.
 
-A peer that scouts nobody, gossips nothing and listens on the loopback; subscribers connect to it. Access control denies
-everything but the way out of our own keys, and nothing in this process subscribes. Streams are dropped for whoever cannot
-keep up; events are cached for late subscribers and their loss is noticed (advanced publisher).
+The session is a Zenoh peer without scouting and gossip. By default it listens on the loopback, and subscribers connect to it.
+Access control permits only the output of our own keys, and nothing in this process subscribes. Messages of a stream are dropped
+for a slow subscriber. Events are cached for late subscribers, which can also detect lost events (advanced publisher).
 
 Keys are `atalante/<robot>/<stream>`, payloads protobuf of `messages.proto`, encodings
 `application/protobuf;atalante.v1.<Message>`.
@@ -25,29 +25,31 @@ from atalante_hal.telemetry.schema import encoding
 from atalante_hal.telemetry.sink import EVENTS, SinkError
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 7447
-#: Ports tried in turn when none is asked for: several demos on one machine must all run.
+#: Number of ports tried in turn if no endpoint is configured, so that several demos can run on one machine.
 PORTS_TRIED = 16
-#: Events that a late subscriber can still ask for.
+#: Number of events cached for late subscribers.
 EVENTS_KEPT = 256
-#: Everybody who reaches the endpoint may listen.
+#: Access without restrictions: every client that reaches the endpoint may subscribe.
 OPEN = Access()
 
 _log = logging.getLogger(__name__)
 
 
 class Publisher(Closing):
-    """A Zenoh session that publishes one key a stream. Use it as a context manager: an unclosed session outlives its process.
+    """Zenoh session that publishes one key for each stream.
+
+    Use it as a context manager, because an open session prevents the end of the process.
 
     Args:
-        robot: name of the robot, one chunk of the keys.
-        streams: (key, message type) of each stream; the events come by themselves.
-        listen: Zenoh endpoint such as tcp/127.0.0.1:7447; None takes the first free port from 7447 on the loopback.
+        robot: Name of the robot, a part of the keys.
+        streams: (key, message type) of each stream; the stream of events is always added.
+        listen: Zenoh endpoint such as tcp/127.0.0.1:7447; None: the first free port of the loopback from 7447 on.
         access: TLS and users.
-        before: endpoint of the publisher that this one replaces, where its subscribers reconnect; tried first when
+        before: Endpoint of the publisher that this one replaces, to which its subscribers reconnect. It is tried first if
             `listen` is None.
 
     Raises:
-        SinkError: the endpoint cannot be listened on.
+        SinkError: If the endpoint cannot be opened.
     """
 
     def __init__(
@@ -84,25 +86,36 @@ class Publisher(Closing):
         )
 
     def put(self, key: str, payload: bytes, timestamp: int, cycle: int) -> None:
-        """Publish a message; never waits for a subscriber, and keeps events for late ones. Times are in the payload.
+        """Publish a message without waiting for a subscriber; events are also cached for late subscribers.
+
+        Args:
+            key: Key of the stream.
+            payload: Encoded message, which contains time and cycle.
+            timestamp: Ignored.
+            cycle: Ignored.
 
         Raises:
-            SinkError: the session has failed.
+            SinkError: If the session has failed.
         """
         try:
             self._publishers[key].put(payload)
         except zenoh.ZError as error:
-            raise SinkError("TELEMETRY_DOWN", f"Zenoh publishes no more: {error}") from error
+            raise SinkError("TELEMETRY_DOWN", f"Zenoh cannot publish: {error}") from error
         self.messages += 1
 
     def begin_run(self, number: int, about: Mapping[str, object]) -> None:
-        """Nothing to do: subscribers see the run in `SystemState`."""
+        """Do nothing, because every `SystemState` message contains the run.
+
+        Args:
+            number: Ignored.
+            about: Ignored.
+        """
 
     def close(self) -> None:
-        """End the session. With a stopped subscriber Zenoh needs ten seconds for it and raises in the end.
+        """End the session. With a stopped subscriber this takes 10 s and fails.
 
         Raises:
-            SinkError: the session could not be ended.
+            SinkError: If Zenoh could not end the session.
         """
         try:
             self._stack.close()
@@ -111,7 +124,15 @@ class Publisher(Closing):
 
 
 def configuration(robot: str, listen: str) -> dict[str, Any]:
-    """Zenoh configuration of the session: who may connect, and that nothing comes in."""
+    """Return the Zenoh configuration of the session, which permits output only.
+
+    Args:
+        robot: Name of the robot, a part of the keys.
+        listen: Zenoh endpoint to listen on.
+
+    Returns:
+        Configuration as JSON types, without the settings of `Access`.
+    """
     own = [f"atalante/{robot}/**", f"atalante/{robot}/**/@adv/**"]  # "**" does not match a chunk that begins with @
     return {
         "mode": "peer",
@@ -122,10 +143,10 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
             "link": {
                 "tx": {
                     "queue": {
-                        # Batches; the default of 2 made a put ten times slower with a subscriber there.
+                        # Number of batches. With the default of 2 and a subscriber, a put took ten times longer.
                         "size": {"real_time": 16},
-                        # What is never dropped (undeclarations, heartbeats) waits this long [us] for a stopped subscriber,
-                        # who is cut off then; by default 5 s.
+                        # Messages that are never dropped (undeclarations, heartbeats) wait this long [us] for a stopped
+                        # subscriber, which is then disconnected; the default is 5 s.
                         "congestion_control": {"block": {"wait_before_close": 100_000}},
                     }
                 }
@@ -143,7 +164,7 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
                     "key_exprs": own,
                 },
                 {
-                    # What a subscriber says to get it: its interest, by whatever wildcard, and the question for cached events.
+                    # Messages of a subscriber: its subscription, with any wildcard, and its query for cached events.
                     "id": "subscribers ask",
                     "permission": "allow",
                     "flows": ["ingress"],
@@ -158,7 +179,7 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
 
 
 def _open(robot: str, listen: str | None, access: Access, before: str | None) -> tuple[zenoh.Session, str]:
-    """A session and the endpoint it listens on."""
+    """Open a session and return it with the endpoint on which it listens."""
     if listen is not None:
         try:
             return zenoh.open(_parsed(robot, listen, access)), listen
@@ -189,6 +210,6 @@ def _parsed(robot: str, listen: str, access: Access) -> zenoh.Config:
 
 
 def _reason(error: zenoh.ZError) -> str:
-    """What the system said, without Zenoh's source places."""
+    """Return the error of the operating system without Zenoh's source positions."""
     text = str(error)
     return "the port is taken" if "os error 98" in text else text.split(" at /")[0]

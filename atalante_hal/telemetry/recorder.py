@@ -1,7 +1,7 @@
-"""MCAP: the recording of a session, with the protobuf schema inside.
+"""MCAP recorder: the recording of a session, with its protobuf schema.
 
-One file holds every run of a session one after the other; log time goes on from run to run, each run has a metadata record
-`run/<number>` with its name and times, and `SystemState` carries the number. Topics are the keys of the streams.
+One file contains all runs of a session in order of log time. Each run has a metadata record `run/<number>` with its name and
+start time, and every `SystemState` message contains the number. The topics are the keys of the streams.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ from atalante_hal.closing import Closing
 from atalante_hal.telemetry.schema import PACKAGE, descriptor_set
 from atalante_hal.telemetry.sink import EVENTS, SinkError
 
-#: What a crash of the telemetry process can cost; about two seconds at 100 Hz.
+#: Size of a chunk [bytes]: the data that a crash of the telemetry process can lose, about 2 s at 100 Hz.
 _CHUNK_BYTES = 1 << 18
 
 
 class Recorder(Closing):
-    """Writes messages into an MCAP file.
+    """Writer of messages to an MCAP file.
 
     Args:
-        path: of the file; its folder is made.
-        streams: (key, message type) of each stream; the events come by themselves.
-        about: metadata of the whole recording, under the name "session".
+        path: Path of the file; missing folders are created.
+        streams: (key, message type) of each stream; the stream of events is always added.
+        about: Metadata of the whole recording, stored under the name "session".
 
     Raises:
-        SinkError: the file cannot be made or written.
+        SinkError: If the file cannot be created or written.
     """
 
     def __init__(self, path: Path, streams: Iterable[tuple[str, str]], about: Mapping[str, object]) -> None:
         self.path = path
         self.messages = 0
-        self.saved = 0  # of `messages`, those that are in the file even if this process is killed
-        self.finished = False  # closed with its index: every message is in the file
+        self.saved = 0  # number of messages that stay in the file even if this process is killed
+        self.finished = False  # True: closed with its index, so every message is in the file
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("wb")
         except OSError as error:
-            raise SinkError("RECORD_STOPPED", f"the recording {path} cannot be made: {error.strerror}") from error
+            raise SinkError("RECORD_STOPPED", f"the recording {path} cannot be created: {error.strerror}") from error
         self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._channels: dict[str, int] = {}
         try:
@@ -59,10 +59,13 @@ class Recorder(Closing):
         """Add a message.
 
         Args:
-            timestamp: log time [ns].
+            key: Key of the stream.
+            payload: Encoded message.
+            timestamp: Log time [ns].
+            cycle: Cycle number; its lower 32 bits are stored as sequence number.
 
         Raises:
-            SinkError: the disk is full or gone; the recorder is closed then, and refuses every further message.
+            SinkError: If the file cannot be written. The recorder is then closed and rejects further messages.
         """
         if self._file.closed:
             raise SinkError("RECORD_STOPPED", f"the recording {self.path} is closed")
@@ -76,7 +79,15 @@ class Recorder(Closing):
             raise self._failed(error) from error
 
     def begin_run(self, number: int, about: Mapping[str, object]) -> None:
-        """Note that a run begins; raises as `put`."""
+        """Write the metadata record of a run that begins.
+
+        Args:
+            number: Number of the run in the session, from 0.
+            about: Metadata of the run.
+
+        Raises:
+            SinkError: If the file cannot be written.
+        """
         try:
             self._writer.add_metadata(f"run/{number}", _texts(about))
             self._length = self._file.tell()
@@ -84,10 +95,10 @@ class Recorder(Closing):
             raise self._failed(error) from error
 
     def close(self) -> None:
-        """Write index and statistics, close the file.
+        """Write index and statistics, and close the file.
 
         Raises:
-            SinkError: the disk is full; readers then scan the file instead of using its index.
+            SinkError: If the disk is full. Readers then scan the file, because it has no index.
         """
         if self._file.closed:
             return
@@ -99,11 +110,11 @@ class Recorder(Closing):
         self.saved, self.finished = self.messages, True
 
     def _failed(self, error: OSError) -> SinkError:
-        with contextlib.suppress(OSError):  # what the buffer still holds does not fit either
+        with contextlib.suppress(OSError):  # the buffered rest cannot be written either
             self._file.close()
         return SinkError("RECORD_STOPPED", f"the recording {self.path} stopped: {error.strerror}")
 
 
 def _texts(about: Mapping[str, object]) -> dict[str, str]:
-    """MCAP metadata is text to text."""
+    """Convert metadata to texts, as MCAP requires."""
     return {name: str(value) for name, value in about.items()}

@@ -1,16 +1,16 @@
 """Shared-memory ring: the loop's process writes fixed-size records, the telemetry process reads them.
 
-One writer, one reader, no lock, no system call in `write`: one copy, then one integer store that says so. The slot after the
-newest record counts as being written at any time. So a reader that copies a batch and then looks at the count again knows
-which of its records were overwritten under its hands (a seqlock for the whole batch). This relies on stores being seen in
-program order, as on x86-64; elsewhere a record could be read before its last bytes arrive.
+A ring has one writer and one reader. `write` needs no lock and no system call: it copies the record and then stores the counter
+of written records. The slot after the newest record may be written at any time. So a reader copies a batch, reads the counter
+again and discards the records that were overwritten meanwhile (a seqlock for the whole batch). This requires that stores become
+visible in program order, as on x86-64. On other processors a record could be read before its last bytes arrive.
 
-When the ring is full the oldest record is overwritten and the reader counts the loss. A lossless ring waits for the reader
-instead, in short sleeps, but never for a dead reader and never longer than its patience; then it overwrites like the other.
+When the ring is full, the oldest record is overwritten and the reader counts the loss. A lossless ring waits for the reader
+instead, in short sleeps. If the reader's process has ended, or after its patience, it overwrites like any other ring.
 
-The memory is an anonymous file (memfd): it has no name, so nothing is left in /dev/shm whoever crashes. Its descriptor is
-handed to the reader's process (`pass_fds`). Writer and reader hold one byte each of the file under a POSIX lock, which the
-kernel drops with the process: that is how they notice each other's death, whatever the cause.
+The memory is an anonymous file (memfd). It has no name, so nothing is left in /dev/shm after a crash. Its descriptor is passed
+to the reader's process (`pass_fds`). Writer and reader each hold a POSIX lock on one byte of the file. The kernel releases the
+lock when the process ends, for any cause, so each end can detect the end of the other process.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ _WRITTEN, _CLOSED, _WRITER_PID, _NOTES_LENGTH, _LOSSLESS = range(8, 13)
 _READ, _LOST, _READER_PID, _KEPT = range(16, 20)
 _HEADER_BYTES = 256
 
-_WRITER_BYTE, _READER_BYTE = 0, 1  # of the file, locked while the process lives
-_LOCK_TRIES = 50  # a probe by the other side holds a lock for microseconds
+_WRITER_BYTE, _READER_BYTE = 0, 1  # offsets of the bytes that writer and reader lock until their process ends
+_LOCK_TRIES = 50  # more than one, because a test by the other end holds the lock for some microseconds
 
 _WAIT = 0.0002  # s, one sleep of a lossless writer
 NOTES_BYTES = 1 << 16
 
 
 class RingError(RuntimeError):
-    """The ring cannot be made, opened or written as asked; the message says why."""
+    """Error on creating, opening or writing a ring; the message names the cause."""
 
 
 class _Ring:
-    """The mapped memory and what both ends know of it."""
+    """Mapped memory of a ring, and the header fields that both ends read."""
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
@@ -61,42 +61,42 @@ class _Ring:
 
     @property
     def record_size(self) -> int:
-        """Bytes of a record."""
+        """Return the size of a record [bytes]."""
         return self._header[_RECORD_SIZE]
 
     @property
     def slots(self) -> int:
-        """Places for records; one of them is always being written."""
+        """Return the number of slots for records, one of which is reserved for writing."""
         return self._header[_SLOTS]
 
     @property
     def written(self) -> int:
-        """Records written so far."""
+        """Return the number of records written so far."""
         return self._header[_WRITTEN]
 
     @property
     def lost(self) -> int:
-        """Records the reader has missed so far."""
+        """Return the number of records that were overwritten before they were read."""
         return self._header[_LOST]
 
     @property
     def kept(self) -> int:
-        """Records whose content the readers have saved so far: what a killed reader had not saved is not among them."""
+        """Return the number of records whose content the readers have saved to disk so far."""
         return self._header[_KEPT]
 
     @property
     def lossless(self) -> bool:
-        """Whether the writer waits for the reader when the ring is full."""
+        """Return whether the writer waits for the reader when the ring is full."""
         return bool(self._header[_LOSSLESS])
 
     @property
     def closed(self) -> bool:
-        """Whether the writer has said that nothing more comes."""
+        """Return whether the writer has finished, so that no more records follow."""
         return bool(self._header[_CLOSED])
 
     @property
     def meta(self) -> dict[str, Any]:
-        """What the writer says about the records, as JSON types."""
+        """Return the writer's description of the records, as JSON types."""
         length = self._header[_META_LENGTH]
         found: dict[str, Any] = json.loads(bytes(self._bytes[_HEADER_BYTES : _HEADER_BYTES + length]))
         return found
@@ -106,7 +106,7 @@ class _Ring:
         return _HEADER_BYTES + self._header[_META_LENGTH]
 
     def _lock(self, byte: int) -> bool:
-        """Lock one byte of the file for this process; False when another process holds it."""
+        """Lock one byte of the file for this process; return False if another process holds the lock."""
         for _ in range(_LOCK_TRIES):
             try:
                 fcntl.lockf(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, byte)
@@ -117,7 +117,17 @@ class _Ring:
         return False
 
     def _held(self, byte: int, pid: int) -> bool:
-        """Whether the process that took `byte` is there. Its own locks never stand in a process's way, hence the pid."""
+        """Return whether the process that locked a byte still exists.
+
+        POSIX locks never conflict with locks of the same process, so the process number is compared first.
+
+        Args:
+            byte: Offset of the locked byte.
+            pid: Number of the process that locked it.
+
+        Returns:
+            True if that process exists, running or stopped.
+        """
         if pid == os.getpid():
             return True
         try:
@@ -135,17 +145,17 @@ class _Ring:
 
 
 class RingWriter(_Ring, Closing):
-    """The writing end; makes the memory and owns it.
+    """Writing end of a ring, which creates the memory.
 
     Args:
-        record_size: bytes of a record.
-        slots: places for records; one less can wait for the reader.
-        lossless: wait for the reader when the ring is full.
-        patience: longest such wait [s]; after it the ring overwrites for good.
-        meta: what the reader needs to know, JSON types.
+        record_size: Size of a record [bytes].
+        slots: Number of slots, at least 2; one less can wait for the reader.
+        lossless: True: wait for the reader when the ring is full.
+        patience: Longest such wait [s]. After it the ring is no longer lossless.
+        meta: Description of the records for the reader, as JSON types.
 
     Raises:
-        RingError: a size is not positive.
+        RingError: If a size is too small.
     """
 
     def __init__(
@@ -158,7 +168,7 @@ class RingWriter(_Ring, Closing):
         meta: Mapping[str, Any] | None = None,
     ) -> None:
         if record_size < 1 or slots < 2:
-            raise RingError(f"a ring of {slots} records of {record_size} bytes cannot be; valid are 2 and 1 upwards")
+            raise RingError(f"a ring must have 2 slots and 1 byte a record or more, got {slots} and {record_size}")
         packed = json.dumps(dict(meta or {})).encode()
         stride = -(-record_size // 8) * 8
         data = -(-(_HEADER_BYTES + len(packed) + NOTES_BYTES) // mmap.PAGESIZE) * mmap.PAGESIZE
@@ -174,7 +184,7 @@ class RingWriter(_Ring, Closing):
         self._count = 0
         self._slots = slots
         self._size, self._stride = record_size, stride
-        self._begin = self._place = data  # of the next record in the file [bytes]
+        self._begin = self._offset = data  # offsets of the first slot and of the next record in the file [bytes]
         self._end = data + stride * slots
         self._limit = slots - 1 if lossless else sys.maxsize
 
@@ -182,22 +192,22 @@ class RingWriter(_Ring, Closing):
         """Copy one record into the ring.
 
         Args:
-            record: contiguous buffer of `record_size` bytes.
+            record: Contiguous buffer of `record_size` bytes.
 
         Raises:
-            IndexError: the buffer has another size.
+            IndexError: If the buffer has another size.
         """
         count = self._count
         if count >= self._limit:
             self._wait_for_reader()
-        place = self._place
-        self._map[place : place + self._size] = record  # type: ignore[assignment]
+        offset = self._offset
+        self._map[offset : offset + self._size] = record  # type: ignore[assignment]
         self._header[_WRITTEN] = self._count = count + 1
-        place += self._stride
-        self._place = place if place < self._end else self._begin
+        offset += self._stride
+        self._offset = offset if offset < self._end else self._begin
 
     def _wait_for_reader(self) -> None:
-        """Lossless: come back with room for one record, or with the ring overwriting from here on."""
+        """Wait until there is room for one record; after the patience, stop being lossless."""
         header, oldest = self._header, self._count - self._slots + 1
         give_up = time.monotonic() + self._patience
         while header[_READ] <= oldest:
@@ -209,63 +219,69 @@ class RingWriter(_Ring, Closing):
         self._limit = header[_READ] + self._slots - 1
 
     def last(self) -> bytes:
-        """Bytes of the record written last; empty when there is none."""
+        """Return the bytes of the record written last; empty if there is none."""
         if not self._count:
             return b""
-        place = self._begin + (self._count - 1) % self._slots * self._stride
-        return bytes(self._map[place : place + self._size])
+        offset = self._begin + (self._count - 1) % self._slots * self._stride
+        return bytes(self._map[offset : offset + self._size])
 
     def note(self, note: Mapping[str, Any]) -> None:
-        """Append a remark (JSON types) that the reader gets together with the next record; rare, not for every cycle.
+        """Append a note, which the reader receives with the next record. Notes are for rare facts, not for every cycle.
+
+        Args:
+            note: JSON types.
 
         Raises:
-            RingError: there is no room; all remarks together have 64 KiB.
+            RingError: If there is no room; all notes of a ring together have 64 KiB.
         """
         packed = json.dumps({**note, "from": self._count}).encode() + b"\n"
         used = self._header[_NOTES_LENGTH]
         if used + len(packed) > NOTES_BYTES:
-            raise RingError(f"the ring's {NOTES_BYTES} bytes for remarks are full")
+            raise RingError(f"all notes of a ring must fit into {NOTES_BYTES} bytes, got {used + len(packed)}")
         start = self._notes_start + used
         self._bytes[start : start + len(packed)] = packed
         self._header[_NOTES_LENGTH] = used + len(packed)
 
     @property
     def taken(self) -> int:
-        """Records the reader has dealt with so far."""
+        """Return the number of records that the reader has read or lost so far."""
         return self._header[_READ]
 
     @property
     def reader_alive(self) -> bool:
-        """Whether a reader has attached and its process is there (a stopped process is)."""
+        """Return whether a reader has attached and its process exists, running or stopped."""
         pid = self._header[_READER_PID]
         return pid != 0 and self._held(_READER_BYTE, pid)
 
     def finish(self) -> None:
-        """Tell the reader that nothing more comes."""
+        """Mark the ring as closed for the reader: no more records follow."""
         self._header[_CLOSED] = 1
 
     def close(self) -> None:
-        """Finish and let go of the memory; it is gone when the reader has closed, too."""
+        """Finish and release the memory. The kernel frees it when the reader has also closed."""
         if not self._map.closed:
             self.finish()
             self._release()
 
 
 class RingReader(_Ring, Closing):
-    """The reading end, from a descriptor of the writer's (`RingWriter.fd`, inherited or duplicated); takes it over.
+    """Reading end of a ring.
+
+    Args:
+        fd: Descriptor of the writer (`RingWriter.fd`, inherited or duplicated). The reader takes it over and closes it.
 
     Raises:
-        RingError: the descriptor is no ring of this version, or another process reads it.
+        RingError: If the descriptor is not a ring of this version, or another process reads the ring.
     """
 
     def __init__(self, fd: int) -> None:
         if os.fstat(fd).st_size < _HEADER_BYTES:
-            raise RingError(f"file descriptor {fd} is no telemetry ring")
+            raise RingError(f"file descriptor {fd} is not a telemetry ring")
         super().__init__(fd)
         header = self._header
         if header[_MAGIC] != MAGIC or header[_VERSION] != VERSION:
             self._release()
-            raise RingError(f"file descriptor {fd} is no telemetry ring of version {VERSION}")
+            raise RingError(f"file descriptor {fd} is not a telemetry ring of version {VERSION}")
         if not self._lock(_READER_BYTE):
             self._release()
             raise RingError("another process reads this telemetry ring; a ring has one reader")
@@ -277,10 +293,10 @@ class RingReader(_Ring, Closing):
         self._notes_read = 0
 
     def read(self) -> npt.NDArray[np.uint8]:
-        """Everything written since the last call, oldest first; what was overwritten before or meanwhile is counted as lost.
+        """Read all records written since the last call; records that were overwritten are counted as lost.
 
         Returns:
-            Shape (n, record_size) bytes, n may be 0; a view that the next call reuses.
+            Records, oldest first, shape (n, record_size) bytes; n may be 0. The next call reuses the array.
         """
         header, slots = self._header, len(self._records)
         written = header[_WRITTEN]
@@ -295,22 +311,22 @@ class RingReader(_Ring, Closing):
         return self._batch[intact - first : count, : self.record_size]
 
     def keep(self, records: int) -> None:
-        """Add records to those whose content is saved.
+        """Add to the number of saved records, see `kept`.
 
         Args:
-            records: number of records that `read` returned and that are on the disk since the last call.
+            records: Number of records whose content was saved to disk since the last call.
         """
         self._header[_KEPT] += records
 
     @property
     def position(self) -> int:
-        """Number of the record that the next `read` begins with, when none is lost."""
+        """Return the number of the record with which the next `read` begins if none is lost."""
         return self._next
 
     def notes(self) -> list[dict[str, Any]]:
-        """Remarks written since the last call; "from" is the number of the record that follows a remark.
+        """Return the notes written since the last call; "from" is the number of the record that follows a note.
 
-        Called after `read`, it has every remark that belongs to what was read.
+        Call it after `read` to get every note that belongs to the records read.
         """
         start, length = self._notes_start, self._header[_NOTES_LENGTH]
         packed = bytes(self._bytes[start + self._notes_read : start + length])
@@ -319,11 +335,11 @@ class RingReader(_Ring, Closing):
 
     @property
     def writer_alive(self) -> bool:
-        """Whether the writer's process is there (a stopped process is)."""
+        """Return whether the writer's process exists, running or stopped."""
         return self._held(_WRITER_BYTE, self._header[_WRITER_PID])
 
     def close(self) -> None:
-        """Let go of the memory."""
+        """Release the memory; a second call has no effect."""
         if not self._map.closed:
             del self._records
             self._header[_READER_PID] = 0

@@ -1,9 +1,9 @@
-"""What the telemetry process does: empty the rings, and hand each record to publisher, recorder and CAN log.
+"""Service of the telemetry process: read the rings, and pass the records to publisher, recorder and CAN log.
 
     rings -> records -> messages -> Zenoh, MCAP
           -> frames ---------------> python-can log
 
-A sink that fails is closed and reported as an event; the others go on.
+A sink that fails is removed and reported as an event. The other sinks continue.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ if TYPE_CHECKING:  # these need protobuf and python-can, which a session may do 
     from atalante_hal.telemetry.messages import Encoder
     from atalante_hal.telemetry.recorder import Recorder
 
-_POLL = 0.005  # s, between looks at empty rings
-_LOOK_FOR_WRITER = 0.2  # s, between looks whether the writer lives, while nothing comes
-_DROPPED_EVERY = 1.0  # s, between reports of lost cycles
+_POLL = 0.005  # s, polling period of empty rings
+_WRITER_CHECK = 0.2  # s, shortest time between two checks that the writer's process exists
+_DROPPED_EVERY = 1.0  # s, shortest time between two reports of lost cycles
 
 
 @dataclass(frozen=True)
 class Run:
-    """One run of the session."""
+    """Run of a session, as its note in the ring describes it."""
 
     number: int
     name: str
@@ -44,15 +44,17 @@ class Run:
 
 
 class Service:
-    """Rings in, sinks out.
+    """Loop that reads the rings and writes to the sinks.
 
     Args:
-        records, events, frames: reading ends; `frames` only with a CAN log.
-        encoder: for the layout of the records; None when there is no sink for messages.
-        sinks: each with the number of cycles from one message of a stream to the next.
-        loop_every: cycles from one message of loop statistics to the next.
-        can_log: where the frames go.
-        recorder: the one of `sinks` that writes a file; counts in the ring which records are saved.
+        records: Reader of the ring of cycle records.
+        events: Reader of the ring of events.
+        frames: Reader of the ring of CAN frames; None without a CAN log.
+        encoder: Encoder for the layout of the records; None without a sink for messages.
+        sinks: Each sink with the number of cycles between two messages of a stream.
+        loop_every: Number of cycles between two messages of loop statistics.
+        can_log: Writer of the CAN log; None: none.
+        recorder: The element of `sinks` that writes the recording; its saved records are counted in the ring.
     """
 
     def __init__(
@@ -70,35 +72,40 @@ class Service:
         self._records, self._events, self._frames = records, events, frames
         self._encoder, self._sinks, self._loop_every, self._can_log = encoder, list(sinks), loop_every, can_log
         self._runs = [Run(0, "", records.meta["start_ns"], 0)]
-        self._cycle, self._timestamp = 0, self._runs[0].start_ns  # of the record seen last
+        self._cycle, self._timestamp = 0, self._runs[0].start_ns  # of the last record
         self._lost, self._lost_reported = 0, -math.inf
-        self._recorder, self._saved = recorder, 0  # messages of the recorder that were saved when last looked at
-        self._handled = self._kept = (
-            0  # records whose messages were all put; those of them counted as saved in the ring
-        )
-        self.notices: list[str] = []  # what went wrong, one sentence each
+        self._recorder, self._saved = recorder, 0  # saved messages of the recorder at the last check
+        self._handled = 0  # number of records whose messages were all passed to the sinks
+        self._kept = 0  # number of records counted as saved in the ring
+        self.notices: list[str] = []  # faults, one sentence each
 
     def run(self, stop: Sequence[object]) -> None:
-        """Until the writer closes the rings or is gone, or `stop` is not empty; then once more what is in the rings."""
-        looked = time.monotonic()
+        """Handle records until the writer closes the rings or its process ends, or until a stop is requested.
+
+        At the end the remaining contents of the rings are handled.
+
+        Args:
+            stop: Sequence that becomes non-empty to request the stop.
+        """
+        checked = time.monotonic()
         while not (stop or self._records.closed):
             if self.step():
                 continue
             time.sleep(_POLL)
-            if time.monotonic() - looked > _LOOK_FOR_WRITER:
-                looked = time.monotonic()
+            if time.monotonic() - checked > _WRITER_CHECK:
+                checked = time.monotonic()
                 if not self._records.writer_alive:
                     break
         self.step()
 
     def settle(self) -> None:
-        """Count every record as saved if the recording is finished; call it after the recorder was closed."""
+        """Count every record as saved if the recording is complete. Call it after the recorder was closed."""
         if self._recorder is not None and self._recorder.finished:
             self._keep()
 
     def step(self) -> bool:
-        """Handle everything that is in the rings; whether there was anything."""
-        # Events first: what is said about a run was written before the events in it, and is read after them.
+        """Handle the contents of the rings and return whether there were any."""
+        # Read events first: the note of a run is written before the events in it, so it is certainly there when read after them.
         events = [unpack(bytes(event)) for event in self._events.read()]
         records = self._records.read()
         first = self._records.position - len(records)
@@ -107,7 +114,7 @@ class Service:
             self._handle_records(self._encoder, records.view(np.float64), first)
         for event, number in events:
             run = next(run for run in reversed(self._runs) if run.number == number)
-            self._tell(event, run.start_ns + event.cycle * CYCLE_NS)
+            self._put_event(event, run.start_ns + event.cycle * CYCLE_NS)
         logged = self._frames is not None and self._handle_frames(self._frames.read())
         self._report_lost()
         return bool(len(records) or events or logged)
@@ -123,30 +130,36 @@ class Service:
                 try:
                     sink.begin_run(run.number, about)
                 except SinkError as error:
-                    self._give_up(sink, error)
+                    self._remove(sink, error)
 
     def _run_of(self, record: int) -> Run:
-        """The run of the record of that number."""
+        """Return the run to which the record with a given number belongs."""
         return next((run for run in reversed(self._runs) if run.first <= record), self._runs[0])
 
     def _handle_records(self, encoder: Encoder, records: npt.NDArray[np.float64], first: int) -> None:
-        """Records of consecutive numbers from `first` on. Shape (n, layout.size)."""
+        """Encode the due records and pass them to the sinks.
+
+        Args:
+            encoder: Encoder for the layout of the records.
+            records: Records with consecutive numbers, shape (n, layout.size).
+            first: Number of the first record.
+        """
         cycles = np.rint(records[:, encoder.cycle_at]).astype(np.int64)
         due = cycles % self._loop_every == 0
         for _, every in self._sinks:
             due |= cycles % every == 0
         window_from, before = 0, self._handled
-        for place in np.flatnonzero(due).tolist():
-            self._handled = before + place
-            cycle, run = int(cycles[place]), self._run_of(first + place)
-            sample = encoder.sample(records[place], cycle, run.start_ns, run.number, run.name)
+        for row in np.flatnonzero(due).tolist():
+            self._handled = before + row
+            cycle, run = int(cycles[row]), self._run_of(first + row)
+            sample = encoder.sample(records[row], cycle, run.start_ns, run.number, run.name)
             sinks = [sink for sink, every in self._sinks if cycle % every == 0]
             if sinks:
                 for stream in encoder.streams:
                     self._put(sinks, stream.key, stream.encode(sample), sample.timestamp, cycle)
             if cycle % self._loop_every == 0:
-                encoder.window.add(records[window_from : place + 1])
-                window_from = place + 1
+                encoder.window.add(records[window_from : row + 1])
+                window_from = row + 1
                 payload = encoder.window.encode(sample, self._records.lost)
                 self._put([sink for sink, _ in self._sinks], encoder.window.key, payload, sample.timestamp, cycle)
         self._handled = before + len(records)
@@ -155,7 +168,7 @@ class Service:
         self._timestamp = self._run_of(first + len(records) - 1).start_ns + round(records[-1, encoder.time_at] * 1e9)
 
     def _handle_frames(self, records: npt.NDArray[np.uint8]) -> bool:
-        """Records of the frame ring; whether there were any."""
+        """Write records of the frame ring to the CAN log and return whether there were any."""
         if self._can_log is None or not len(records):
             return False
         try:
@@ -173,28 +186,35 @@ class Service:
             try:
                 sink.put(key, payload, timestamp, cycle)
             except SinkError as error:
-                self._give_up(sink, error)
+                self._remove(sink, error)
         if self._recorder is not None and self._recorder.saved != self._saved:
             self._saved = self._recorder.saved
             self._keep()
 
     def _keep(self) -> None:
-        """Count the records handled so far as saved."""
+        """Count the records handled so far as saved in the ring."""
         self._records.keep(self._handled - self._kept)
         self._kept = self._handled
 
-    def _give_up(self, failed: MessageSink, error: SinkError) -> None:
-        """Go on without a sink."""
+    def _remove(self, failed: MessageSink, error: SinkError) -> None:
+        """Remove a failed sink and report its error."""
         if any(sink is failed for sink, _ in self._sinks):
             self._sinks = [(sink, every) for sink, every in self._sinks if sink is not failed]
             self.report(error.code, str(error), "error")
 
     def report(self, code: str, text: str, severity: str, value: float = 0.0) -> None:
-        """An event of the telemetry process itself, which is also a notice at the end."""
-        self.notices.append(text)
-        self._tell(Event(self._cycle, code, text, severity, "TELEMETRY", value), self._timestamp)
+        """Publish and record an event of the telemetry process, and add its text to the notices.
 
-    def _tell(self, event: Event, timestamp: int) -> None:
+        Args:
+            code: Code of the event.
+            text: One sentence.
+            severity: Severity, one of `events.SEVERITIES`.
+            value: Measured value; its meaning depends on the code.
+        """
+        self.notices.append(text)
+        self._put_event(Event(self._cycle, code, text, severity, "TELEMETRY", value), self._timestamp)
+
+    def _put_event(self, event: Event, timestamp: int) -> None:
         if self._encoder is not None:
             payload = self._encoder.event(event, timestamp)
             self._put([sink for sink, _ in self._sinks], EVENTS, payload, timestamp, event.cycle)
@@ -202,6 +222,6 @@ class Service:
     def _report_lost(self) -> None:
         lost = self._records.lost
         if lost > self._lost and time.monotonic() - self._lost_reported > _DROPPED_EVERY:
-            text = f"telemetry did not see {lost - self._lost} cycles, they came faster than it could read"
+            text = f"telemetry lost {lost - self._lost} cycles, because it read more slowly than the loop wrote"
             self._lost, self._lost_reported = lost, time.monotonic()
             self.report("TELEMETRY_DROPPED", text, "warning", float(lost))

@@ -110,7 +110,7 @@ def test_a_full_disk_stops_the_recording_with_a_sentence(tmp_path: Path) -> None
 
 def test_a_file_that_cannot_be_made_is_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(SinkError, match="cannot be made: File exists"):
+    with pytest.raises(SinkError, match="cannot be created: File exists"):
         Recorder(tmp_path / "file" / "recording.mcap", STREAMS, {})
     with pytest.raises(SinkError, match="stopped: No space left on device"):
         Recorder(Path("/dev/full"), STREAMS, {})
