@@ -205,7 +205,7 @@ class Hal:
         return self._send_command()
 
     def _follow_drives(self) -> None:
-        """Set the commanded torque to the torque with which each drive holds now.
+        """Set the commanded torques to the present torques of the drives.
 
         From the second cycle on all limits apply. A drive that is off produces no torque, so its command is 0.
         """

@@ -67,8 +67,9 @@ class Pendant:
         indices = [codec.index("PENDANT_STATE", name) for name in _SIGNALS]
         assert indices == list(range(indices[0], indices[0] + len(indices)))
         self._slice = slice(indices[0], indices[-1] + 1)
-        #: Signal values as received. `hear` must be called when their bytes differ from `heard`, the bytes handled last.
+        #: Signal values as received, a view of the process image.
         self.signals = image.values[self._slice]
+        #: Bytes of `signals` at the last call of `hear`; a change of `signals` requires another call.
         self.heard = b""
         self.dead_man = False
         self.stop_requested = False
@@ -77,9 +78,7 @@ class Pendant:
         #: Assistance factor Xi in [0, 1]; None: the pendant sets none.
         self.assistance_factor: float | None = None
         self._press: float | None = None  # RequestCounter of the last cycle
-        self._pressed = (
-            False  # stored START: pressed before the pendant was qualified, or in a cycle with differing frames
-        )
+        self._pressed = False  # True: a START is stored until the pendant is qualified
 
     def hear(self, present: bool, *, qualifying: bool = False, beside: Sequence[Vector] = ()) -> None:
         """Evaluate the requests of one cycle.

@@ -64,7 +64,9 @@ class Sensors:
     """Tolerances of healthy sensors, see `plausibility`."""
 
     velocity_error: float  # rad/s at the joint, mean error of the reported velocity against the encoder
-    attitude_error: float  # rad, each axis: tibia IMU relative to the pelvis IMU, against the encoders between them
+    attitude_error: (
+        float  # rad, each axis: attitude of a tibia IMU relative to the pelvis IMU, compared with the encoders
+    )
     attitude_change: float  # rad, change of the attitude error within a fraction of a second
     misalignment: float  # rad of additional tolerance for each rad the leg turns meanwhile
     quaternion_error: float  # error of the squared norm of a quaternion against 1

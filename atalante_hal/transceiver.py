@@ -172,7 +172,7 @@ class Transceiver:
         return count
 
     def foreign(self, frames: Frames) -> None:
-        """Report frames that no other node may send to this one: error frames, own messages and unknown messages.
+        """Report received frames that are no messages to this node: error frames, its own messages and unknown messages.
 
         Args:
             frames: Received frames that are not in a process image, shape (n,).

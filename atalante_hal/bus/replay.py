@@ -85,7 +85,7 @@ class ReplayBus:
         return self._next is None
 
     def send(self, frames: Frames) -> None:
-        """Raise `BusError`, because a log cannot be sent to.
+        """Raise `BusError`, because a log is read only.
 
         Args:
             frames: Ignored.

@@ -53,7 +53,7 @@ class RingTap:
         self._used = 0
 
     def begin_run(self, base_ns: int) -> None:
-        """Set the zero of the time stamps of all following frames.
+        """Set the time to which the stamps of all following frames are relative.
 
         Args:
             base_ns: Time of stamp 0 [ns]: 0 on the wall clock, the start of the run in virtual time.
