@@ -81,7 +81,7 @@ class Thresholds:
     supply_low: float  # V at a drive; below it the battery is nearly empty
     supply_under: float  # V at a drive; below it the drives cannot hold much longer
     derated_imbalance: (
-        float  # torque limit of a hot drive, as a share of the same joint's on the other leg; below: no walking
+        float  # smallest ratio of a hot drive's torque limit to that of the same joint on the other leg to walk
     )
     full_assist_ramp: float  # s, time in which FULL_ASSIST ramps the assistance factor from 0 to 1
     position_tolerance: float  # rad beyond a position limit from which a joint is out of its range

@@ -241,7 +241,7 @@ class Transceiver:
         self.quiet = False
 
     def _receive_rest(self, first: int, count: int, expected: set[int], patience: float) -> int:
-        """Wait until every expected message has arrived after the first `first` frames, at most `patience` [s]."""
+        """Wait until every expected message has arrived in `scratch[first:]`, at most `patience` [s]."""
         # If no node has answered so far, receive until the bus is silent, so that no answer is left for the next cycle.
         until_silent = not expected
         unlikely = until_silent or not self._asked

@@ -72,7 +72,7 @@ class Recorder(Closing):
         try:
             self._writer.add_message(self._channels[key], timestamp, payload, timestamp, cycle & 0xFFFFFFFF)
             self.messages += 1
-            if self._file.tell() != self._length:  # the chunk is full and written, with this message
+            if self._file.tell() != self._length:  # the file grew, so the chunk with this message was written
                 self._file.flush()
                 self._length, self.saved = self._file.tell(), self.messages
         except OSError as error:

@@ -207,7 +207,7 @@ class RingWriter(_Ring, Closing):
         self._offset = offset if offset < self._end else self._begin
 
     def _wait_for_reader(self) -> None:
-        """Wait until there is room for one record; after the patience, stop being lossless."""
+        """Wait until there is room for one record; after the patience, let the ring overwrite records from now on."""
         header, oldest = self._header, self._count - self._slots + 1
         give_up = time.monotonic() + self._patience
         while header[_READ] <= oldest:

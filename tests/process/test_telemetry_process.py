@@ -379,7 +379,7 @@ class TestRefusals:
     def test_a_recording_that_cannot_be_made(self, layout: Layout, tmp_path: Path) -> None:
         (tmp_path / "file").touch()
         config = TelemetryConfig(recording=tmp_path / "file" / "r.mcap", publish=False)
-        with pytest.raises(TelemetryError, match="cannot be made"), TelemetryProcess(config, layout):
+        with pytest.raises(TelemetryError, match="cannot be created"), TelemetryProcess(config, layout):
             pass
 
     def test_an_endpoint_that_was_asked_for_and_is_taken(self, layout: Layout) -> None:

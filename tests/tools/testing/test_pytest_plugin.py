@@ -136,7 +136,7 @@ def test_a_log_that_cannot_be_written_does_not_hide_the_failure(run, pytester: p
     pytester.path.joinpath("taken").write_text("a file")
     result = run(FAILS_AND_PASSES, "--can-log-dir", "taken")
     result.assert_outcomes(passed=2, failed=1)
-    result.stdout.fnmatch_lines(["*on purpose*", "*cannot be made*"])
+    result.stdout.fnmatch_lines(["*on purpose*", "*cannot be created*"])
 
 
 # -- buses that are there, and that are not ----------------------------------------------------------------------------
