@@ -207,7 +207,7 @@ class TestTelemetryFile:
         [
             ('lisen = "tcp/127.0.0.1:1"', "lisen is unknown; valid keys are robot, listen, certificate"),
             ("listen = 7447", "listen must be a text that is not empty, got 7447"),
-            ('users = ""', "users is a text"),
+            ('users = ""', "users must be a text"),
             ('users = "nobody.txt"', "users must be a readable file, got"),
             ('certificate = "robot.pem"', "certificate and private_key must be given together"),
             ('private_key = "robot.key"', "certificate and private_key must be given together"),
