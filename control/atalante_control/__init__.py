@@ -1,1 +1,1 @@
-"""The paper: model, gait, baseline controller, virtual guide, haptics. Knows no CAN."""
+"""Control laws of the paper: model, gait, baseline controller, virtual guide and haptics, independent of CAN."""

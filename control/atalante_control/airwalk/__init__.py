@@ -1,1 +1,1 @@
-"""Walk in the air: the controller, its step kernel and its telemetry."""
+"""Walking suspended in the air: the controller, its compiled kernel and its telemetry."""

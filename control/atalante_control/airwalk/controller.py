@@ -1,23 +1,24 @@
-"""The controller of the paper, for an exoskeleton that hangs by its pelvis: `State -> Command`, once a cycle.
+"""Controller of the paper for an exoskeleton suspended by its pelvis: `State -> Command`, once a cycle.
 
     step switch -> q_des = q_nom + s -> PID, gravity, flat foot -> u_t --------------------------.
                                      -> idealization u_i, feedforward u_f, virtual guide u_v ->  merge -> u
                                      -> haptics
 
-Steps alternate right and left stance and change by time: in the air nothing is hit. The swing leg's SH and SK get the
-assistive torque, every other joint the baseline torque. What the paper leaves open is settled so:
+Steps alternate between right and left stance. They change by time, because no foot touches the ground in the air. SH and SK of
+the swing leg get the assistive torque; every other joint gets the baseline torque. The paper leaves four points open. They are
+decided as follows:
 
-- *Assistance factor.* Xi is taken over at step changes alone, where the state is re-centred and the torque handed over:
-  no guide ever moves under a joint inside a step, so the certificate of each step stays true, whatever the operator does.
-- *Xi towards 1.* The assisted joints get w u_t + (1 - w) (u_i + u_f + u_v), with w a smoothstep from 0 at Xi = 0.9 to
-  exactly 1 at Xi = 1: there it is the baseline torque to the last bit. Their integrals take the same share w.
+- *Assistance factor.* Xi changes only at a step change, where the state is re-centred and the torque is handed over. The guide
+  therefore never moves during a step, and the certificate of each step stays valid for any input of the operator.
+- *Xi towards 1.* The assisted joints get w u_t + (1 - w) (u_i + u_f + u_v). The weight w is a smoothstep from 0 at Xi = 0.9 to
+  exactly 1 at Xi = 1, where the torque is bitwise equal to the baseline torque. Their integrals are scaled by the same w.
   No guide is certified for Xi between 0.9 and 1.
-- *Gains.* A stiff backup policy holds a narrow guide, and in a wide one asks for more torque than there is. Each step takes
-  the gentlest of a few gains with which its guide is certified, with a margin, at its Xi; the command is continuous in Xi but
-  where they change.
-- *Hand-over.* At a step change the deadbeat takes the tracking error to zero at once, a leg changes from one law to the
-  other, and the horizon jumps back to T. The torque that would jump is carried over and faded out in `blend`: the
-  command is continuous. This is part of the baseline, and the same with and without assistance.
+- *Gains.* A stiff backup policy is needed in a narrow guide, but exceeds the available torque in a wide one. Each step uses the
+  lowest of a few gains with which its guide is certified, with a margin, at its Xi. The command is continuous in Xi except
+  where the gains change.
+- *Hand-over.* At a step change the re-centring sets the tracking error to zero, a leg changes from one control law to the
+  other, and the horizon returns to its full length. The resulting torque step is carried over and faded out within `blend`, so
+  the command is continuous. This is part of the baseline and is the same with and without assistance.
 """
 
 from __future__ import annotations
@@ -59,62 +60,71 @@ _PELVIS = IMUS.index("pelvis")
 
 @dataclass(frozen=True)
 class AirwalkConfig:
-    """Everything that may be chosen.
+    """Parameters of the airwalk controller.
 
     Raises:
-        ValueError: a number out of range.
+        ValueError: If a parameter is out of range.
     """
 
     gains: PidGains = AIR_GAINS
     friction: Friction = field(default_factory=Friction)
-    alpha: float = 0.4  # of a step, until the deadbeat has met the nominal
+    alpha: float = 0.4  # fraction of the step after which re-centring reaches the nominal trajectory
     guide_rate: Pair = (28.0, 44.0)  # rad/s, natural frequency of the stiffest backup policy on SH and SK
-    gentler: tuple[float, ...] = (0.5, 0.7)  # parts of it to be tried first, rising
-    guide_margin: float = (
-        0.25  # part of the guide that has to be left where it is tightest, for gentler gains to be taken
-    )
-    guide_damping: float = 1.05  # damping ratio; 1 and above is monotone
-    # Nm, u_ext of SH and SK as separate inertias (see `certificate`). In PyBullet, coupling to the other joints, delay and
-    # friction left over came to 14 and 20 Nm in 95 % of the cycles; friction a fifth off, to 43 and 26 Nm.
+    gentler: tuple[float, ...] = (0.5, 0.7)  # fractions of guide_rate tried first, ascending
+    guide_margin: float = 0.25  # smallest certificate margin, as a fraction of the guide, at which lower gains are used
+    guide_damping: float = 1.05  # damping ratio of the backup policy; monotone from 1 on
+    # Nm, bounds of u_ext of SH and SK as separate inertias (see `certificate`). Measured in PyBullet, 95 % of the cycles:
+    # coupling to other joints, delay and residual friction cause 14 and 20 Nm; a friction error of 20 % causes 43 and 26 Nm.
     disturbance: tuple[Pair, Pair] = ((-30.0, 30.0), (-20.0, 20.0))
     points: int = 100  # intervals of the horizon grid
-    overlap: float = 0.1  # s, horizon past the step's end
+    overlap: float = 0.1  # s, length of the horizon after the end of the step
     zeta: float = 0.01  # s, derivative gain of the guide
     hand_over: HandOver = field(default_factory=HandOver)
-    decoupled: bool = True  # SH and SK through their common mass matrix; False: u_v on its own joint, as printed
-    feedforward: bool = False  # u_f of the gait on the assisted joints; off in the air
-    flat_foot: bool = True
-    ankle_offset: float = math.radians(1.0)  # rad, on both sagittal ankles
-    fade: float = 0.9  # Xi from which the baseline takes over
-    startup: float = 2.0  # s, from the measured pose to the gait's first
-    blend: float = 0.03  # s, in which a torque step at the step change fades out
-    active: float = 0.05  # gate above which the filter counts as acting
+    decoupled: bool = (
+        True  # convert u_v through the mass matrix of SH and SK; False: apply u_v directly, as in the paper
+    )
+    feedforward: bool = False  # apply u_f of the gait to the assisted joints; off in the air
+    flat_foot: bool = True  # hold the swing sole level
+    ankle_offset: float = math.radians(1.0)  # rad, added to both sagittal ankles
+    fade: float = 0.9  # Xi above which the baseline is blended in
+    startup: float = 2.0  # s, duration of the motion from the measured pose to the first pose of the gait
+    blend: float = 0.03  # s, time in which a torque step at the step change fades out
+    active: float = 0.05  # gate above which the filter counts as active
 
     def __post_init__(self) -> None:
         for name in ("startup", "blend"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= PERIOD):
-                raise ValueError(f"{name} is at least one cycle ({PERIOD} s), not {getattr(self, name)!r}")
+                raise ValueError(f"{name} must be at least one cycle ({PERIOD} s), got {getattr(self, name)!r}")
         if not 0.0 <= self.fade < 1.0:
-            raise ValueError(f"fade is an assistance factor in [0, 1), not {self.fade!r}")
+            raise ValueError(f"fade must be an assistance factor in [0, 1), got {self.fade!r}")
         if not (min(self.guide_rate) > 0.0 and self.guide_damping > 0.0):
-            raise ValueError("guide_rate and guide_damping are positive")
+            raise ValueError(
+                f"guide_rate and guide_damping must be positive, got {self.guide_rate!r} and {self.guide_damping!r}"
+            )
         if list(self.gentler) != sorted(self.gentler) or not all(0.0 < part < 1.0 for part in self.gentler):
-            raise ValueError(f"gentler are parts of guide_rate between 0 and 1, rising, not {self.gentler!r}")
+            raise ValueError(f"gentler must be ascending fractions of guide_rate in (0, 1), got {self.gentler!r}")
 
 
 def baseline_share(xi: float, fade: float) -> float:
-    """w(Xi): 0 up to `fade`, smoothstep to exactly 1 at Xi = 1."""
+    """Return the weight w(Xi) of the baseline torque: 0 up to `fade`, then a smoothstep to exactly 1 at Xi = 1.
+
+    Args:
+        xi: assistance factor in [0, 1].
+        fade: `AirwalkConfig.fade`, in [0, 1).
+    """
     x = (xi - fade) / (1.0 - fade)
     return 0.0 if x <= 0.0 else 1.0 if x >= 1.0 else x * x * (3.0 - 2.0 * x)
 
 
 class AirwalkController:
-    """The controller. It implements `atalante_hal.types.Controller`.
+    """Airwalk controller. It implements `atalante_hal.types.Controller`.
 
     Attributes:
-        guide: the virtual guide filter of this step, one of `guides`, which are the gentlest first.
-        statistics: since `reset`.
-        telemetry, telemetry_fields: for the recording, see `telemetry.TELEMETRY`.
+        guide: virtual guide filter of this step, one of `guides`.
+        guides: guide filters in ascending order of their gains.
+        statistics: statistics of the guide since `reset`.
+        telemetry: telemetry of the last cycle, for the recording.
+        telemetry_fields: name and width of each field of `telemetry`, see `telemetry.TELEMETRY`.
     """
 
     telemetry_fields = tuple((name, TELEMETRY[name].itemsize // 8) for name in TELEMETRY.names or ())
@@ -127,10 +137,17 @@ class AirwalkController:
         config: AirwalkConfig | None = None,
         exoskeleton: ExoskeletonParameters | None = None,
     ) -> None:
-        """Prepare every table; nothing is allocated in the loop.
+        """Prepare every table, so that the control loop allocates no memory.
+
+        Args:
+            robot: limits of the joints.
+            gait: right-stance step that repeats.
+            shape: shape of the virtual guide.
+            config: parameters of the controller; None: the defaults.
+            exoskeleton: geometry and masses of the empty exoskeleton; None: the defaults.
 
         Raises:
-            GaitError: the gait leaves a limit of the robot or cannot be repeated, see `hanging.check_hung`.
+            GaitError: If the gait exceeds a limit of the robot or is not periodic, see `suspended.check_hung`.
         """
         self.config = config = config or AirwalkConfig()
         exoskeleton = exoskeleton or ExoskeletonParameters()
@@ -144,7 +161,7 @@ class AirwalkController:
         gaits = {RIGHT: gait, LEFT: gait.mirrored()}
         tables = {stance: step.tables() for stance, step in gaits.items()}
         ankles = [_SA, _LEG + _SA]
-        #: Rows (q_nom, q_nom') of a step; the working copy gets the deadbeat.
+        #: Rows (q_nom, q_nom') of a step; re-centring is added to the copy in `_reference`.
         self._nominal = {}
         for stance, table in tables.items():
             rows = np.hstack([table.q, table.qd])
@@ -157,7 +174,7 @@ class AirwalkController:
         (c0, c1), (c0d, c1d), _ = self._deadbeat.basis(time)
         self._fading = int(np.searchsorted(time, self._deadbeat.end))
         n = len(JOINTS)
-        self._basis = np.zeros((2, self._fading, 2 * n))  # of s(0) and s'(0): added to the rows
+        self._basis = np.zeros((2, self._fading, 2 * n))  # rows to add per unit of s(0) and of s'(0)
         self._basis[0, :, :n], self._basis[0, :, n:] = c0[: self._fading, None], c0d[: self._fading, None]
         self._basis[1, :, :n], self._basis[1, :, n:] = c1[: self._fading, None], c1d[: self._fading, None]
 
@@ -178,7 +195,7 @@ class AirwalkController:
         ]
         self.guide = self.guides[-1]
         gentler = self.guides[:-1]
-        #: Assistance factor up to which each but the stiffest is taken.
+        #: Largest assistance factor at which each guide is used; the stiffest guide has no entry.
         self._taken_to = [largest_assistance(guide, config.guide_margin, config.hand_over) for guide in gentler]
 
         ramp = np.arange(round(config.blend / PERIOD)) * (PERIOD / config.blend)
@@ -189,16 +206,16 @@ class AirwalkController:
         self._start_pose, self._start_row = np.zeros(n), np.zeros(2 * n)
         self._deviation, self._rate, self._added = np.zeros(2 * n), np.zeros(2 * n), np.zeros_like(self._basis)
         self._command = Command(self._pid.torque, np.zeros(len(MOTORS)))
-        told = np.zeros(1, TELEMETRY)
-        self.telemetry = told.view(np.float64)
+        telemetry = np.zeros(1, TELEMETRY)
+        self.telemetry = telemetry.view(np.float64)
         self._step = np.zeros(1, STEP)
         self._step["cycles"], self._step["acting"] = self._cycles, config.active
         pid, feet, law = self._pid, self._feet, law_of(config.friction, self._inertia, config.decoupled)
-        #: What `kernel.run` works on from `steps` on, but for the guide of the step, which comes last.
+        #: Arguments of `kernel.run` from `steps` on, without the guide tables of the step, which are the last arguments.
         self._kept: tuple[Any, ...] = (
             self._step, feet.ankles, feet.cubics, self._gravity.links, np.zeros(n),
             pid.gains, pid.limit, pid.integral, pid.torque, np.ascontiguousarray(uf), law,
-            self._last, self._carried, self._blend, self._command.vibration, told,
+            self._last, self._carried, self._blend, self._command.vibration, telemetry,
         )  # fmt: skip
         self._run = compiled(run)
         self._tables: tuple[Any, ...] = (*self._kept, *self.guide.tables)
@@ -208,32 +225,43 @@ class AirwalkController:
         self._forget()
 
     def guide_at(self, xi: float) -> GuideFilter:
-        """The guide of the steps at an assistance factor: the gentlest certified there with `guide_margin`, or the stiffest."""
+        """Return the guide of lowest gains that is certified at Xi with `guide_margin`, or else the stiffest guide.
+
+        Args:
+            xi: assistance factor in [0, 1].
+        """
         return next(
             (guide for guide, to in zip(self.guides, self._taken_to, strict=False) if xi <= to), self.guides[-1]
         )
 
     def certificate(self, xi: float) -> Certificate:
-        """Return what the filter of the steps at an assistance factor is built for, and whether its guide is certified.
+        """Return the certificate of the guide used at an assistance factor.
 
-        It is not where the certificate's law is not the one that runs: while the baseline fades in, at Xi = 1 and with
-        `AirwalkConfig.decoupled` off.
+        The guide is not certified where the running control law differs from the certified one: while the baseline fades in,
+        at Xi = 1, and with `AirwalkConfig.decoupled` off.
+
+        Args:
+            xi: assistance factor in [0, 1].
         """
         config = self.config
         certificate = certify(self.guide_at(xi), xi, config.hand_over, self._inertia)
         share = baseline_share(xi, config.fade)
         if share == 1.0:
-            reason = "at Xi = 1 the baseline controller drives every joint alone"
+            reason = "at Xi = 1 only the baseline controller drives the joints"
         elif share > 0.0:
-            reason = f"fade: between Xi {config.fade:g} and 1 the baseline is blended in, which the certificate does not cover"
+            reason = f"fade: the certificate does not cover Xi {config.fade:g} to 1, where the baseline is blended in"
         elif not config.decoupled:
-            reason = "hip and knee are coupled (decoupled=False), and the certificate is that of separate inertias"
+            reason = "the certificate holds for separate inertias, but hip and knee are coupled (decoupled=False)"
         else:
             return certificate
         return replace(certificate, certified=False, reason=reason, joint_torque=None)
 
     def reset(self, state: State) -> None:
-        """Start from where the joints are, and from the torque they have."""
+        """Restart the motion from the measured pose and torque of the joints.
+
+        Args:
+            state: measured state of the robot.
+        """
         self._forget()
         self._changed_at = state.cycle
         self._start_pose[:] = state.position
@@ -254,7 +282,10 @@ class AirwalkController:
         self.statistics = AirwalkStatistics()
 
     def _guide_configs(self, robot: Robot, q: Vector) -> Iterator[GuideConfig]:
-        """Backup gains, gentlest first, for the inertia the swing leg shows along the step, and the torque left for them."""
+        """Yield the configuration of each guide, lowest gains first.
+
+        The gains follow from the inertia of the swing leg along the step. The torque limit is what gravity and friction leave.
+        """
         config = self.config
         level = (1.0, 0.0, 0.0, 0.0)
         weight = np.array([np.abs(self._gravity.torque(pose, level)) for pose in q[::20].copy()]).max(axis=0)
@@ -269,9 +300,10 @@ class AirwalkController:
             yield GuideConfig((hip, knee), config.disturbance, config.points, config.overlap, config.zeta)
 
     def _ideal_feedforward(self, gait: Gait) -> Vector | None:
-        """u_f of the swing leg's SH and SK, meant for the separate inertias: Bezier control points (2, 8) [Nm].
+        """Return u_f of SH and SK of the swing leg for the separate inertias: Bezier control points (2, 8) [Nm].
 
-        The gait's own is meant for the coupled pair: it is taken through the mass matrix along the nominal and fitted.
+        The feedforward of the gait applies to the coupled pair. It is converted with the mass matrix along the nominal
+        trajectory and fitted again.
         """
         swing = [_SH, _SK]
         if gait.feedforward is None or not self.config.decoupled:
@@ -288,7 +320,14 @@ class AirwalkController:
     # -- one cycle ---------------------------------------------------------------------------------------------------
 
     def update(self, state: State) -> Command:
-        """One cycle: the step switch, then everything else in machine code (`kernel.run`)."""
+        """Compute the command of one cycle: the step switch, then the compiled kernel (`kernel.run`).
+
+        Args:
+            state: measured state of the robot.
+
+        Returns:
+            The command, overwritten by the next call.
+        """
         cycle = state.cycle - self._changed_at
         if self._walking:
             if step_over(cycle, self._cycles):
@@ -314,14 +353,14 @@ class AirwalkController:
         return self._command
 
     def _move_to_start(self, state: State, cycle: int) -> Command:
-        """Quintic from rest at the pose of `reset` to the gait's first pose and speed, by the baseline alone."""
+        """Move along a quintic from rest at the pose of `reset` to the first pose and speed of the gait, baseline only."""
         x, duration = cycle / self._startup_cycles, self.config.startup
         row, n = self._start_row, len(JOINTS)
         first = self._nominal[RIGHT][0]
-        way, speed = first[:n] - self._start_pose, first[n:]
-        row[:n] = self._start_pose + way * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x))
+        gap, speed = first[:n] - self._start_pose, first[n:]
+        row[:n] = self._start_pose + gap * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x))
         row[:n] += speed * (duration * x**3 * (-4.0 + 7.0 * x - 3.0 * x * x))
-        row[n:] = way * (30.0 * x * x * (1.0 - x) ** 2 / duration) + speed * (x * x * (-12.0 + 28.0 * x - 15.0 * x * x))
+        row[n:] = gap * (30.0 * x * x * (1.0 - x) ** 2 / duration) + speed * (x * x * (-12.0 + 28.0 * x - 15.0 * x * x))
         torque = self._pid.update(row, state.position, state.velocity, state.torque_sent)
         torque += self._gravity.torque(state.position, state.imu_quaternion[_PELVIS].tolist())
         hand_over(self._step, cycle, torque, self._last, self._carried, self._blend)

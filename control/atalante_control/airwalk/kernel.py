@@ -1,8 +1,8 @@
-"""A cycle of the controller on the way, as machine code: `row (q_nom + s), state -> u, vibration, telemetry`.
+"""Compiled control cycle within a step: `row (q_nom + s), state -> u, vibration, telemetry`.
 
     flat foot -> PID, gravity -> u_t, virtual guide -> u_v, merge with u_i and u_f -> hand-over -> u, haptics, telemetry
 
-What each part computes, and why, is said where it is written; this is their order and what they pass on.
+This module defines the order of the parts and the data between them. Each part is documented in its own module.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 
-#: What holds for a step.
+#: Record of the values that are constant during a step, and of the pending hand-over.
 STEP = np.dtype(
     [
         ("stance", np.int64),  # 0 left, 1 right
-        ("completed", np.int64),  # right-stance steps before it
-        ("cycles", np.int64),
-        ("xi", np.float64),
-        ("share", np.float64),  # w, of the baseline
-        ("intensity", np.float64),  # of the haptics
-        ("acting", np.float64),  # gate above which the filter counts as acting
-        ("carry", np.bool_),  # the torque is to go on from the last one
+        ("completed", np.int64),  # right-stance steps completed before this step
+        ("cycles", np.int64),  # cycles of a step
+        ("xi", np.float64),  # assistance factor
+        ("share", np.float64),  # w, weight of the baseline torque
+        ("intensity", np.float64),  # factor of the haptic levels
+        ("acting", np.float64),  # gate above which the filter counts as active
+        ("carry", np.bool_),  # true: the next torque must continue from the last one
     ]
 )
 
@@ -70,19 +70,39 @@ def run(
     flow: Vector,
     guide: Vector,
 ) -> tuple[float, float, bool]:
-    """Rewrite torque, vibration and telemetry.
+    """Compute torque, vibration and telemetry of one cycle in place.
 
     Args:
-        cycle: since the step change.
-        level: the tibia's IMU is heard, and the swing foot is to be level.
-        row: q_des, q_des', shape (24,); that of the swing ankle is overwritten.
-        attitudes, gyros: of the IMUs, as in `State`.
-        sent: what the limits left of the last torque, shape (12,) [Nm].
-        steps: shape (1,), of STEP.
-        feedforward: u_f of SH and SK by cycle, meant like u_v.
+        cycle: cycles since the step change.
+        level: whether the tibia IMU is valid and the swing sole must be level.
+        row: q_des [rad], then q_des' [rad/s], shape (24,); the entries of the swing ankle are overwritten.
+        q: measured angles, shape (12,) [rad].
+        qd: measured speeds, shape (12,) [rad/s].
+        attitudes: attitude of each IMU, as in `State`.
+        gyros: angular velocity of each IMU, as in `State`.
+        sent: last torque after the limiter, shape (12,) [Nm].
+        steps: record of the step, shape (1,), dtype STEP; `carry` is cleared.
+        ankles: `LevelFeet.ankles`.
+        cubics: `LevelFeet.cubics`.
+        links: `Gravity.links`, overwritten.
+        gravity: u_g, shape (12,) [Nm], overwritten.
+        gains: `Pid.gains`.
+        integral_limit: `Pid.limit` [Nm].
+        integral: `Pid.integral`, shape (12,) [Nm], updated.
+        torque: PID torque of the last cycle, shape (12,) [Nm]; overwritten with the torque command u.
+        feedforward: u_f of SH and SK for each cycle, shape (n, 2) [Nm], on the same inertias as u_v.
+        law: parameters of `idealization.merge`.
+        last: torque at the step change, shape (12,) [Nm].
+        carried: torque carried over the step change, shape (12,) [Nm].
+        blend: factor of `carried` for each cycle, from 1 to 0.
+        vibration: levels of the motors, shape (8,), overwritten.
+        telemetry: telemetry of the cycle, shape (1,), dtype TELEMETRY, overwritten.
+        joints: `GuideFilter.joints`, updated.
+        flow: `GuideFilter.flow`.
+        guide: `GuideFilter.step`.
 
     Returns:
-        Of SH and SK: the larger |e| / q_bound, the smaller h, whether the filter acts on one.
+        The larger |e| / q_bound of SH and SK, the smaller h of the two, and whether the filter is active on either.
     """
     step = steps[0]
     swing, w = 1 - step["stance"], step["share"]
@@ -110,7 +130,16 @@ def run(
 
 
 def hand_over(steps: Table, cycle: int, torque: Vector, last: Vector, carried: Vector, blend: Vector) -> None:
-    """Carry over what the torque would jump by at a change, and fade it out."""
+    """Carry the torque step at a change over and fade it out, so that the command is continuous.
+
+    Args:
+        steps: record of the step, shape (1,), dtype STEP; `carry` is cleared.
+        cycle: cycles since the change.
+        torque: torque command, shape (12,) [Nm], updated.
+        last: torque before the change, shape (12,) [Nm].
+        carried: torque carried over the change, shape (12,) [Nm], set at the change.
+        blend: factor of `carried` for each cycle, from 1 to 0.
+    """
     step = steps[0]
     if step["carry"]:
         for joint in range(len(torque)):

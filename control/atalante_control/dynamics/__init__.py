@@ -1,1 +1,1 @@
-"""Dynamics of the exoskeleton: gravity, stance and suspension, and the network of gaits."""
+"""Dynamics of the exoskeleton: gravity, on the ground and suspended in the air, and the gait network."""

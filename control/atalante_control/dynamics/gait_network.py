@@ -1,9 +1,9 @@
-"""The gait network: who walks and how, to the twelve trajectories of his step. `Subject -> 12 x 8 control points -> Gait`.
+"""Gait network: from a patient and step parameters to a gait. `Subject -> 12 x 8 control points -> Gait`.
 
-`gait library -> fit (training stack) -> weights in a file -> this module (numpy) -> controller`. A perceptron with tanh
-layers. The rows of its last layer satisfy the linear equation by which the angles of a step continue in the next one
-through the swap of the legs, c_7 = S c_0 with S swap and sign; so every gait it can put out is periodic in them, trained
-well or badly. Speeds jump by what the fit keeps of the impact, under 0.02 rad/s.
+`gait library -> fit (training stack) -> weights in a file -> this module (numpy) -> controller`. The network is a perceptron with
+tanh layers. The rows of its last layer satisfy the linear equation c_7 = S c_0, with S the swap and sign change of the legs. The
+angles at the end of a step are therefore those at the start of the next step, for every input and any quality of the training.
+Speeds jump at the step change by the residual of the fit, less than 0.02 rad/s.
 """
 
 from __future__ import annotations
@@ -27,38 +27,47 @@ Vector = npt.NDArray[np.float64]
 
 FORMAT = "atalante-gait-network/2"
 DEFAULT_NETWORK = Path(__file__).parents[1] / "gaits" / "network.npz"
-#: What the network is told, in this order, and the unit.
+#: Inputs of the network in their order, with units.
 INPUTS = {"mass": "kg", "height": "m", "step_length": "m", "step_duration": "s"}
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
-WIDTH_MAX = 128  # numbers between two layers
-_PERIODICITY_DEFECT = 1e-9  # rad, of the weights of one neuron
-_ANGLE_MAX = 2.0 * np.pi  # rad, of a control point
-_LEG_TOLERANCE = 1e-3  # m, thigh and shank against Winter's, which the network was fitted to
+WIDTH_MAX = 128  # largest number of neurons of a layer
+_PERIODICITY_DEFECT = 1e-9  # rad, largest jump of the angles at the step change for one input of the last layer
+_ANGLE_MAX = 2.0 * np.pi  # rad, largest absolute value of a control point
+_LEG_TOLERANCE = (
+    1e-3  # m, largest deviation of thigh and shank from the lengths of Winter, for which the network was fitted
+)
 
 
 class NetworkError(ValueError):
-    """The file is not a gait network, or the subject is not one it knows; the message says what is valid."""
+    """Error of an invalid network file, or of a subject outside the range of the network. The message gives what is valid."""
 
 
 class Layer(NamedTuple):
-    """y = x W + b."""
+    """Linear layer of the network, y = x W + b."""
 
-    weights: Vector  # (inputs, outputs)
-    bias: Vector  # (outputs,)
+    weights: Vector  # W, (inputs, outputs)
+    bias: Vector  # b, (outputs,)
 
 
 @dataclass(frozen=True)
 class GaitNetwork:
-    """The weights, and the box of parameters they were fitted in."""
+    """Weights of the network, and the range of parameters for which they were fitted."""
 
-    low: Vector  # (4,) of INPUTS
-    high: Vector
-    layers: tuple[Layer, ...]  # tanh after all but the last
-    version: str  # of the code that fitted it
+    low: Vector  # (4,), smallest values of INPUTS
+    high: Vector  # (4,), largest values of INPUTS
+    layers: tuple[Layer, ...]  # with tanh after each layer except the last
+    version: str  # version of the code that fitted the network
 
     def coefficients(self, inputs: Vector) -> Vector:
-        """Bezier control points of a right-stance step, unchecked; a continuous function. (4,) to (12, 8) [rad]."""
+        """Return the Bezier control points of a right-stance step, without checks. The result is continuous in the inputs.
+
+        Args:
+            inputs: values of INPUTS, shape (4,).
+
+        Returns:
+            Control points in the order of JOINTS, shape (12, 8) [rad].
+        """
         x = (inputs - self.low) * (2.0 / (self.high - self.low)) - 1.0
         *hidden, last = self.layers
         for weights, bias in hidden:
@@ -66,11 +75,17 @@ class GaitNetwork:
         return np.asarray((x @ last.weights + last.bias).reshape(len(JOINTS), DEGREE + 1))
 
     def gait(self, subject: Subject, robot: Robot) -> Gait:
-        """The subject's gait, its feedforward by inverse dynamics of the trajectory it puts out.
+        """Return the gait of a subject, with the feedforward from inverse dynamics of its trajectory.
+
+        The limits of the robot are not checked here, see `check_gait`.
+
+        Args:
+            subject: patient and step parameters.
+            robot: robot description for the dynamics.
 
         Raises:
-            NetworkError: a parameter outside the range of the network, legs that are not Winter's, or weights that give
-                angles of which no torque can be computed. Limits of the robot are not checked here, see `check_gait`.
+            NetworkError: If a parameter is outside the range of the network, if the leg lengths are not those of Winter, or if
+                the angles are too large to compute torques.
         """
         self.check(subject)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -87,33 +102,39 @@ class GaitNetwork:
         return Gait(str(subject), subject.step_duration, coefficients, feedforward, subject.parameters(), made)
 
     def check(self, subject: Subject) -> None:
-        """Refuse a subject the network was not fitted for.
+        """Reject a subject for which the network was not fitted.
+
+        Args:
+            subject: patient and step parameters.
 
         Raises:
-            NetworkError: names the parameter and its range.
+            NetworkError: If a parameter is out of range. The message gives the parameter and its range.
         """
         for name, value, low, high in zip(INPUTS, _inputs(subject), self.low, self.high, strict=True):
             if not low <= value <= high:
                 unit = INPUTS[name]
                 raise NetworkError(
-                    f"the gait network knows a {name.replace('_', ' ')} from {low:g} to {high:g} {unit}, not {value:g} {unit}"
+                    f"{name.replace('_', ' ')} for the gait network must be {low:g} to {high:g} {unit}, got {value:g} {unit}"
                 )
         patient = subject.patient
         winter = type(patient)(patient.mass, patient.height)
         for segment in ("thigh", "shank"):
             if abs(patient.length(segment) - winter.length(segment)) > _LEG_TOLERANCE:
                 raise NetworkError(
-                    f"the gait network knows legs of Winter's proportions, a {segment} of {winter.length(segment):.3f} m "
-                    f"and not {patient.length(segment):.3f} m: make this gait with `atalante gait solve`"
+                    f"{segment} length for the gait network must be that of Winter's table, {winter.length(segment):.3f} m, "
+                    f"got {patient.length(segment):.3f} m: compute this gait with `atalante gait solve`"
                 )
 
 
 def periodicity() -> Vector:
-    """Linear equations on the control points by which a step continues in the next one: 12 of angles, 12 of slopes. (24, 96)."""
+    """Return the linear equations on the control points for continuity at the step change, shape (24, 96).
+
+    The first 12 rows are for the angles, the last 12 rows for the slopes.
+    """
     points = np.arange(OUTPUTS).reshape(len(JOINTS), DEGREE + 1)
     rows = np.zeros((2, len(JOINTS), OUTPUTS))
     for joint, (other, sign) in enumerate(zip(SWAP, SIGN, strict=True)):
-        # q(T) is S q(0) of the next step, and the slopes at both ends alike.
+        # q(T) must equal S q(0) of the next step; the same applies to the slopes at both ends.
         rows[0, joint, points[joint, DEGREE]] = 1.0
         rows[0, joint, points[other, 0]] = -sign
         rows[1, joint, points[joint, DEGREE]] = 1.0
@@ -124,10 +145,14 @@ def periodicity() -> Vector:
 
 
 def save_network(network: GaitNetwork, path: Path) -> None:
-    """Write the file `load_network` reads.
+    """Write a file that `load_network` can read.
+
+    Args:
+        network: network to write.
+        path: path of the file, replaced if it exists.
 
     Raises:
-        NetworkError: the network is not one that `load_network` accepts.
+        NetworkError: If `load_network` would reject the network.
     """
     layers = {f"{kind}_{i}": array for i, layer in enumerate(network.layers) for kind, array in layer._asdict().items()}
     about = {"format": np.array(FORMAT), "version": np.array(network.version), "inputs": np.array(list(INPUTS))}
@@ -143,12 +168,11 @@ def load_network(path: Path | None = None) -> GaitNetwork:
     """Read a network strictly.
 
     Args:
-        path: of a file of `save_network`; the one that ships with the package unless given.
+        path: path of a file of `save_network`; None: the network of this package.
 
     Raises:
-        NetworkError: the file cannot be read or is damaged, an array is unknown or missing or has a wrong shape, a number
-            is not finite, or the last layer gives gaits that are not periodic. The message names the file and what makes
-            a good one.
+        NetworkError: If the file cannot be read or is damaged, if an array is unknown, missing or of the wrong shape, if a number
+            is not finite, or if the last layer gives gaits that are not periodic. The message gives the file and the remedy.
     """
     remedy = "make it with `atalante gait fit`" if path else "install atalante-hal again"
     path = path or DEFAULT_NETWORK
@@ -161,26 +185,30 @@ def load_network(path: Path | None = None) -> GaitNetwork:
 
 
 def _names(depth: int) -> list[str]:
-    """Return the names of the arrays of a network with so many layers."""
+    """Return the names of the arrays of a network with `depth` layers."""
     layers = [f"{kind}_{i}" for i in range(depth) for kind in Layer._fields]
     return ["format", "version", "inputs", "low", "high", *layers]
 
 
 def _size_max() -> int:
-    """Return the bytes that a file of the largest network may have; half a kilobyte an array is for headers and texts."""
+    """Return the largest valid file size in bytes, with 512 bytes for the headers and texts of each array."""
     widths = [len(INPUTS), *(LAYERS_MAX - 1) * [WIDTH_MAX], OUTPUTS]
     numbers = 2 * len(INPUTS) + sum((rows + 1) * columns for rows, columns in pairwise(widths))
     return np.dtype(np.float64).itemsize * numbers + 512 * len(_names(LAYERS_MAX))
 
 
 def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
-    """Return the network of arrays by name. Raises `ArrayFileError` unless they are one."""
+    """Return the network that the named arrays contain.
+
+    Raises:
+        ArrayFileError: If the arrays are not a valid network.
+    """
     depth = sum(name.startswith("weights_") for name in arrays)
     expected = _names(max(1, depth))
     if missing := [name for name in expected if name not in arrays]:
         raise ArrayFileError(f"{missing[0]} is missing; {', '.join(expected)} are required")
     if unknown := sorted(set(arrays) - set(expected)):
-        raise ArrayFileError(f"{unknown[0]} does not belong there; valid arrays are {', '.join(expected)}")
+        raise ArrayFileError(f"{unknown[0]} is not a valid array; valid arrays are {', '.join(expected)}")
     about = {name: arrays[name] for name in ("format", "version", "inputs")}
     for name, array in about.items():
         if array.dtype.kind != "U" or array.ndim != (name == "inputs"):
@@ -191,19 +219,21 @@ def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
         raise ArrayFileError(f"inputs must be {', '.join(INPUTS)}, got {about['inputs'].tolist()!r:.80}")
     for name, array in arrays.items():
         if name not in about and (array.dtype != np.float64 or not np.isfinite(array).all()):
-            raise ArrayFileError(f"{name} must be an array of finite 64-bit numbers")
+            raise ArrayFileError(
+                f"{name} must be an array of finite 64-bit floats, got {array.dtype} or a value not finite"
+            )
     layers = tuple(Layer(arrays[f"weights_{i}"], arrays[f"bias_{i}"]) for i in range(depth))
     low, high = arrays["low"], arrays["high"]
     width = len(INPUTS)
     if low.shape != (width,) or high.shape != (width,) or not (low < high).all():
-        raise ArrayFileError(f"low and high must be {width} numbers each, low below high")
+        raise ArrayFileError(f"low and high must be {width} numbers each, low below high, got {low} and {high}")
     if depth > LAYERS_MAX:
         raise ArrayFileError(f"a network must have at most {LAYERS_MAX} layers, got {depth}")
     for i, (weights, bias) in enumerate(layers):
         columns = bias.size
         if weights.shape != (width, columns) or bias.shape != (columns,) or not 1 <= columns <= WIDTH_MAX:
             raise ArrayFileError(
-                f"weights_{i} must have {width} rows and as many columns, 1 to {WIDTH_MAX}, as bias_{i} has numbers, "
+                f"weights_{i} must have {width} rows, and 1 to {WIDTH_MAX} columns, as many as bias_{i} has numbers, "
                 f"got shapes {weights.shape} and {bias.shape}"
             )
         width = columns
@@ -212,7 +242,7 @@ def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
     defect = np.abs(periodicity()[: len(JOINTS)] @ np.vstack([layers[-1].weights, layers[-1].bias]).T).max()
     if not defect <= _PERIODICITY_DEFECT:
         raise ArrayFileError(
-            f"the angles of a gait must continue in the next step, got weights with a jump of {defect:.2g} rad"
+            f"the angles of a gait must be continuous at the step change, got weights with a jump of {defect:.2g} rad"
         )
     return GaitNetwork(low, high, layers, str(about["version"]))
 

@@ -1,8 +1,8 @@
-"""Gravity of the empty exoskeleton, hanging from a pelvis of known attitude. `q, pelvis attitude -> u_g`.
+"""Gravity torque of the empty exoskeleton, suspended at a pelvis of known attitude. `q, pelvis attitude -> u_g`.
 
-Statics of a tree of links, as in the recursive Newton-Euler algorithm (Featherstone, Rigid Body Dynamics Algorithms, 5.3):
-outwards every link learns where down is; inwards it hands the force and the moment that hold it to its parent, and its joint
-bears the share about its axis. The tree is Pinocchio's, which is the witness of the tests.
+Statics of a tree of links, as in the recursive Newton-Euler algorithm (Featherstone, Rigid Body Dynamics Algorithms, 5.3). The
+outward pass computes the direction of gravity in each link. The inward pass adds the holding force and moment of each link to
+its parent; the joint torque is the component about the axis. The tree is that of Pinocchio, the reference in the tests.
 """
 
 from __future__ import annotations
@@ -23,47 +23,51 @@ Vector3 = tuple[float, float, float]
 
 _GRAVITY = 9.81  # m/s2
 
-#: A link, in the frame of the joint that moves it: what stays, then what a pose gives it.
+#: Record of a link in the frame of the joint that moves it: constants, then the values of a pose.
 LINK = np.dtype(
     [
-        ("joint", np.int64),  # its place in JOINTS
-        ("parent", np.int64),
-        ("offset", np.float64, 3),  # m, of the joint in the parent's frame
+        ("joint", np.int64),  # index in JOINTS
+        ("parent", np.int64),  # index of the parent link
+        ("offset", np.float64, 3),  # m, position of the joint in the frame of the parent
         ("turn", np.float64, (3, 3, 3)),  # rotation to the parent: turn[0] + sin(q) turn[1] + (1 - cos(q)) turn[2]
-        ("axis", np.float64, 3),
+        ("axis", np.float64, 3),  # unit vector of the joint axis
         ("mass", np.float64),  # kg
-        ("lever", np.float64, 3),  # m, its centre of mass
-        ("rotation", np.float64, (3, 3)),
-        ("down", np.float64, 3),  # m/s2, acceleration of a falling body
-        ("force", np.float64, 3),  # N, that holds it and what hangs from it
-        ("moment", np.float64, 3),  # Nm, about its joint
+        ("lever", np.float64, 3),  # m, centre of mass
+        ("rotation", np.float64, (3, 3)),  # rotation to the parent at the pose
+        ("down", np.float64, 3),  # m/s2, gravitational acceleration
+        ("force", np.float64, 3),  # N, holding force of the link and its descendants
+        ("moment", np.float64, 3),  # Nm, holding moment about the joint
     ],
     align=True,
 )
 
 
 class Gravity:
-    """u_g: generalized gravity of the empty exoskeleton, hanging from a pelvis of known attitude.
+    """Generalized gravity u_g of the empty exoskeleton, suspended at a pelvis of known attitude.
 
     Attributes:
-        links: the tree `hold` works on.
+        links: tree of links for `hold`, dtype LINK, parents first.
     """
 
     def __init__(self, articulated: ArticulatedModel) -> None:
-        """Take a model with the pelvis fixed."""
+        """Prepare the tree of links.
+
+        Args:
+            articulated: model of the empty exoskeleton with the pelvis fixed.
+        """
         self.links, self._torque = _links(articulated), np.zeros(len(JOINTS))
         self._hold = compiled(hold)
         self.torque(np.zeros(len(JOINTS)), (1.0, 0.0, 0.0, 0.0))
 
     def torque(self, position: Vector, pelvis: Sequence[float]) -> Vector:
-        """Torques that hold the exoskeleton still.
+        """Compute the joint torques that hold the exoskeleton at rest.
 
         Args:
-            position: shape (12,) [rad].
+            position: joint angles, shape (12,) [rad].
             pelvis: attitude of the pelvis IMU, unit quaternion wxyz, pelvis to world.
 
         Returns:
-            Shape (12,) [Nm], overwritten by the next call.
+            Torques, shape (12,) [Nm], overwritten by the next call.
         """
         w, x, y, z = pelvis
         self._hold(self.links, position, w, x, y, z, self._torque)
@@ -71,16 +75,16 @@ class Gravity:
 
 
 def _links(articulated: ArticulatedModel) -> npt.NDArray[np.void]:
-    """The pelvis, then the links of a model, parents first."""
+    """Return the records of the pelvis and the links of a model, parents first."""
     model, into, _ = articulated
     data, neutral = model.createData(), pinocchio.neutral(model)
-    places = {int(q): joint for joint, q in enumerate(into)}
+    joint_of = {int(q): joint for joint, q in enumerate(into)}
     links = np.zeros(model.njoints, LINK)
     for i in range(1, model.njoints):
         link, placement, inertia = links[i], model.jointPlacements[i], model.inertias[i]
         axis = pinocchio.computeJointJacobian(model, data, neutral, i)[3:, model.idx_vs[i]]
         cross = pinocchio.skew(axis)
-        link["joint"], link["parent"] = places[model.idx_qs[i]], model.parents[i]
+        link["joint"], link["parent"] = joint_of[model.idx_qs[i]], model.parents[i]
         link["offset"], link["axis"] = placement.translation, axis
         link["turn"] = [placement.rotation @ part for part in (np.eye(3), cross, cross @ cross)]
         link["mass"], link["lever"] = inertia.mass, inertia.lever
@@ -88,7 +92,17 @@ def _links(articulated: ArticulatedModel) -> npt.NDArray[np.void]:
 
 
 def hold(links: npt.NDArray[np.void], position: Vector, w: float, x: float, y: float, z: float, torque: Vector) -> None:
-    """u_g into `torque`. Args: `links`, rows of LINK; attitude of the pelvis, wxyz."""
+    """Write u_g into `torque`.
+
+    Args:
+        links: tree of links, dtype LINK, parents first; the values of the pose are overwritten.
+        position: joint angles, shape (12,) [rad].
+        w: first component of the pelvis attitude, a unit quaternion, pelvis to world.
+        x: second component of the pelvis attitude.
+        y: third component of the pelvis attitude.
+        z: fourth component of the pelvis attitude.
+        torque: u_g, shape (12,) [Nm], overwritten.
+    """
     down = links[0]["down"]
     down[0], down[1] = -_GRAVITY * 2.0 * (x * z - w * y), -_GRAVITY * 2.0 * (y * z + w * x)
     down[2] = -_GRAVITY * (1.0 - 2.0 * (x * x + y * y))

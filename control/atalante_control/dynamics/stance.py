@@ -1,16 +1,15 @@
 """Inverse dynamics on the ground, stance sole flat and at rest: `model, q, q', q'' -> joint torques, ground wrench`.
 
-`gait (solved, or of the network) -> torques that walk it -> feedforward u_f of the gait file`. Pinocchio alone.
+`gait (solver or network) -> torques of the gait -> feedforward u_f of the gait file`. The module uses only Pinocchio.
 
-The pelvis floats, and its motion follows from the joints': the stance foot does not move. With V the twist of the foot
-seen from the pelvis, the pelvis moves with -V. One recursive Newton-Euler pass gives the wrench f on the floating pelvis;
-nothing but the ground can supply it, so the ground wrench is f, and the joints' torques are those of the pass minus
-J^T f, J being the foot's Jacobian in the pelvis (the base rows of the equation of motion, solved exactly).
+The pelvis floats. Its motion follows from the joint motion, because the stance foot does not move: with V the twist of the foot
+in the pelvis frame, the pelvis moves with -V. One recursive Newton-Euler pass gives the wrench f on the floating pelvis. Only
+the ground can apply this wrench, so the ground wrench is f. The joint torques are those of the pass minus J^T f, with J the
+Jacobian of the foot in the pelvis frame (the base rows of the equation of motion, solved exactly).
 
-What walks is the sum of two torques: u_g, the gravity of the *empty* exoskeleton hanging from its pelvis, which the
-controller adds in every cycle (joint idealization), and u_f, all the rest, which the gait file holds: the patient's
-weight, what standing on one leg asks for, and the inertia. So u_f excludes gravity where u_g is added, and u_g + u_f is
-the torque that walks.
+The torque of a gait is the sum u_g + u_f. The gravity torque u_g is that of the *empty* exoskeleton suspended at its pelvis; the
+controller adds it in every cycle (joint idealization). The feedforward u_f in the gait file is the remainder: the weight of the
+patient, the load of standing on one leg, and the inertia.
 """
 
 from __future__ import annotations
@@ -28,33 +27,33 @@ from atalante_hal.robot import SIDES, Robot
 
 Vector = npt.NDArray[np.float64]
 
-#: The foot that stands in the step a `Gait` describes, and the one that swings.
+#: Links of the stance foot and the swing foot in the right-stance step of a `Gait`.
 STANCE_FOOT, SWING_FOOT = (f"{side}_{LEG_LINKS['HA']}" for side in reversed(SIDES))
-#: Phases a feedforward is fitted at; its control points are eight.
+#: Number of phases at which the eight control points of a feedforward are fitted.
 _SAMPLES = 33
 
 
 class GroundForces(NamedTuple):
-    """What one pose in motion asks for, and how the pelvis is turned."""
+    """Joint torques and ground wrench of one state, with the attitude of the pelvis."""
 
     torque: Vector  # (12,) Nm, order of JOINTS
-    force: Vector  # (3,) N, of the ground, in the stance foot's axes
-    moment: Vector  # (3,) Nm, about the stance foot's origin (the ankle)
+    force: Vector  # (3,) N, force of the ground, in the axes of the stance foot
+    moment: Vector  # (3,) Nm, moment of the ground about the origin of the stance foot (the ankle)
     pelvis: tuple[float, float, float, float]  # unit quaternion wxyz, pelvis to world
 
 
 class StanceDynamics:
-    """A robot, worn or empty, on its right foot."""
+    """Inverse dynamics of the exoskeleton, empty or with a patient, standing on its right foot."""
 
     def __init__(self, urdf_text: str, empty: str) -> None:
-        """Build the Pinocchio models, pelvis floating and pelvis fixed, and that of u_g.
+        """Build the Pinocchio models with floating and with fixed pelvis, and the model of u_g.
 
         Args:
-            urdf_text: what walks.
-            empty: the same exoskeleton with nobody in it.
+            urdf_text: URDF of the exoskeleton that walks, empty or with a patient.
+            empty: URDF of the same exoskeleton without a patient.
 
         Raises:
-            ValueError: a joint of `JOINTS` is not in a text.
+            ValueError: If a joint of `JOINTS` is missing in a URDF.
         """
         self._gravity = Gravity(pinocchio_model(empty))
         self._floating, self._fixed = pinocchio_model(urdf_text, fixed_base=False), pinocchio_model(urdf_text)
@@ -62,11 +61,17 @@ class StanceDynamics:
         self._foot, self._swing_foot = (self._fixed.model.getFrameId(name) for name in (STANCE_FOOT, SWING_FOOT))
         pinocchio.forwardKinematics(self._fixed.model, self._data[1], pinocchio.neutral(self._fixed.model))
         pinocchio.updateFramePlacement(self._fixed.model, self._data[1], self._foot)
-        #: The feet toe out and stand flat: the pelvis at the zero pose looks along the walking direction.
+        #: Rotation of the stance foot in the pelvis frame at the zero pose, where the pelvis faces the walking direction.
         self._toe_out = self._data[1].oMf[self._foot].rotation.copy()
 
     def forces(self, position: Vector, velocity: Vector, acceleration: Vector) -> GroundForces:
-        """Joint torques and ground wrench of one state. Shapes (12,) [rad, rad/s, rad/s2]."""
+        """Compute the joint torques and the ground wrench of one state.
+
+        Args:
+            position: joint angles, shape (12,) [rad].
+            velocity: joint speeds, shape (12,) [rad/s].
+            acceleration: joint accelerations, shape (12,) [rad/s2].
+        """
         fixed, floating = self._fixed, self._floating
         on_pelvis, data = self._data[1], self._data[0]
         q, v, a = np.zeros(fixed.model.nq), np.zeros(fixed.model.nv), np.zeros(fixed.model.nv)
@@ -74,7 +79,7 @@ class StanceDynamics:
         pinocchio.computeJointJacobians(fixed.model, on_pelvis, q)
         pinocchio.forwardKinematics(fixed.model, on_pelvis, q, v, a)
         foot = pinocchio.updateFramePlacement(fixed.model, on_pelvis, self._foot)
-        frame = pinocchio.ReferenceFrame.WORLD  # of this model: the pelvis, at its origin
+        frame = pinocchio.ReferenceFrame.WORLD  # in this model the world frame is the pelvis frame
         twist = pinocchio.getFrameVelocity(fixed.model, on_pelvis, self._foot, frame).vector
         change = pinocchio.getFrameAcceleration(fixed.model, on_pelvis, self._foot, frame).vector
         jacobian = pinocchio.getFrameJacobian(fixed.model, on_pelvis, self._foot, frame)
@@ -93,7 +98,11 @@ class StanceDynamics:
         return GroundForces(torque, on_foot.linear.copy(), on_foot.angular.copy(), (w, x, y, z))
 
     def swing_foot(self, position: Vector) -> Any:
-        """Pose of the left foot in the frame of the right one, a `pinocchio.SE3` [m]. Shape (12,) [rad]."""
+        """Return the pose of the left foot in the frame of the right foot, a `pinocchio.SE3` [m].
+
+        Args:
+            position: joint angles, shape (12,) [rad].
+        """
         fixed, data = self._fixed, self._data[1]
         q = np.zeros(fixed.model.nq)
         q[fixed.q] = position
@@ -104,15 +113,24 @@ class StanceDynamics:
         return stance.actInv(swing)
 
     def torques(self, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-        """Joint torques along a motion. Shapes (n, 12) [rad, rad/s, rad/s2] to (n, 12) [Nm]."""
+        """Compute the joint torques along a motion.
+
+        Args:
+            q: joint angles, shape (n, 12) [rad].
+            qd: joint speeds, shape (n, 12) [rad/s].
+            qdd: joint accelerations, shape (n, 12) [rad/s2].
+
+        Returns:
+            Joint torques, shape (n, 12) [Nm].
+        """
         return np.array([self.forces(*state).torque for state in zip(q, qd, qdd, strict=True)])
 
     def feedforward(self, coefficients: Vector, duration: float) -> Vector:
-        """u_f of a right-stance step: the torques that walk it less u_g, as (12, 8) control points [Nm].
+        """Return u_f of a right-stance step, its joint torques less u_g, as control points of shape (12, 8) [Nm].
 
         Args:
-            coefficients: Bezier control points of the joints, (12, 8) [rad].
-            duration: T [s].
+            coefficients: Bezier control points of the joints, shape (12, 8) [rad].
+            duration: duration of the step T [s].
         """
         phase = np.linspace(0.0, 1.0, _SAMPLES)
         states = [self.forces(*state) for state in zip(*motion(coefficients, duration, phase), strict=True)]
@@ -124,7 +142,12 @@ class StanceDynamics:
 
 
 def stance_dynamics(robot: Robot, patient: Patient | None = None) -> StanceDynamics:
-    """The exoskeleton with a patient in it, or empty, on its right foot."""
+    """Build the inverse dynamics of the exoskeleton standing on its right foot.
+
+    Args:
+        robot: limits of the joints.
+        patient: patient in the exoskeleton; None: empty.
+    """
     exoskeleton = ExoskeletonParameters()
     fitted = exoskeleton if patient is None else exoskeleton.fitted(patient)
     return StanceDynamics(urdf(exoskeleton, robot, patient), urdf(fitted, robot))

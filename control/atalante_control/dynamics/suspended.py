@@ -1,7 +1,7 @@
-"""A walking gait in the air: the feedforward of what hangs there instead of what stands on the ground.
+"""Gait for the exoskeleton suspended in the air: the same trajectories with another feedforward.
 
-`gait (solved, or of the network), exoskeleton -> the same gait with the u_f of the air -> AirwalkController`. The trajectories
-stay; but a step on the ground carries a patient on the other leg, and here an empty exoskeleton hangs by its pelvis.
+`gait (solver or network), exoskeleton -> the same gait with u_f for the air -> AirwalkController`. The feedforward of a gait on
+the ground includes the load of the patient on the stance leg. In the air the exoskeleton is empty and suspended by its pelvis.
 """
 
 from __future__ import annotations
@@ -19,34 +19,43 @@ from atalante_hal.robot import JOINTS, Robot
 
 Vector = npt.NDArray[np.float64]
 
-_SAMPLES = 33  # phases the eight control points are fitted at
+_SAMPLES = 33  # number of phases at which the eight control points are fitted
 _SAGITTAL_ANKLES = np.array([float(joint.endswith("_SA")) for joint in JOINTS])
 _LEVEL = (1.0, 0.0, 0.0, 0.0)  # attitude of the pelvis, unit quaternion wxyz
 
 
 def suspended_gait(gait: Gait, exoskeleton: ExoskeletonParameters, robot: Robot) -> Gait:
-    """The gait with u_f of the hanging empty exoskeleton: the torques of its inertia alone, since u_g is added to it."""
+    """Return the gait with u_f of the suspended empty exoskeleton.
+
+    This u_f contains only the inertia torques, because the controller adds u_g.
+
+    Args:
+        gait: gait of any source.
+        exoskeleton: geometry and masses of the empty exoskeleton.
+        robot: limits of the joints.
+    """
     return replace(gait, feedforward=_feedforward(gait, pinocchio_model(urdf(exoskeleton, robot))))
 
 
 def check_hung(gait: Gait, robot: Robot, articulated: ArticulatedModel, gravity: Gravity, ankle_offset: float) -> None:
-    """Refuse a gait that the hanging exoskeleton must not or cannot walk.
+    """Reject a gait that the suspended exoskeleton cannot walk within its limits.
 
-    The torque limits hold for the sum of u_g, pelvis level, and u_f; where the gait has no u_f, it is that of `suspended_gait`.
+    The torque limits apply to the sum of u_f and u_g with the pelvis level. If the gait has no u_f, that of `suspended_gait`
+    applies.
 
     Args:
-        gait: a right-stance step that repeats, from whichever source.
-        robot: with the limits.
-        articulated: the empty exoskeleton, pelvis fixed.
-        gravity: of the same exoskeleton.
-        ankle_offset: added to both sagittal ankles [rad].
+        gait: right-stance step that repeats, of any source.
+        robot: limits of the joints.
+        articulated: model of the empty exoskeleton with the pelvis fixed.
+        gravity: gravity of the same exoskeleton.
+        ankle_offset: angle added to both sagittal ankles [rad].
 
     Raises:
-        GaitError: see `check_gait`.
+        GaitError: If the gait is invalid, see `check_gait`.
     """
     where = f"gait {gait.name!r}"
     check_gait(gait, robot, where)
-    # A constant added to all control points of a polynomial is added to the polynomial.
+    # Adding a constant to all Bezier control points adds the constant to the polynomial.
     coefficients = gait.coefficients + ankle_offset * _SAGITTAL_ANKLES[:, None]
     feedforward = _feedforward(gait, articulated) if gait.feedforward is None else gait.feedforward
     walked = replace(gait, coefficients=coefficients, feedforward=feedforward)
@@ -54,7 +63,7 @@ def check_hung(gait: Gait, robot: Robot, articulated: ArticulatedModel, gravity:
 
 
 def _feedforward(gait: Gait, articulated: ArticulatedModel) -> Vector:
-    """Return u_f of the hanging empty exoskeleton as control points, (12, 8) [Nm]."""
+    """Return u_f of the suspended empty exoskeleton as control points, shape (12, 8) [Nm]."""
     model, into, out_of = articulated
     data = model.createData()
     phase = np.linspace(0.0, 1.0, _SAMPLES)

@@ -1,1 +1,1 @@
-"""The virtual guide: shapes, filter, kernel, backup policy and certificate."""
+"""Virtual guide: shapes, filter, compiled kernel, backup policy and certificate."""

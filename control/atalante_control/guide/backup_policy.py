@@ -1,17 +1,17 @@
-r"""Backup policy of the virtual guide and the exact flow it gives a joint.
+r"""Backup policy of the virtual guide and the exact flow of a joint under it.
 
-`gait, re-centring -> forced response P`, `gains, inertia -> transition Phi, disturbance responses` -> guide filter and
-certificate. A joint is idealised as :math:`J\ddot q = u_b + u_f + u_{ext}` with
-:math:`u_b = K_p (q_{des} - q) + K_d (\dot q_{des} - \dot q)`; its error :math:`e = q - q_{des}` follows
+`gait, re-centring -> forced response P`, `gains, inertia -> transition Phi, disturbance responses`. The guide filter and the
+certificate use both. A joint is idealised as :math:`J\ddot q = u_b + u_f + u_{ext}` with
+:math:`u_b = K_p (q_{des} - q) + K_d (\dot q_{des} - \dot q)`. Its error :math:`e = q - q_{des}` obeys
 
 .. math:: J\ddot e + K_d \dot e + K_p e = u_f - J \ddot q_{des} + u_{ext},
 
-which is linear. From the state :math:`x = (e, \dot e)` at :math:`t`, under a constant disturbance, it is exactly
+which is linear. From the state :math:`x = (e, \dot e)` at :math:`t`, under a constant disturbance, the state is exactly
 
 .. math:: x(t + \tau) = P(t + \tau) + \Phi(\tau) (x - P(t)) + u_{ext} S(\tau)
 
-with any one solution P of the undisturbed loop. Between step changes the forcing is a polynomial, so P is a polynomial
-too, found by comparing coefficients: no integration, no grid.
+with any solution P of the undisturbed loop. Between step changes the forcing is a polynomial. P is therefore a polynomial too,
+and its coefficients are found by comparison, without integration and without a grid.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ Vector = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class BackupPolicy:
-    """PD law of one joint with the inertia and the torque it acts with.
+    """PD law of one joint, with the inertia of the joint and the torque limit.
 
     Raises:
-        ValueError: a value that is not positive and finite.
+        ValueError: If a value is not positive, or if one other than the torque limit is not finite.
     """
 
     kp: float  # Nm/rad
@@ -46,17 +46,27 @@ class BackupPolicy:
         for name in ("kp", "kd", "inertia"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name} of the backup policy is positive and finite, not {value!r}")
+                raise ValueError(f"{name} of the backup policy must be positive and finite, got {value!r}")
         if not self.torque_limit > 0.0:
-            raise ValueError(f"torque_limit of the backup policy is positive, in Nm, not {self.torque_limit!r}")
+            raise ValueError(f"torque_limit of the backup policy must be positive [Nm], got {self.torque_limit!r}")
 
     @property
     def monotone(self) -> bool:
-        """True when Kd^2 >= 4 Kp J: the impulse response never changes sign, and constant extremes are the worst."""
+        """Return whether Kd^2 >= 4 Kp J.
+
+        The impulse response of a monotone loop never changes sign, so a constant extreme is the worst disturbance.
+        """
         return self.kd**2 >= 4.0 * self.kp * self.inertia * (1.0 - 1e-12)
 
     def transition(self, tau: Vector) -> Vector:
-        """Phi(tau), closed form. Args: tau shape (n,) [s]. Returns: shape (n, 2, 2) acting on (e, e')."""
+        """Return the state transition Phi(tau) in closed form.
+
+        Args:
+            tau: times from the start, shape (n,) [s].
+
+        Returns:
+            Matrices that act on (e, e'), shape (n, 2, 2).
+        """
         impulse, slope = self._impulse(tau)
         sigma, stiffness = self.kd / (2.0 * self.inertia), self.kp / self.inertia
         phi = np.empty((len(tau), 2, 2))
@@ -65,18 +75,30 @@ class BackupPolicy:
         return phi
 
     def step_response(self, tau: Vector) -> Vector:
-        """S(tau): response of (e, e') to a unit disturbance torque from rest. Shape (n, 2) [rad/Nm, rad/(Nm s)]."""
+        """Return S(tau), the response of (e, e') from rest to a constant disturbance of 1 Nm.
+
+        Args:
+            tau: times from the start, shape (n,) [s].
+
+        Returns:
+            Response, shape (n, 2) [rad/Nm, rad/(Nm s)].
+        """
         impulse, slope = self._impulse(tau)
         sigma = self.kd / (2.0 * self.inertia)
         return np.stack([(1.0 - slope - 2.0 * sigma * impulse) / self.kp, impulse / self.inertia], axis=1)
 
     def peak_response(self, tau: Vector) -> Vector:
-        """Largest |e(tau)| any disturbance within +-1 Nm can cause from rest: the L1 norm of the impulse response.
+        """Return the largest |e(tau)| that a disturbance within +-1 Nm can cause from rest.
 
-        Equal to S for a monotone loop. An underdamped one answers best to a disturbance that changes sign with the
-        impulse response, at tau_n = n pi / omega_d: between these, S is monotone, and its increments add up.
+        It is the L1 norm of the impulse response. For a monotone loop it equals the error of S. For an underdamped loop the
+        worst disturbance changes sign with the impulse response, at tau_n = n pi / omega_d. S is monotone between these
+        times, so the absolute increments of S are summed.
 
-        Returns: shape (n,) [rad/Nm].
+        Args:
+            tau: times from the start, shape (n,) [s].
+
+        Returns:
+            Largest error, shape (n,) [rad/Nm].
         """
         if self.monotone:
             return np.abs(self.step_response(tau)[:, 0])
@@ -88,23 +110,30 @@ class BackupPolicy:
         return np.asarray(summed[last] + np.abs(self.step_response(tau)[:, 0] - at_turns[last]))
 
     def disturbance(self, tau: Vector, low: float, high: float) -> tuple[Vector, Vector]:
-        """Largest and smallest e(tau) that disturbances within [low, high] Nm can cause from rest.
+        """Return the largest and the smallest e(tau) that disturbances within [low, high] can cause from rest.
 
-        Their mean acts through S, what is left of them through the peak response: for a monotone loop this is the
-        pair of constant extremes of the paper, for an underdamped one it is the true worst case, not that pair.
+        The mean of the interval acts through S, the deviation from the mean through the peak response. For a monotone loop the
+        result is the pair of constant extremes of the paper. For an underdamped loop it is the true worst case, which that
+        pair underestimates.
 
-        Returns: two arrays of shape (n,) [rad].
+        Args:
+            tau: times from the start, shape (n,) [s].
+            low: smallest disturbance [Nm].
+            high: largest disturbance [Nm].
+
+        Returns:
+            Largest and smallest error, each of shape (n,) [rad].
         """
         mean, half = 0.5 * (high + low), 0.5 * (high - low)
         drift, spread = mean * self.step_response(tau)[:, 0], half * self.peak_response(tau)
         return drift + spread, drift - spread
 
     def particular(self, forcing: Vector, scale: float) -> Vector:
-        """Polynomial solution of e'' + (Kd/J) e' + (Kp/J) e = f.
+        """Return the polynomial solution of e'' + (Kd/J) e' + (Kp/J) e = f.
 
         Args:
             forcing: coefficients of f [rad/s2] in powers of t / scale, lowest first, shape (d + 1,).
-            scale: [s].
+            scale: unit of time of the powers [s].
 
         Returns:
             Coefficients of e [rad] in the same powers, shape (d + 1,).
@@ -124,7 +153,7 @@ class BackupPolicy:
         return sigma, spread
 
     def _impulse(self, tau: Vector) -> tuple[Vector, Vector]:
-        """Response e and e' to e(0) = 0, e'(0) = 1; accurate through critical damping."""
+        """Return e and e' from e(0) = 0, e'(0) = 1; accurate near critical damping too."""
         sigma, spread = self._poles()
         if spread.imag:
             omega = spread.imag
@@ -138,11 +167,11 @@ class BackupPolicy:
 
 
 class ForcedResponse(NamedTuple):
-    """One solution P of the undisturbed loop and what a deadbeat adds to it; (e, e'), each of shape (n, 2)."""
+    """Solution P of the undisturbed loop and its sensitivity to the re-centring; (e, e'), each of shape (n, 2)."""
 
-    nominal: Vector  # rad, rad/s
-    deviation: Vector  # per rad of s(0)
-    rate: Vector  # per rad/s of s'(0)
+    nominal: Vector  # P without re-centring [rad, rad/s]
+    deviation: Vector  # added to P per rad of s(0)
+    rate: Vector  # added to P per rad/s of s'(0)
 
 
 def forced_response(
@@ -153,16 +182,18 @@ def forced_response(
     time: Vector,
     feedforward: Vector | None = None,
 ) -> ForcedResponse:
-    """P of one joint over a step and, past T, into the trajectory that follows it.
+    """Return P of one joint over a step and, after T, along the nominal trajectory of the next step.
 
-    P is linear in the deadbeat's deviations, so a step change only adds two tables: P = nominal + s(0) deviation +
+    P is linear in the deviations at the step change, so a step change only adds two tables: P = nominal + s(0) deviation +
     s'(0) rate.
 
     Args:
+        policy: backup policy of the joint.
+        deadbeat: re-centring of the gait.
         nominal: Bezier control points of q_nom in this step, shape (8,) [rad].
-        following: of the same joint in the next step, shape (8,) [rad].
-        time: since the step change, shape (n,) [s], not negative; may pass T.
-        feedforward: Bezier control points of u_f applied in this step, shape (8,) [Nm]; None: none applied.
+        following: Bezier control points of q_nom of the same joint in the next step, shape (8,) [rad].
+        time: time since the step change, shape (n,) [s], at least 0; may exceed T.
+        feedforward: Bezier control points of u_f applied in this step, shape (8,) [Nm]; None: no feedforward.
     """
     duration = deadbeat.duration
     now = policy.particular(_forcing(policy, nominal, feedforward, duration), duration)
@@ -193,10 +224,18 @@ def free_drift(
     time: Vector,
     feedforward: Vector | None = None,
 ) -> ForcedResponse:
-    """Error of the joint with no backup torque: what a constant torque is added to where the drive saturates.
+    """Return the error of the joint without backup torque, the double integral of u_f / J - q_des''.
 
-    Twice integrated u_f / J - q_des''. Arguments and result as for `forced_response`; only differences along the
+    Where the drive saturates, the kernel adds the motion under a constant torque to this drift. Only differences along the
     drift have a meaning.
+
+    Args:
+        policy: backup policy of the joint.
+        deadbeat: re-centring of the gait.
+        nominal: Bezier control points of q_nom in this step, shape (8,) [rad].
+        following: Bezier control points of q_nom of the same joint in the next step, shape (8,) [rad].
+        time: time since the step change, shape (n,) [s], at least 0; may exceed T.
+        feedforward: Bezier control points of u_f applied in this step, shape (8,) [Nm]; None: no feedforward.
     """
     duration = deadbeat.duration
     late = time > duration
@@ -216,7 +255,7 @@ def free_drift(
 
 
 def _forcing(policy: BackupPolicy, nominal: Vector, feedforward: Vector | None, duration: float) -> Vector:
-    """Coefficients of u_f / J - q_nom'' in powers of t / T, shape (8,)."""
+    """Return the coefficients of u_f / J - q_nom'' in powers of t / T, shape (8,) [rad/s2]."""
     forcing = np.zeros(len(nominal))
     acceleration = power_basis(derivative(derivative(nominal[None, :])))[0] / duration**2
     forcing[: len(acceleration)] -= acceleration
@@ -226,7 +265,7 @@ def _forcing(policy: BackupPolicy, nominal: Vector, feedforward: Vector | None, 
 
 
 def _polynomial(coefficients: Vector, time: Vector, scale: float) -> Vector:
-    """Value and time derivative, shape (n, 2)."""
+    """Return the value and the time derivative of a polynomial in time / scale, shape (n, 2)."""
     x = time / scale
     slope = coefficients[1:] * np.arange(1, len(coefficients)) / scale
     return np.stack([np.polynomial.polynomial.polyval(x, c) for c in (coefficients, slope)], axis=1)

@@ -1,43 +1,44 @@
-r"""Guide certificate: what a guide promises, computed before it is walked. `guide filter -> Certificate`.
+r"""Guide certificate: a check before walking that the filter can keep the joints in a guide. `guide filter -> Certificate`.
 
-The filter keeps a joint in its guide as long as the joint is in the safe backward image, the states from which the
-backup policy stays inside under any disturbance within its bounds (Proposition 1 of the paper). Three things then have
-to hold for a whole walk, and each is computed here, exactly, from the linear flow.
+The filter keeps a joint in its guide as long as the joint is in the safe backward image. These are the states from which the
+backup policy stays in the guide under every disturbance within its bounds (Proposition 1 of the paper). Three conditions must
+hold for a whole walk. Each is computed here exactly from the linear flow.
 
-1. *The re-centred state is in the image at the start of a step.* The deadbeat sets s(0) = q - q_nom, s'(0) = q' -
-   q_nom', so every step starts at e = 0, e' = 0, wherever the last one ended. From there the error is
-   :math:`R(t) + s(0) R_0(t) + s'(0) R_1(t)` plus what the disturbance adds, at most D(t) up or down; R is the response
-   to the nominal acceleration, R_0 and R_1 to the deadbeat's. Contained means that at every t to the horizon's end the
-   largest of it over all admissible s(0), s'(0) stays under the upper bound, and the smallest over the lower one.
-   What is left, as a part of the bound, is the margin.
-2. *The image is then not empty all along the step.* From a state in the image at 0, the backup policy without
-   disturbance leads at t to a state from which the worst disturbance adds D(tau) <= D(t + tau): that state is in the
-   image at t. (For a monotone loop, a constant extreme from t on is a disturbance the image at 0 was made for; for an
-   underdamped one D is the L1 norm, which covers every signal.)
-3. *The end of a step does not spoil the next one.* Near T the horizon is short; without more, the filter would admit
-   states there from which the next step cannot be kept, and h would fall at the change. Two things prevent that. The
-   deadbeat re-centres the state, so the end state enters the next step through s(0) and s'(0) alone, and 1 holds for
-   every pair of them in the hand-over box. And the horizon reaches `overlap` past T, so that the image at T already
-   excludes leaving the guide fast. A joint that swings every other step is handed over by the baseline controller; one
-   assisted in consecutive steps by its own guide, with |s(0)| up to the last width. The box is an assumption that
-   the controller checks at every step change; the largest one admitted is part of the certificate.
+1. *The re-centred state is in the image at the start of a step.* Re-centring sets s(0) = q - q_nom, s'(0) = q' - q_nom'.
+   Every step therefore starts at e = 0, e' = 0 from any end of the last step. From there the error is
+   :math:`R(t) + s(0) R_0(t) + s'(0) R_1(t)` plus the effect of the disturbance, at most D(t) up or down. R is the response to
+   the nominal acceleration; R_0 and R_1 are the responses to the acceleration of the re-centring. The condition holds if, at
+   every t of the horizon, the largest error over all admissible s(0), s'(0) is below the upper bound and the smallest is above
+   the lower bound. The remaining distance, as a fraction of the bound, is the margin.
+2. *The image is not empty at any time of the step.* This follows from 1. The backup policy without disturbance leads from a
+   state in the image at 0 to a state at t, from which the worst disturbance adds D(tau) <= D(t + tau). That state is in the
+   image at t. (For a monotone loop, a constant extreme from t on is one of the disturbances covered by the image at 0. For an
+   underdamped loop D is the L1 norm, which covers every signal.)
+3. *The end of a step does not violate the next one.* Near T the horizon is short. With this horizon alone the filter would
+   admit states near T from which the next step cannot be kept, and h would fall at the step change. Two measures prevent this.
+   Re-centring resets the error, so the end state enters the next step only through s(0) and s'(0), and condition 1 holds for
+   every pair of them in the hand-over box. In addition the horizon extends `overlap` past T, so the image at T already
+   excludes states that leave the guide fast. A joint that swings every other step is handed over by the baseline controller. A
+   joint that is assisted in consecutive steps is handed over by its own guide, with |s(0)| up to the last width. The box is an
+   assumption, which the controller checks at every step change. The largest admissible box is part of the certificate.
 
-By induction over the steps the joint never leaves its guide, on the model: separate inertias J, each with its own ideal
-torque limit. 1 and 2 hold for the linear loop. Where the ideal torque saturates away from the re-centred path, the filter
-steps the two extremes and keeps a torque reserve; that is tested under adversarial pushes, not proved.
+By induction over the steps the joint never leaves its guide on the model of separate inertias J, each with its own ideal
+torque limit. Conditions 1 and 2 hold for the linear loop. Where the ideal torque saturates away from the re-centred path, the
+filter simulates the two extremes cycle by cycle and keeps a torque reserve. This case is tested under adversarial pushes, but
+not proved.
 
-The bounds the filter is built for are torques on those separate inertias. A torque d on the coupled hip and knee counts as
-A d with A = J M(q_SK)^-1, which is several times d on the light empty leg: 1 Nm at the hip counts as (7.6, -3.4) Nm at a
-straight knee, 1 Nm at the knee as (-14.7, 7.7). `joint_torque` turns the bounds into the pair (hip, knee) of real torques
-that is printed: any |d_SH| <= hip and |d_SK| <= knee, together, in any direction and order, stay inside the bounds at
-every knee angle the leg can have inside the guide.
+The bounds of the filter are torques on the separate inertias. A torque d on the coupled hip and knee is equivalent to A d on
+the separate inertias, with A = J M(q_SK)^-1. On the light empty leg this is several times d: at a straight knee, 1 Nm at the hip
+is equivalent to (7.6, -3.4) Nm, and 1 Nm at the knee to (-14.7, 7.7) Nm. `joint_torque` converts the bounds to the printed pair
+(hip, knee) of real torques. All disturbances with |d_SH| <= hip and |d_SK| <= knee, together, in any direction and order, are
+within the bounds at every knee angle that the leg can have inside the guide.
 
-What the pair includes: the mass matrix of SH and SK in the worst pose, deviations at the step change up to the hand-over
-box, sampling. What it does not include, and what a certified guide was left through: the real torque limit of the drives,
-the limiter's torque rate, the delay of the loop, the torque carried over a step change. Errors of friction and inertia,
-velocity noise and the other joints are not included either; they use up the same bounds. The pair is therefore a margin on
-the model, no guarantee for the robot. Where the baseline fades in (Xi between `AirwalkConfig.fade` and 1) another law runs:
-nothing is certified there.
+The pair includes the mass matrix of SH and SK in the worst pose, deviations at the step change up to the hand-over box, and
+sampling. It does not include the real torque limit of the drives, the torque rate of the limiter, the delay of the loop and the
+torque carried over a step change; joints have left a certified guide because of these. It does not include errors of friction
+and inertia, velocity noise and the other joints either; these use part of the same bounds. The pair is therefore a margin on the
+model, not a guarantee for the robot. Where the baseline fades in (Xi between `AirwalkConfig.fade` and 1) the control law is
+different, and nothing is certified.
 """
 
 from __future__ import annotations
@@ -57,18 +58,18 @@ Vector = npt.NDArray[np.float64]
 Pair = tuple[float, float]
 
 _JOINTS = ("SH", "SK")
-_STATES = 41  # errors across the guide at which the image is cut
-#: Direction of the pair of real torques, hip to knee. The largest pair along it is what `joint_torque` returns.
+_STATES = 41  # number of errors across the guide at which the image is evaluated
+#: Ratio of the real torques of hip and knee in the pair that `joint_torque` returns.
 _DIRECTION = np.array([5.0, 3.0])
-_KNEE_SPACING = math.radians(0.05)  # rad, largest distance between the knee angles at which the mass matrix is taken
+_KNEE_SPACING = math.radians(0.05)  # rad, largest spacing of the knee angles at which the mass matrix is evaluated
 
 
 @dataclass(frozen=True)
 class HandOver:
-    """Deviations from the nominal start of a step with which a joint is handed over to the guide.
+    """Largest deviations from the nominal start of a step at which a joint is handed over to the guide.
 
     Raises:
-        ValueError: a value that is negative or not finite.
+        ValueError: If a value is negative or not finite.
     """
 
     deviation: float = math.radians(2.0)  # rad, largest |s(0)|
@@ -82,7 +83,7 @@ class HandOver:
 
 @dataclass(frozen=True)
 class JointTorque:
-    """Largest disturbances of the real joints, together and in any direction and order, inside the filter's bounds."""
+    """Largest disturbances of the real joints, together and in any direction and order, within the bounds of the filter."""
 
     hip: float  # Nm, at SH
     knee: float  # Nm, at SK
@@ -91,28 +92,28 @@ class JointTorque:
 
 @dataclass(frozen=True)
 class JointCertificate:
-    """What holds for one joint."""
+    """Certificate of one joint."""
 
     joint: str  # SH or SK
-    margin: float  # 1 - largest e / q_bound from the re-centred state; negative: it is left
-    tightest_phase: float  # where along the step, t / T
-    side: str  # upper or lower
-    u_ext: tuple[float, float]  # Nm on the separate inertia, the bounds the filter is built for
-    #: Nm on the separate inertia, the same bounds scaled to where the margin is zero; (0, 0): there is none. A filter built
-    #: for these holds them, the filter at hand does not.
+    margin: float  # 1 - largest e / q_bound from the re-centred state; negative: the joint may leave the guide
+    tightest_phase: float  # phase of the smallest margin, t / T
+    side: str  # side of the smallest margin, upper or lower
+    u_ext: tuple[float, float]  # Nm on the separate inertia, disturbance bounds of the filter
+    #: Disturbance bounds scaled to a margin of zero, Nm on the separate inertia; (0, 0): no bounds are admissible. Only a
+    #: filter configured with these bounds holds them, not the filter of this certificate.
     u_ext_max: tuple[float, float]
-    torque: float  # Nm on the separate inertia, largest |u_b| along the way
-    torque_limit: float  # Nm on the separate inertia, what the filter counts on
-    image_empty_at: float  # first phase at which no state at all is safe; infinity where there is always one
-    hand_over_max: float  # the hand-over box may be this much larger before the margin is zero
+    torque: float  # Nm on the separate inertia, largest |u_b| along the step
+    torque_limit: float  # Nm on the separate inertia, torque limit less the reserve of the filter
+    image_empty_at: float  # first phase without a safe state; infinity if every phase has one
+    hand_over_max: float  # factor by which the hand-over box can grow until the margin is zero
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """Whether a guide holds on the model, and if not, why.
+    """Result of the certification of a guide on the model, with the reason.
 
-    `joint_torque` is what the running filter is built for: real torque at the joints. It is None where the guide is not
-    certified, and where `certify` was not given the mass matrix.
+    `joint_torque` is the real torque at the joints that corresponds to the bounds of the filter. It is None if the guide is not
+    certified or if `certify` was called without the mass matrix.
     """
 
     shape: str
@@ -124,25 +125,25 @@ class Certificate:
 
     @property
     def margin(self) -> float:
-        """The smaller margin of the two joints."""
+        """Return the smaller margin of the two joints."""
         return min(joint.margin for joint in self.joints)
 
 
 def certify(
     guide: GuideFilter, xi: float, hand_over: HandOver | None = None, inertia: AssistedInertia | None = None
 ) -> Certificate:
-    """Certificate of a guide at an assistance factor.
+    """Compute the certificate of a guide at an assistance factor.
 
     Args:
-        guide: gives shape, gains, inertia, disturbance bounds, gait and deadbeat; it is not changed.
+        guide: filter with shape, gains, inertia, disturbance bounds, gait and re-centring; it is not changed.
         xi: assistance factor in [0, 1].
-        hand_over: deviations from the baseline controller; None: the default of `HandOver`.
-        inertia: mass matrix of SH and SK, for `Certificate.joint_torque`.
+        hand_over: largest deviations at the hand-over from the baseline controller; None: the default of `HandOver`.
+        inertia: mass matrix of SH and SK, for `Certificate.joint_torque`; None: `joint_torque` is None.
     """
     hand_over = hand_over or HandOver()
     bounds = guide.shape.bounds(guide.time / guide.deadbeat.duration, xi)
     joints = (_joint(guide, bounds, 0, hand_over), _joint(guide, bounds, 1, hand_over))
-    reason = next((said for said in map(_complaint, joints) if said), "")
+    reason = next((complaint for complaint in map(_complaint, joints) if complaint), "")
     if reason:
         return Certificate(guide.shape.name, xi, False, reason, joints)
     worst = min(joints, key=lambda joint: joint.margin)
@@ -150,7 +151,7 @@ def certify(
         guide.shape.name,
         xi,
         True,
-        f"{100 * worst.margin:.0f} % of the guide is left where it is tightest, {worst.joint} at "
+        f"smallest margin {100 * worst.margin:.0f} % of the guide, {worst.joint} at "
         f"{worst.tightest_phase:.2f} T ({worst.side} side)",
         joints,
         None if inertia is None else joint_torque(guide, xi, hand_over, inertia),
@@ -158,16 +159,16 @@ def certify(
 
 
 def joint_torque(guide: GuideFilter, xi: float, hand_over: HandOver, inertia: AssistedInertia) -> JointTorque:
-    """Largest pair of real torques, 5 at the hip to 3 at the knee, inside the bounds the filter is built for.
+    """Return the largest pair of real torques, hip to knee as 5 to 3, within the disturbance bounds of the filter.
 
-    With A = J M(q_SK)^-1 it is the largest pair for which |A| (hip, knee) is at most the bounds, row by row, at every knee
-    angle from the lowest to the highest that the guide and the deadbeat allow along the step. It is rounded down to 0.01 Nm.
+    With A = J M(q_SK)^-1 it is the largest pair for which |A| (hip, knee) is at most the bounds, row by row. This holds at every
+    knee angle that the guide and the re-centring allow along the step. The pair is rounded down to 0.01 Nm.
 
     Args:
-        guide: gives gait, deadbeat, shape and disturbance bounds.
+        guide: filter with gait, re-centring, shape and disturbance bounds.
         xi: assistance factor in [0, 1].
-        hand_over: deviations that the deadbeat starts from.
-        inertia: gives M and J.
+        hand_over: largest deviations at the step change.
+        inertia: mass matrix M and separate inertias J.
     """
     bounds = np.array([min(-low, high) for low, high in guide.config.disturbance]) + 0.0  # no -0.0
     low, high = _knee_range(guide, xi, hand_over)
@@ -180,20 +181,25 @@ def joint_torque(guide: GuideFilter, xi: float, hand_over: HandOver, inertia: As
 
 
 def _knee_range(guide: GuideFilter, xi: float, hand_over: HandOver) -> Pair:
-    """Lowest and highest angle of SK along a step inside the guide: q_nom + s + e [rad]."""
+    """Return the lowest and the highest angle of SK along a step inside the guide, q_nom + s + e [rad]."""
     time = guide.time[: guide.cycles + 1]
     phase = time / guide.deadbeat.duration
     upper, lower = guide.shape.bounds(phase, xi).T
     nominal = bezier(guide.nominal[1:], phase)[:, 0]
-    # As for the margin, a corner of the hand-over box is the worst.
+    # s is linear in the deviations, so a corner of the hand-over box is the worst case.
     moved = np.abs(guide.deadbeat.basis(time)[0]).T @ [hand_over.deviation, hand_over.rate]
     return float((nominal - moved - lower).min()), float((nominal + moved + upper).max())
 
 
 def largest_assistance(guide: GuideFilter, margin: float, hand_over: HandOver | None = None) -> float:
-    """Up to which assistance factor a guide is certified with a margin; negative: not even at 0.
+    """Return the largest assistance factor at which a guide is certified with a margin; -1 if it is not certified at 0.
 
-    Guides close as Xi grows, so it is found by bisection, to 0.01 and never too large.
+    Guides become narrower as Xi grows, so the factor is found by bisection. It is at most 0.01 too small and never too large.
+
+    Args:
+        guide: filter to certify; it is not changed.
+        margin: smallest accepted `Certificate.margin`, fraction of the guide.
+        hand_over: largest deviations at the step change; None: the default of `HandOver`.
     """
 
     def held(xi: float) -> bool:
@@ -213,7 +219,7 @@ def _joint(guide: GuideFilter, bounds: Vector, joint: int, hand_over: HandOver) 
     policy, (low, high), time = guide.config.policies[joint], guide.config.disturbance[joint], guide.time
     response = _from_rest(policy, guide.forced[joint], time)
     up, down = policy.disturbance(time, low, high)
-    # Linear in the deviations, so a corner of the box is the worst: (n, 2) of (e, e'), up to a sign.
+    # The response is linear in the deviations, so a corner of the box is the worst case: (n, 2) of (e, e'), up to a sign.
     d, r = hand_over.deviation, hand_over.rate
     same, opposite = d * response.deviation + r * response.rate, d * response.deviation - r * response.rate
     moved = np.maximum(np.abs(same[:, 0]), np.abs(opposite[:, 0]))
@@ -255,44 +261,47 @@ def _joint(guide: GuideFilter, bounds: Vector, joint: int, hand_over: HandOver) 
 
 
 def _complaint(joint: JointCertificate) -> str:
-    """Return why a joint is not certified, empty if it is; in parts of the bounds, which are not the joint's Nm."""
+    """Return why a joint is not certified, or "" if it is.
+
+    Values are percentages of the bounds, because the bounds are torques on separate inertias and not on the real joint.
+    """
     if math.isfinite(joint.image_empty_at):
         return (
-            f"no state of {joint.joint} is safe: at {joint.tightest_phase:.2f} T the guide is narrower, or closes faster, "
-            "than the backup policy holds against the disturbance its filter is built for"
+            f"no state of {joint.joint} is safe: at {joint.tightest_phase:.2f} T the guide is too narrow, or closes too fast, "
+            "for the backup policy under the disturbance bounds of the filter"
         )
     if not joint.margin >= 0.0:
         return (
             f"{joint.joint} may leave the guide by {-100 * joint.margin:.0f} % at {joint.tightest_phase:.2f} T "
-            f"({joint.side} side) under the disturbance its filter is built for"
+            f"({joint.side} side) under the disturbance bounds of the filter"
         )
     if joint.torque > joint.torque_limit:
         return (
-            f"the backup policy of {joint.joint} needs {100 * joint.torque / joint.torque_limit:.0f} % of the torque it may "
-            "count on, from the re-centred state"
+            f"from the re-centred state the backup policy of {joint.joint} needs "
+            f"{100 * joint.torque / joint.torque_limit:.0f} % of its torque limit less the reserve"
         )
     return ""
 
 
 def _from_rest(policy: BackupPolicy, forced: ForcedResponse, time: Vector) -> ForcedResponse:
-    """The forced responses that start at e = 0, e' = 0."""
+    """Return the forced responses that start at e = 0, e' = 0."""
     phi = policy.transition(time)
     return ForcedResponse(*(part - phi @ part[0] for part in forced))
 
 
 def _smallest_ratio(room: Vector, taken: Vector) -> float:
-    """How often `taken` goes into `room` where it goes least; infinity where nothing is taken."""
+    """Return the smallest room / taken, at least 0; entries with taken = 0 count as infinity."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return max(0.0, float(np.where(taken > 0.0, room / taken, np.inf).min()))
 
 
 def _image(guide: GuideFilter, bounds: Vector, joint: int, cycle: int) -> tuple[Vector, Vector, Vector]:
-    """The safe backward image at a cycle: for errors e across the guide, the speeds e' between which it is safe.
+    """Return the safe backward image at a cycle: the interval of safe speeds e' for each error e across the guide.
 
-    Each point of the horizon bounds Phi11 e + Phi12 e' on both sides: an interval of e' for each e.
+    Each point of the horizon bounds Phi11 e + Phi12 e' on both sides, which gives an interval of e' for each e.
 
     Returns:
-        e, lowest and highest e', each shape (m,); lowest > highest where no e' is safe.
+        Errors e, lowest e' and highest e', each of shape (m,); lowest > highest where no e' is safe.
     """
     policy, (low, high) = guide.config.policies[joint], guide.config.disturbance[joint]
     points = np.concatenate([[cycle], guide.grid[guide.grid > cycle]])

@@ -1,13 +1,14 @@
 r"""Virtual guide filter of the swing leg's SH and SK, with the exact flow of the backup policy.
 
-`e, e' of both joints -> safe backward image h -> lambda -> u_v`. Each cycle asks where the backup policy would lead the
-two joints over the rest of the step under the worst disturbances, and lets it act the more, the closer that comes to
-the guide. The flow is linear (see `backup_policy`), so the answer is a few products over the horizon for each joint and both
-extremes, not an integration; where the backup policy would saturate the drive, it is piece by piece (`kernel`).
+`e, e' of both joints -> safe backward image h -> lambda -> u_v`. Each cycle predicts the motion of the two joints under the
+backup policy over the rest of the step, for the worst disturbances. The closer the prediction comes to the guide, the larger is
+the share of the backup policy in the torque. The flow is linear (see `backup_policy`), so the prediction takes a few products
+over the horizon for each joint and both extremes, and no integration. Where the backup policy would saturate the drive, the
+prediction is piecewise (see `kernel`).
 
-The horizon is a grid of `points` intervals ending at T, the same points all step long, plus `overlap` beyond T: there
-the joint goes on along the next step's nominal and the guide keeps its last width. Without it the last cycles of a
-step look no further than the step's end, and admit any speed there (see `certificate`).
+The horizon is a grid of `points` intervals that ends at T, with the same points during the whole step, plus `overlap` after T.
+After T the joint follows the nominal trajectory of the next step, and the guide keeps its last width. Without the overlap the
+prediction in the last cycles would end at T, and any speed would be admitted there (see `certificate`).
 """
 
 from __future__ import annotations
@@ -31,43 +32,51 @@ Pair = tuple[float, float]
 
 @dataclass(frozen=True)
 class GuideConfig:
-    """What the guide filter needs to know of the two assisted joints, SH then SK.
+    """Parameters of the guide filter for the two assisted joints, SH then SK.
 
     Raises:
-        ValueError: a disturbance interval that does not contain zero, or a number out of range.
+        ValueError: If a disturbance interval does not contain zero, or if a number is out of range.
     """
 
     policies: tuple[BackupPolicy, BackupPolicy]
     disturbance: tuple[tuple[float, float], tuple[float, float]]  # Nm, (u_ext_min, u_ext_max) of each joint
     points: int = 100  # grid intervals over a step
-    overlap: float = 0.1  # s, horizon beyond the step's end
+    overlap: float = 0.1  # s, length of the horizon after the end of the step
     zeta: float = 0.01  # s, gain of the derivative term lambda_d
-    derivative_time: float = 0.005  # s, time constant of the low pass on dh/dt
-    reserve: float = 0.1  # part of the torque limit the rollouts do not count on: it corrects what a cycle is late
+    derivative_time: float = 0.005  # s, time constant of the low-pass filter on dh/dt
+    reserve: float = (
+        0.1  # fraction of the torque limit that the rollouts do not use; compensates for a delay of one cycle
+    )
 
     def __post_init__(self) -> None:
         for low, high in self.disturbance:
             if not (math.isfinite(low) and math.isfinite(high) and low <= 0.0 <= high):
-                raise ValueError(f"a disturbance bound is (min <= 0, max >= 0) in Nm, not {(low, high)!r}")
+                raise ValueError(f"disturbance must be (min <= 0, max >= 0) in Nm for each joint, got {(low, high)!r}")
         if self.points < 2:
-            raise ValueError(f"points is at least 2, not {self.points!r}")
+            raise ValueError(f"points must be at least 2, got {self.points!r}")
         if not 0.0 <= self.reserve < 1.0:
-            raise ValueError(f"reserve is a part of the torque limit in [0, 1), not {self.reserve!r}")
+            raise ValueError(f"reserve must be a fraction of the torque limit in [0, 1), got {self.reserve!r}")
         for name in ("overlap", "zeta", "derivative_time"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
-                raise ValueError(f"{name} is not negative and finite, in s, not {getattr(self, name)!r}")
+                raise ValueError(f"{name} must be finite and at least 0 s, got {getattr(self, name)!r}")
 
 
 class GuideFilter:
-    """The filter on both joints, for one gait and one shape; the same for either swing leg, by symmetry.
+    """Guide filter of both joints, for one gait and one shape; by symmetry it serves either swing leg.
 
     Call `start_step` at each step change, then `tick` once a cycle.
 
     Attributes:
-        joints, flow, step: what `kernel` works on, SH and SK; h, gate and guide in `joints` are of the last tick.
-        nominal: as given, Bezier control points of SH and SK, shape (2, 8) [rad].
-        cycles, stride, grid, horizon: cycles of a step, of a grid interval, of the grid points, of the horizon's end.
-        time: of every cycle to the horizon's end [s]; `forced`: responses of SH and SK on it that P is made of.
+        joints: records of SH and SK for `kernel`, dtype JOINT; h, gate and guide are those of the last tick.
+        flow: table `flow` of `kernel` for SH and SK, shape (2, horizon + 1, 9).
+        step: table `step` of `kernel` for SH and SK, shape (2, horizon + 1, 6).
+        nominal: Bezier control points of SH and SK, shape (2, 8) [rad].
+        cycles: cycles of a step.
+        stride: cycles of a grid interval.
+        grid: cycles of the grid points.
+        horizon: cycle at the end of the horizon.
+        time: time of every cycle to the end of the horizon [s].
+        forced: forced responses of SH and SK at `time`, from which P is computed.
     """
 
     def __init__(
@@ -82,12 +91,15 @@ class GuideFilter:
         """Prepare every table of a step.
 
         Args:
-            nominal: Bezier control points of the swing leg's SH and SK, shape (2, 8) [rad].
-            following: of the same joints in the step after, when the leg stands, shape (2, 8) [rad].
-            feedforward: of u_f where it is applied, shape (2, 8) [Nm].
+            config: gains, disturbance bounds and horizon.
+            shape: shape of the guide.
+            deadbeat: re-centring of the gait.
+            nominal: Bezier control points of SH and SK of the swing leg, shape (2, 8) [rad].
+            following: Bezier control points of the same joints in the next step, as stance leg, shape (2, 8) [rad].
+            feedforward: Bezier control points of u_f, shape (2, 8) [Nm]; None: no feedforward.
 
         Raises:
-            ValueError: a bound of the shape is not finite or is too small at a cycle of the step, see `GuideShape.bounds`.
+            ValueError: If a bound of the shape is not finite or too small at a cycle of the step, see `GuideShape.bounds`.
         """
         self.config, self.shape, self.deadbeat, self.nominal = config, shape, deadbeat, nominal
         self.cycles = round(deadbeat.duration / PERIOD)
@@ -105,7 +117,7 @@ class GuideFilter:
             curve = policy, deadbeat, nominal[joint], following[joint], self.time, uf
             self.forced.append(forced_response(*curve))
             tables.append(np.concatenate([self.forced[joint], free_drift(*curve)], axis=2))
-        #: First columns of `step`: of the nominal, per deviation, per rate. Shape (3, 2, horizon + 1, 4).
+        #: First columns of `step` for the nominal, per unit of deviation and per unit of rate. Shape (3, 2, horizon + 1, 4).
         self._parts = np.stack(tables, axis=1)
         self.flow = np.array([_flow(config, joint, self.time) for joint in (0, 1)])
         self.step = np.empty((2, self.horizon + 1, 6))
@@ -115,7 +127,7 @@ class GuideFilter:
         self._tick(self.joints.copy(), self.flow, self.step, 0, 0.0, 0.0, 0.0, 0.0)
 
     def start_step(self, xi: float, deviation: Pair, rate: Pair) -> None:
-        """Take the step change: width from Xi, P from what the deadbeat has to undo.
+        """Start a step: compute the width from Xi and P from the deviations at the step change.
 
         Args:
             xi: assistance factor of the whole step.
@@ -130,46 +142,55 @@ class GuideFilter:
         joints["xi"], joints["fresh"] = xi, True
 
     def tick(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Pair:
-        """u_v of SH and SK [Nm].
+        """Return u_v of SH and SK [Nm].
 
         Args:
-            cycle: since the step change; past the step's end it stays there.
-            e_hip, e_knee: q - q_des [rad].
-            ed_hip, ed_knee: q' - q_des' [rad/s].
+            cycle: cycles since the step change; limited to the length of the step.
+            e_hip: q - q_des of SH [rad].
+            ed_hip: q' - q_des' of SH [rad/s].
+            e_knee: q - q_des of SK [rad].
+            ed_knee: q' - q_des' of SK [rad/s].
         """
         cycle = min(cycle, self.cycles)
         return self._tick(self.joints, self.flow, self.step, cycle, e_hip, ed_hip, e_knee, ed_knee)
 
     @property
     def tables(self) -> tuple[npt.NDArray[np.void], Vector, Vector]:
-        """`joints`, `flow` and `step`."""
+        """Return `joints`, `flow` and `step`, the tables of `kernel`."""
         return self.joints, self.flow, self.step
 
     @property
     def h(self) -> list[float]:
-        """Safe backward image function at the last tick, SH and SK; at least 0 inside it."""
+        """Return the safe backward image function h of SH and SK at the last tick; it is at least 0 inside the image."""
         return list(self.joints["h"].tolist())
 
     @property
     def gates(self) -> list[float]:
-        """lambda + (1 - lambda) lambda_d at the last tick, SH and SK."""
+        """Return lambda + (1 - lambda) lambda_d of SH and SK at the last tick."""
         return list(self.joints["gate"].tolist())
 
     @property
     def bounds(self) -> list[float]:
-        """Guide at the last tick, upper and lower [rad]."""
+        """Return the upper and the lower distance to the guide at the last tick [rad]."""
         return [float(self.joints[side][0]) for side in ("upper", "lower")]
 
     @property
     def stepped(self) -> int:
-        """Rollouts so far that were not linear, because the backup policy saturates along them."""
+        """Return the number of rollouts computed cycle by cycle, because the backup policy saturates along them."""
         return int(self.joints["stepped"].sum())
 
     def rollouts(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Vector:
-        """Errors the unsaturated backup policy leads to at the rest of the grid, from the exact flow.
+        """Predict the errors under the unsaturated backup policy at the remaining grid points, from the exact flow.
+
+        Args:
+            cycle: cycles since the step change.
+            e_hip: q - q_des of SH [rad].
+            ed_hip: q' - q_des' of SH [rad/s].
+            e_knee: q - q_des of SK [rad].
+            ed_knee: q' - q_des' of SK [rad/s].
 
         Returns:
-            Shape (4, n) [rad]: of SH the largest e and the largest -e under the disturbance bounds, then of SK.
+            Largest e and largest -e of SH under the disturbance bounds, then of SK, shape (4, n) [rad].
         """
         points = self.grid[self.grid >= cycle].tolist()
         rolled = []
@@ -180,7 +201,7 @@ class GuideFilter:
         return np.array(rolled).swapaxes(1, 2).reshape(4, len(points))
 
     def solution(self) -> Vector:
-        """P of this step on the cycle grid, (e, e') of SH then of SK. Shape (horizon + 1, 4) [rad, rad/s]."""
+        """Return P of this step at every cycle, (e, e') of SH, then of SK. Shape (horizon + 1, 4) [rad, rad/s]."""
         hip, knee = self.step[:, :, P : P + 2]
         return np.hstack([hip, knee])
 
@@ -202,7 +223,7 @@ def _joints(config: GuideConfig, first: int, stride: int) -> npt.NDArray[np.void
 
 
 def _flow(config: GuideConfig, joint: int, time: Vector) -> Vector:
-    """The joint's `flow` of `kernel`, shape (n, 9)."""
+    """Return the table `flow` of `kernel` for one joint, shape (n, 9)."""
     policy, (low, high) = config.policies[joint], config.disturbance[joint]
     phi, (s, rate) = policy.transition(time), policy.step_response(time).T
     largest, smallest = policy.disturbance(time, low, high)

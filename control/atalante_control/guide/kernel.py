@@ -1,11 +1,11 @@
-"""A cycle of the virtual guide filter: `e, e' of a joint, tables of the step -> h -> lambda -> u_v`, as machine code.
+"""Compiled cycle of the virtual guide filter: `e, e' of a joint, tables of the step -> h -> lambda -> u_v`.
 
-`GuideFilter` prepares the tables and runs `tick` compiled. The flow of the backup policy is linear as long as the drive
-gives the torque it asks for (`_linear`). Where it does not, the rollout goes cycle by cycle (`limited`): the torque is constant
-and the error a known drift plus a parabola, until the drive comes off its limit and the flow is linear for the rest.
+`GuideFilter` prepares the tables and runs `tick` compiled. The flow of the backup policy is linear as long as its torque is
+within the limit of the drive (`_linear`). Beyond the limit the rollout is computed cycle by cycle (`limited`): the torque is
+constant, and the error is a known drift plus a parabola. When the torque is within the limit again, the flow is linear.
 
-Everything is of one joint here: its row of JOINT; `flow`, one row a cycle ahead, shape (horizon + 1, 9); and `step`, one
-row a cycle since the step change, shape (horizon + 1, 6).
+Three tables describe a joint: its record of dtype JOINT; `flow`, one row for each cycle ahead, shape (horizon + 1, 9); and
+`step`, one row for each cycle since the step change, shape (horizon + 1, 6).
 """
 
 from __future__ import annotations
@@ -21,36 +21,36 @@ from atalante_control.gait.gait import PERIOD
 Vector = npt.NDArray[np.float64]
 Pair = tuple[float, float]
 
-#: What the filter knows of a joint: what stays, what a step gives it, and what the last tick found.
+#: Record of a joint: constants, values of the step and results of the last tick.
 JOINT = np.dtype(
     [
-        *((name, np.float64) for name in ("kp", "kd", "inertia", "limit")),  # the backup policy
-        ("counted", np.float64),  # Nm, part of its limit the rollouts count on
+        *((name, np.float64) for name in ("kp", "kd", "inertia", "limit")),  # of the backup policy
+        ("counted", np.float64),  # Nm, torque limit less the reserve, used by the rollouts
         ("up", np.float64),  # Nm, u_ext_max
         ("down", np.float64),  # Nm, u_ext_min
         *((name, np.float64) for name in ("phi11", "phi12", "phi21", "phi22", "s1", "s2")),  # Phi and S of one cycle
-        ("monotone", np.bool_),
+        ("monotone", np.bool_),  # see `BackupPolicy.monotone`
         ("first", np.int64),  # cycle of the first point of the grid
-        ("stride", np.int64),  # cycles from one to the next
-        ("zeta", np.float64),  # s
-        ("smoothing", np.float64),  # of dh/dt, part of a new value that is taken
+        ("stride", np.int64),  # cycles between two points of the grid
+        ("zeta", np.float64),  # s, gain of the derivative term
+        ("smoothing", np.float64),  # weight of a new value in the low-pass filter of dh/dt
         ("xi", np.float64),  # assistance factor of the step
-        ("fresh", np.bool_),  # the step has not had a tick: there is no h to compare with
-        ("h", np.float64),
+        ("fresh", np.bool_),  # true before the first tick of a step, when dh/dt is not defined
+        ("h", np.float64),  # safe backward image function
         ("rate", np.float64),  # 1/s, dh/dt
         ("gate", np.float64),  # lambda + (1 - lambda) lambda_d
-        ("upper", np.float64),  # rad, guide
-        ("lower", np.float64),
-        ("stepped", np.int64),  # rollouts so far that were not linear
+        ("upper", np.float64),  # rad, distance to the guide above
+        ("lower", np.float64),  # rad, distance to the guide below
+        ("stepped", np.int64),  # number of rollouts computed cycle by cycle
     ]
 )
-#: Columns of `flow`: what a unit of e and e' becomes as error, then what the disturbance adds to it at most, up and down;
-#: the same of the torque Kp e + Kd e'; and the error under a constant 1 Nm.
+#: Columns of `flow`: error per unit of e and of e', then the largest error added by the disturbance, up and down; the same four
+#: columns for the torque Kp e + Kd e'; then the error under a constant torque of 1 Nm.
 ERROR, ERROR_ADDED, TORQUE, TORQUE_ADDED, STEADY = 0, 2, 4, 6, 8
-#: Columns of `step`: P, P' of the loop; the drift without any torque, and its rate; guide, upper and lower.
+#: Columns of `step`: P and P' of the loop; the drift without torque and its rate; the guide, upper and lower.
 P, DRIFT, BOUND = 0, 2, 4
 
-_HOPELESS = 2.0  # |e| / q_bound from which a rollout is left: lambda is 1 from 1 on
+_HOPELESS = 2.0  # |e| / q_bound at which a rollout ends early; lambda is 1 for every value above 1
 
 
 def tick(
@@ -63,7 +63,21 @@ def tick(
     e_knee: float,
     ed_knee: float,
 ) -> Pair:
-    """u_v of SH and SK [Nm], from the tables of SH, then SK. What is found on the way goes into `joints`."""
+    """Compute u_v of SH and SK of one cycle.
+
+    Args:
+        joints: records of SH and SK, shape (2,), dtype JOINT; the results of the tick are written to them.
+        flow: tables `flow` of SH and SK, shape (2, horizon + 1, 9).
+        step: tables `step` of SH and SK, shape (2, horizon + 1, 6).
+        cycle: cycles since the step change, at most the length of the step.
+        e_hip: q - q_des of SH [rad].
+        ed_hip: q' - q_des' of SH [rad/s].
+        e_knee: q - q_des of SK [rad].
+        ed_knee: q' - q_des' of SK [rad/s].
+
+    Returns:
+        u_v of SH and SK [Nm].
+    """
     return (
         _act(joints[0], flow[0], step[0], cycle, e_hip, ed_hip),
         _act(joints[1], flow[1], step[1], cycle, e_knee, ed_knee),
@@ -83,7 +97,12 @@ def _act(joint: Any, flow: Vector, step: Vector, cycle: int, e: float, ed: float
 
 
 def gate(h: float, xi: float) -> float:
-    """lambda of the paper, (1 + (Xi^10 - 1) h)^3, clamped to [0, 1]; 1 outside the safe backward image."""
+    """Return lambda of the paper, (1 + (Xi^10 - 1) h)^3, clamped to [0, 1]; 1 outside the safe backward image.
+
+    Args:
+        h: safe backward image function, at most 1.
+        xi: assistance factor in [0, 1].
+    """
     if h <= 0.0:
         return 1.0
     base = 1.0 + (xi**10 - 1.0) * h
@@ -91,9 +110,10 @@ def gate(h: float, xi: float) -> float:
 
 
 def damped_gate(gate: float, rate: float, zeta: float) -> float:
-    """lambda + (1 - lambda) lambda_d with lambda_d = zeta max(0, -dh/dt) clamped to 1; in [0, 1] for lambda in it.
+    """Return lambda + (1 - lambda) lambda_d, with lambda_d = zeta max(0, -dh/dt) clamped to 1.
 
     Args:
+        gate: lambda, in [0, 1]; the result is then in [0, 1] too.
         rate: dh/dt [1/s].
         zeta: derivative gain [s].
     """
@@ -104,10 +124,10 @@ def damped_gate(gate: float, rate: float, zeta: float) -> float:
 
 
 def _largest_ratio(joint: Any, flow: Vector, step: Vector, cycle: int, e: float, ed: float) -> float:
-    """Largest |e| / q_bound now and ahead, under both extremes.
+    """Return the largest |e| / q_bound now and ahead, under both extreme disturbances.
 
-    Only the rollouts along which the drive saturates against the side they are to be held from are stepped: one of a
-    monotone loop that saturates the other way stays below the linear rollout, which is kept as its bound.
+    A rollout is computed cycle by cycle only if the drive saturates while it pushes away from the side of the rollout. A
+    rollout of a monotone loop that saturates in the other direction stays below the linear rollout, which then is its bound.
     """
     worst = float(e / step[cycle, BOUND] if e > 0.0 else -e / step[cycle, BOUND + 1])
     asked = (joint["kp"] * e + joint["kd"] * ed) / joint["counted"]
@@ -123,7 +143,10 @@ def _largest_ratio(joint: Any, flow: Vector, step: Vector, cycle: int, e: float,
 
 
 def _linear(joint: Any, flow: Vector, step: Vector, cycle: int, e: float, ed: float) -> tuple[Pair, Pair]:
-    """Largest |e| / q_bound and largest torque over what is counted on, of the linear rollouts up and down the grid."""
+    """Return the largest |e| / q_bound and the largest torque over `counted` of the linear rollouts.
+
+    Each is a pair: rollout under the upper extreme disturbance, then under the lower one.
+    """
     kp, kd, monotone = joint["kp"], joint["kd"], joint["monotone"]
     y, yd = e - step[cycle, P], ed - step[cycle, P + 1]
     above = below = torque_above = torque_below = -math.inf
@@ -141,17 +164,29 @@ def _linear(joint: Any, flow: Vector, step: Vector, cycle: int, e: float, ed: fl
 
 
 def errors_ahead(flow: Vector, step: Vector, y: float, yd: float) -> Pair:
-    """Largest e and largest -e [rad] at a point ahead, of a linear rollout. Args: rows of the tables; state less P."""
+    """Return the largest e and the largest -e of a linear rollout at a point ahead [rad].
+
+    Args:
+        flow: row of `flow` for the number of cycles to the point.
+        step: row of `step` of the point.
+        y: e less P at the start of the rollout [rad].
+        yd: e' less P' at the start of the rollout [rad/s].
+    """
     error = flow[ERROR] * y + flow[ERROR + 1] * yd + step[P]
     return error + flow[ERROR_ADDED], flow[ERROR_ADDED + 1] - error
 
 
 def limited(joint: Any, flow: Vector, step: Vector, side: int, cycle: int, e: float, ed: float) -> float:
-    """Largest |e| / q_bound ahead where the drive saturates: e under the upper extreme (0), or -e under the lower one (1).
+    """Return the largest |e| / q_bound ahead of a rollout along which the drive saturates.
 
     Args:
-        cycle: since the step change.
-        e, ed: error [rad] and its rate [rad/s] then.
+        joint: record of the joint, dtype JOINT.
+        flow: table `flow` of the joint.
+        step: table `step` of the joint.
+        side: 0: e under the upper extreme disturbance; 1: -e under the lower extreme disturbance.
+        cycle: cycles since the step change at the start of the rollout.
+        e: error at the start [rad].
+        ed: rate of the error at the start [rad/s].
     """
     sign, external = (-1.0, joint["down"]) if side else (1.0, joint["up"])
     limit, horizon, start, worst, linear = joint["counted"], len(step) - 1, cycle, 0.0, False
@@ -173,7 +208,7 @@ def limited(joint: Any, flow: Vector, step: Vector, side: int, cycle: int, e: fl
             e = then[DRIFT] + y + (yd + 0.5 * gained) * PERIOD
             ed = then[DRIFT + 1] + yd + gained
         cycle += 1
-        # What the worst disturbance adds to a constant extreme: nothing in a monotone loop.
+        # Difference between the worst disturbance and the constant extreme, which is zero in a monotone loop.
         ahead = flow[cycle - start]
         allowance = ahead[ERROR_ADDED + side] - sign * external * ahead[STEADY]
         worst = max(worst, (sign * e + allowance) / then[BOUND + side])

@@ -1,7 +1,7 @@
-"""Shapes of the virtual guide: how wide the tube is along a step, above and below the desired trajectory.
+"""Shapes of the virtual guide: its width along a step, above and below the desired trajectory.
 
-`shape, assistance factor -> bounds over the phase -> guide filter, certificate, plots`. The shape is free in the paper;
-its full half-width is the paper's 0.5 + 7 (1 - Xi) degrees.
+`shape, assistance factor -> bounds over the phase -> guide filter, certificate, plots`. The paper leaves the shape open. The full
+half-width is that of the paper, 0.5 + 7 (1 - Xi) degrees.
 """
 
 from __future__ import annotations
@@ -15,35 +15,44 @@ import numpy.typing as npt
 
 Vector = npt.NDArray[np.float64]
 
-PINCH_WIDTH = math.radians(1.0)  # rad, what the pinched guide closes to
-SNAP_WIDTH = math.radians(0.1)  # rad, what the snapping guide closes to
-#: Smallest bound of a shape [rad], about two encoder counts at the joint. A positive bound far below it overflows the filter's h.
+PINCH_WIDTH = math.radians(1.0)  # rad, smallest half-width of the shape `pinched`
+SNAP_WIDTH = math.radians(0.1)  # rad, smallest half-width of the shape `snap`
+#: Smallest bound of a shape [rad], about two encoder counts at the joint. A much smaller bound overflows h in the filter.
 NARROWEST = 1e-6
-#: Phases and assistance factors at which a shape is checked when it is made.
+#: Phases and assistance factors at which a shape is checked on construction.
 _CHECKED_PHASES = np.linspace(0.0, 1.0, 2001)
 _CHECKED_FACTORS = np.linspace(0.0, 1.0, 21).tolist()
 
 
 def half_width(xi: float) -> float:
-    """Full half-width of the guide [rad] for an assistance factor: 0.5 + 7 (1 - Xi) degrees.
+    """Return the full half-width of the guide for an assistance factor, 0.5 + 7 (1 - Xi) degrees, in rad.
+
+    Args:
+        xi: assistance factor in [0, 1].
 
     Raises:
-        ValueError: Xi outside [0, 1].
+        ValueError: If Xi is outside [0, 1].
     """
     if not 0.0 <= xi <= 1.0:
-        raise ValueError(f"the assistance factor is between 0 and 1, not {xi!r}")
+        raise ValueError(f"assistance factor must be between 0 and 1, got {xi!r}")
     return math.radians(0.5 + 7.0 * (1.0 - xi))
 
 
 @dataclass(frozen=True)
 class GuideShape:
-    """A named shape. `fractions(phase, half_width)` gives the parts of the half-width, upper and lower, each (n,).
+    """Named shape of the guide.
 
-    A shape is evaluated when it is made, at 2001 phases and 21 assistance factors. `GuideFilter` evaluates it again at every
-    cycle of its step, and `bounds` checks whatever it returns.
+    A shape is checked on construction, at 2001 phases and 21 assistance factors. `GuideFilter` checks it again at every cycle of
+    its step, and `bounds` checks every result.
+
+    Attributes:
+        name: name of the shape, for options and messages.
+        summary: one line that describes the shape.
+        fractions: function of phases (n,) and the half-width [rad]. It returns the fractions of the half-width above and below
+            the desired trajectory, each of shape (n,).
 
     Raises:
-        ValueError: a bound is not finite or is smaller than `NARROWEST`, or `fractions` returns other array shapes.
+        ValueError: If a bound is not finite or is below `NARROWEST`, or if `fractions` returns other array shapes.
     """
 
     name: str
@@ -54,30 +63,30 @@ class GuideShape:
         self.check(_CHECKED_PHASES)
 
     def check(self, phase: Vector) -> None:
-        """Evaluate the bounds at the phases, for assistance factors from 0 to 1.
+        """Check the bounds at the given phases, for assistance factors from 0 to 1.
 
         Args:
             phase: (t - t_i) / T, shape (n,).
 
         Raises:
-            ValueError: as for `bounds`.
+            ValueError: If a bound is not valid, as for `bounds`.
         """
         for xi in _CHECKED_FACTORS:
             self.bounds(phase, xi)
 
     def bounds(self, phase: Vector, xi: float) -> Vector:
-        """Distances from the desired trajectory to the guide.
+        """Return the distances from the desired trajectory to the guide.
 
         Args:
-            phase: (t - t_i) / T, shape (n,); what is past 1 gets the width at 1.
+            phase: (t - t_i) / T, shape (n,); a phase above 1 gets the width at 1.
             xi: assistance factor in [0, 1].
 
         Returns:
-            Shape (n, 2) [rad], upper and lower, finite and at least `NARROWEST`.
+            Upper and lower distance, shape (n, 2) [rad], finite and at least `NARROWEST`.
 
         Raises:
-            ValueError: a bound is not finite or is too small; `fractions` returns other than two arrays of shape (n,); Xi is
-                outside [0, 1].
+            ValueError: If a bound is not finite or too small, if `fractions` does not return two arrays of shape (n,), or if Xi
+                is outside [0, 1].
         """
         width, phase = half_width(xi), np.clip(phase, 0.0, 1.0)
         sides = [np.asarray(side, dtype=np.float64) for side in self.fractions(phase, width)]
@@ -128,17 +137,17 @@ def _snap(phase: Vector, width: float) -> tuple[Vector, Vector]:
 
 
 def _rise(phase: Vector, start: float, end: float) -> Vector:
-    """From 0 at `start` to 1 at `end`, half a cosine."""
+    """Return a half cosine that rises from 0 at phase `start` to 1 at phase `end`."""
     x = np.clip((phase - start) / (end - start), 0.0, 1.0)
     return np.asarray(0.5 - 0.5 * np.cos(math.pi * x))
 
 
-CONSTANT = GuideShape("constant", "the same width all along the step", _constant)
+CONSTANT = GuideShape("constant", "constant width along the step", _constant)
 WIDENING = GuideShape("widening", "half width at the start, full at the end", _widening)
 NARROWING = GuideShape("narrowing", "full width at the start, half at the end", _narrowing)
 PINCHED = GuideShape("pinched", "full width until 0.4 T, closing to 1 degree by 0.8 T", _pinched)
 ASYMMETRIC = GuideShape("asymmetric", "full width above, 0.6 of it below", _asymmetric)
-SNAP = GuideShape("snap", "closes to 0.1 degrees in 0.02 T: what no backup policy follows", _snap)
+SNAP = GuideShape("snap", "closes to 0.1 degrees within 0.02 T, too fast for any backup policy", _snap)
 
-#: The shapes that ship, by name. `snap` cannot be certified; it shows how that is announced.
+#: Shapes of this package, by name. `snap` cannot be certified; it demonstrates the report of this case.
 SHAPES = {shape.name: shape for shape in (CONSTANT, WIDENING, NARROWING, PINCHED, ASYMMETRIC, SNAP)}

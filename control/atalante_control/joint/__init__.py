@@ -1,1 +1,1 @@
-"""Control of the joints: PID, idealization, flat foot and haptics."""
+"""Control of single joints: PID, joint idealization, flat foot and haptics."""

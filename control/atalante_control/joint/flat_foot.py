@@ -1,9 +1,9 @@
-r"""Flat foot: swing ankle angles that hold the sole level, from the tibia IMU, or from the joints where that is silent.
+r"""Flat foot: swing ankle angles that hold the sole level, from the tibia IMU, or from the joints if that IMU is lost.
 
-`tibia attitude -> SA, HA targets`, in place of the nominal ones, for the same PID. The foot's attitude in the world is
-:math:`R_{tibia} R_z(\text{toe}) R_y(q_{SA}) R_a(q_{HA})`; the sole is level when this takes the sole's normal to the
-vertical. With :math:`g` the vertical seen from the ankle and the henke axis :math:`a = (a_x, 0, a_z)`, the y component
-of :math:`R_a e_z` is :math:`-a_x \sin q_{HA}` and SA does not change it, which gives HA; SA then turns the x-z plane.
+`tibia attitude -> SA, HA targets`. The targets replace the nominal ones of the PID. The attitude of the foot in the world is
+:math:`R_{tibia} R_z(\text{toe}) R_y(q_{SA}) R_a(q_{HA})`. The sole is level when this rotation maps the normal of the sole to the
+vertical. Let :math:`g` be the vertical in the ankle frame and :math:`a = (a_x, 0, a_z)` the henke axis. The y component of
+:math:`R_a e_z` is :math:`-a_x \sin q_{HA}` and does not depend on SA, which gives HA. SA then rotates in the x-z plane.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ Quaternion = tuple[float, float, float, float]
 Vector3 = tuple[float, float, float]
 
 _SA, _HA = LEG_JOINTS.index("SA"), LEG_JOINTS.index("HA")
-_STOP_MARGIN, _STOP_FADE = math.radians(1.0), math.radians(3.0)  # off the ankle's limits
+_STOP_MARGIN, _STOP_FADE = math.radians(1.0), math.radians(3.0)  # distances to the limits of the ankle
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
-_IMU_AGE = 10  # cycles after which what an IMU said is no longer used, its timeout in the DBC
+_IMU_AGE = 10  # largest age of a valid IMU message in cycles, its timeout in the DBC
 
-#: An ankle: what stays, then what a step change leaves to its deadbeat.
+#: Record of an ankle: constants, then the deviations at the step change for the re-centring.
 ANKLE = np.dtype(
     [
-        ("geometry", np.float64, 4),  # of `FlatFoot`
-        ("offset", np.float64),  # rad, on SA
-        ("joints", np.int64, 2),  # SA and HA in JOINTS
-        ("low", np.float64, 2),  # rad, where they are to stay
-        ("high", np.float64, 2),
+        ("geometry", np.float64, 4),  # `FlatFoot.geometry`
+        ("offset", np.float64),  # rad, added to SA
+        ("joints", np.int64, 2),  # indices of SA and HA in JOINTS
+        ("low", np.float64, 2),  # rad, smallest targets
+        ("high", np.float64, 2),  # rad, largest targets
         ("deviation", np.float64, 2),  # rad, from the target at the step change
         ("rate", np.float64, 2),  # rad/s
     ],
@@ -54,29 +54,33 @@ class FlatFoot:
     """Ankle geometry of one foot.
 
     Raises:
-        ValueError: a henke axis with a y component, or with no x component.
+        ValueError: If the henke axis has a y component or no x component.
     """
 
-    toe_out: float  # rad, foot about the tibia's vertical, positive to the left
+    toe_out: float  # rad, rotation of the foot about the vertical of the tibia, positive to the left
     axis: tuple[float, float, float]  # henke axis in the foot frame, any length
 
     def __post_init__(self) -> None:
         if self.axis[1] != 0.0 or self.axis[0] == 0.0:
-            raise ValueError(f"the henke axis lies in the foot's x-z plane and is not vertical, not {self.axis!r}")
+            raise ValueError(f"henke axis must have y = 0 and x != 0 in the foot frame, got {self.axis!r}")
 
     @property
     def geometry(self) -> tuple[float, float, float, float]:
-        """Cosine and sine of the toe-out, x and z of the unit henke axis."""
+        """Return cosine and sine of the toe-out, then x and z of the unit henke axis."""
         ax, _, az = self.axis
         norm = math.hypot(ax, az)
         return math.cos(self.toe_out), math.sin(self.toe_out), ax / norm, az / norm
 
 
 class Tibiae:
-    """Attitude and angular rate of the tibiae from the joints and the pelvis IMU: for a tibia whose own IMU is silent."""
+    """Attitude and angular velocity of the tibiae from the joints and the pelvis IMU, for a tibia whose IMU is lost."""
 
     def __init__(self, articulated: ArticulatedModel) -> None:
-        """Take a model with the pelvis fixed."""
+        """Prepare the forward kinematics.
+
+        Args:
+            articulated: model with the pelvis fixed.
+        """
         self._model, self._into, self._rates = articulated
         self._data = self._model.createData()
         self._pelvis, *self._tibiae = (
@@ -86,41 +90,43 @@ class Tibiae:
     def attitude(
         self, side: int, position: Vector, velocity: Vector, pelvis: Sequence[float], gyro: Sequence[float]
     ) -> tuple[Quaternion, Vector3]:
-        """What the tibia's IMU would say.
+        """Compute the measurement that the IMU of a tibia would make.
 
         Args:
             side: 0 left, 1 right.
-            position, velocity: shape (12,) [rad], [rad/s].
-            pelvis, gyro: attitude (unit quaternion wxyz) and angular velocity [rad/s] of the pelvis IMU.
+            position: joint angles, shape (12,) [rad].
+            velocity: joint speeds, shape (12,) [rad/s].
+            pelvis: attitude of the pelvis IMU, unit quaternion wxyz, pelvis to world.
+            gyro: angular velocity of the pelvis IMU in its own frame [rad/s].
 
         Returns:
-            Unit quaternion wxyz, tibia to world, and angular velocity in the tibia's frame [rad/s].
+            Unit quaternion wxyz, tibia to world, and angular velocity in the frame of the tibia [rad/s].
         """
         model, data, tibia = self._model, self._data, self._tibiae[side]
         q, v = pinocchio.neutral(model), np.zeros(model.nv)
         q[self._into], v[self._rates] = position, velocity
         pinocchio.forwardKinematics(model, data, q, v)
         pinocchio.updateFramePlacements(model, data)
-        seen = data.oMf[self._pelvis].rotation.T @ data.oMf[tibia].rotation  # from the pelvis
-        x, y, z, w = (pinocchio.Quaternion(*pelvis) * pinocchio.Quaternion(seen)).coeffs().tolist()
+        to_pelvis = data.oMf[self._pelvis].rotation.T @ data.oMf[tibia].rotation  # rotation, tibia to pelvis
+        x, y, z, w = (pinocchio.Quaternion(*pelvis) * pinocchio.Quaternion(to_pelvis)).coeffs().tolist()
         own = pinocchio.getFrameVelocity(model, data, tibia, pinocchio.ReferenceFrame.LOCAL).angular
-        p, q_rate, r = (own + seen.T @ np.asarray(gyro)).tolist()
+        p, q_rate, r = (own + to_pelvis.T @ np.asarray(gyro)).tolist()
         return (w, x, y, z), (p, q_rate, r)
 
 
 def flat_feet(parameters: ExoskeletonParameters) -> tuple[FlatFoot, FlatFoot]:
-    """Left and right foot of an exoskeleton."""
+    """Return the ankle geometry of the left and the right foot of an exoskeleton."""
     return FlatFoot(parameters.toe_out, parameters.ha_axis), FlatFoot(-parameters.toe_out, parameters.ha_axis)
 
 
 class LevelFeet:
-    """Flat-foot targets in the place of the nominal ones of the swing ankle, with a deadbeat of their own.
+    """Flat-foot targets that replace the nominal ones of the swing ankle, with their own re-centring.
 
-    Call `start_step` at each step change, then `put_level` once a cycle, or `put` where the tibia's IMU is not heard.
+    Call `start_step` at each step change, then `put_level` once a cycle, or `put` while the tibia IMU is lost.
 
     Attributes:
-        ankles: left and right, rows of ANKLE.
-        cubics: c0, c1 of the deadbeat and their derivatives, a row a cycle until it ends.
+        ankles: records of the left and the right ankle, dtype ANKLE.
+        cubics: c0 and c1 of the re-centring, then their derivatives, one row for each cycle until it ends.
     """
 
     def __init__(
@@ -135,9 +141,12 @@ class LevelFeet:
         """Prepare both ankles.
 
         Args:
-            articulated: with the pelvis fixed.
-            nominal: rows (q_nom, q_nom') of a step the left (0) and the right leg (1) swings in, each shape (n, 24).
-            offset: added to SA [rad].
+            robot: limits of the joints.
+            exoskeleton: geometry of the feet.
+            articulated: model with the pelvis fixed.
+            deadbeat: re-centring of the gait.
+            nominal: rows (q_nom, q_nom') of the step in which the left (0) and the right leg (1) swings, each of shape (n, 24).
+            offset: angle added to SA [rad].
         """
         self._nominal, self._tibiae = nominal, Tibiae(articulated)
         self.ankles = np.zeros(len(SIDES), ANKLE)
@@ -152,19 +161,36 @@ class LevelFeet:
         self.cubics = np.column_stack([c0, c1, c0d, c1d])
 
     def start_step(self, state: State, side: int) -> None:
-        """Leave what the ankle of the leg that swings now (0 left, 1 right) is off its target to the deadbeat."""
+        """Store the deviation of the swing ankle from its target for the re-centring.
+
+        Args:
+            state: measured state of the robot at the step change.
+            side: leg that swings now, 0 left, 1 right.
+        """
         ankle, (angles, rates) = self.ankles[side], self._target(state, side, 0)
         ankle["deviation"] = state.position[ankle["joints"]] - angles
         ankle["rate"] = state.velocity[ankle["joints"]] - rates
 
     def heard(self, state: State, side: int) -> bool:
-        """The tibia's IMU speaks: `put_level` may follow it."""
+        """Return whether the IMU of a tibia is valid, so that `put_level` can use it.
+
+        Args:
+            state: measured state of the robot.
+            side: 0 left, 1 right.
+        """
         return not state.imu_rows or bool(state.age[state.imu_rows[_TIBIAE[side]]] <= _IMU_AGE)
 
     def put(self, state: State, side: int, cycle: int, row: Vector) -> None:
-        """Targets without the tibia's IMU into a row (q_des, q_des') of shape (24,).
+        """Write the targets of the swing ankle into a row without the tibia IMU.
 
-        Its attitude comes from the joints and the pelvis IMU; without that one, too, the nominal holds.
+        The attitude of the tibia is computed from the joints and the pelvis IMU. If the pelvis IMU is lost too, the targets are
+        the nominal ones.
+
+        Args:
+            state: measured state of the robot.
+            side: swing leg, 0 left, 1 right.
+            cycle: cycles since the step change.
+            row: q_des [rad], then q_des' [rad/s], shape (24,); the entries of the swing ankle are overwritten.
         """
         _put(row, self.ankles[side], self.cubics, cycle, *self._target(state, side, cycle))
 
@@ -182,18 +208,23 @@ class LevelFeet:
 def put_level(
     row: Vector, ankles: npt.NDArray[np.void], side: int, cubics: Vector, cycle: int, tibia: Vector, gyro: Vector
 ) -> None:
-    """The targets of the swing leg's ankle (0 left, 1 right) into a row (q_des, q_des') of shape (24,).
+    """Write the targets of the swing ankle into a row from the tibia IMU.
 
     Args:
-        ankles, cubics: of `LevelFeet`.
-        tibia, gyro: as in `level`.
+        row: q_des [rad], then q_des' [rad/s], shape (24,); the entries of the swing ankle are overwritten.
+        ankles: `LevelFeet.ankles`.
+        side: swing leg, 0 left, 1 right.
+        cubics: `LevelFeet.cubics`.
+        cycle: cycles since the step change.
+        tibia: attitude of the tibia IMU, as in `level`.
+        gyro: angular velocity of the tibia, as in `level`.
     """
     angles, rates = _target(ankles[side], tibia, gyro)
     _put(row, ankles[side], cubics, cycle, angles, rates)
 
 
 def _put(row: Vector, ankle: Any, cubics: Vector, cycle: int, angles: Pair, rates: Pair) -> None:
-    """Targets with what their deadbeat adds."""
+    """Write the targets, with re-centring added, into a row (q_des, q_des')."""
     n = len(row) // 2
     for i in range(2):
         angle, rate, joint = angles[i], rates[i], ankle["joints"][i]
@@ -205,7 +236,7 @@ def _put(row: Vector, ankle: Any, cubics: Vector, cycle: int, angles: Pair, rate
 
 
 def _target(ankle: Any, tibia: Sequence[float] | Vector, gyro: Sequence[float] | Vector) -> tuple[Pair, Pair]:
-    """Angles and rates of SA and HA that hold the sole level, with the offset, within the joints' limits."""
+    """Return angles and rates of SA and HA that hold the sole level, with the offset and within the limits."""
     (sagittal, henke), rates = level(ankle["geometry"], tibia, gyro)
     low, high = ankle["low"], ankle["high"]
     sa, sa_rate = _within(sagittal + ankle["offset"], rates[0], low[0], high[0])
@@ -214,17 +245,17 @@ def _target(ankle: Any, tibia: Sequence[float] | Vector, gyro: Sequence[float] |
 
 
 def _within(angle: float, rate: float, low: float, high: float) -> Pair:
-    """Angle held within limits, with a speed that fades out before them rather than at them."""
+    """Return the angle limited to [low, high], and the rate, which fades to zero before the limits."""
     room = max(0.0, min(angle - low, high - angle) / _STOP_FADE)
     return min(high, max(low, angle)), rate * min(1.0, room)
 
 
 def level(geometry: Vector, tibia: Sequence[float] | Vector, gyro: Sequence[float] | Vector) -> tuple[Pair, Pair]:
-    """SA and HA that level the sole, or the nearest HA where the tibia leans too far sideways for it.
+    """Return SA and HA that level the sole, or the nearest HA if the tibia leans too far sideways.
 
     Args:
-        geometry: of `FlatFoot`.
-        tibia: attitude of the tibia IMU, unit quaternion wxyz, tibia to world; its heading does not matter.
+        geometry: `FlatFoot.geometry`.
+        tibia: attitude of the tibia IMU, unit quaternion wxyz, tibia to world; the heading has no effect.
         gyro: angular velocity of the tibia in its own frame [rad/s].
 
     Returns:
@@ -234,7 +265,7 @@ def level(geometry: Vector, tibia: Sequence[float] | Vector, gyro: Sequence[floa
     w, x, y, z = tibia[0], tibia[1], tibia[2], tibia[3]
     tx, ty, tz = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
     p, q, r = gyro[0], gyro[1], gyro[2]
-    txd, tyd, tzd = ty * r - tz * q, tz * p - tx * r, tx * q - ty * p  # the vertical, seen from a turning tibia
+    txd, tyd, tzd = ty * r - tz * q, tz * p - tx * r, tx * q - ty * p  # rate of the vertical in the tibia frame
     gx, gy, gxd, gyd = c * tx + s * ty, c * ty - s * tx, c * txd + s * tyd, c * tyd - s * txd
 
     sine = -gy / ax

@@ -1,7 +1,8 @@
 """Haptic feedback: `tracking error, guide, assistance factor -> levels of the eight vibration motors`.
 
-The paper's law: |e / q_bound| (1 - exp(30 (Xi - 1))), on the front of the limb where the joint is above its desired
-angle and on the back where it is below; thigh for the hip, shank for the knee, of the swing leg; silent at Xi = 1.
+Law of the paper: |e / q_bound| (1 - exp(30 (Xi - 1))). The front motor of the limb vibrates if the joint angle is above the
+desired angle, the back motor if it is below. The thigh motors belong to the hip and the shank motors to the knee of the
+swing leg. At Xi = 1 no motor vibrates.
 """
 
 from __future__ import annotations
@@ -15,26 +16,30 @@ from atalante_hal.robot import MOTORS
 
 Vector = npt.NDArray[np.float64]
 
-#: First motor (front) of thigh and shank, left leg and right leg; the motor behind it is the next.
+#: Index of the front motor of thigh and shank, for the left and the right leg. The next index is the back motor.
 _FRONT = tuple(
     tuple(MOTORS.index(f"{side}_{segment}_front") for segment in ("thigh", "shank")) for side in ("left", "right")
 )
 
 
 def intensity(xi: float) -> float:
-    """1 - exp(30 (Xi - 1)): close to 1 below Xi = 0.9, exactly 0 at Xi = 1."""
+    """Return 1 - exp(30 (Xi - 1)), which is close to 1 below Xi = 0.9 and exactly 0 at Xi = 1.
+
+    Args:
+        xi: assistance factor in [0, 1].
+    """
     return -math.expm1(30.0 * (xi - 1.0))
 
 
 def levels(leg: int, errors: tuple[float, float], bounds: tuple[float, float], intensity: float, out: Vector) -> Vector:
-    """Levels of all motors; those of the stance leg are zero.
+    """Compute the levels of all vibration motors; those of the stance leg are zero.
 
     Args:
         leg: swing leg, 0 left, 1 right.
         errors: q - q_des of SH and SK [rad].
-        bounds: distance from q_des to the guide on the error's side, SH and SK, positive [rad].
-        intensity: of `intensity(xi)`.
-        out: shape (8,), overwritten, order of MOTORS.
+        bounds: distance from q_des to the guide on the side of the error, SH and SK, positive [rad].
+        intensity: result of `intensity(xi)`.
+        out: levels in the order of MOTORS, shape (8,), overwritten.
 
     Returns:
         `out`, each level in [0, 1].

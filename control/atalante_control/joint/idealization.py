@@ -1,14 +1,14 @@
-"""Joint idealization: what makes an assisted joint feel like a free inertia. `q, q' -> u_i`, with u_g from `gravity`.
+"""Joint idealization: torques with which an assisted joint moves like a free inertia. `q, q' -> u_i`, with u_g from `gravity`.
 
-The paper's u_i = k_d sign(q') + k_v q' + u_g, with three things it leaves open settled here:
+The law of the paper is u_i = k_d sign(q') + k_v q' + u_g. Three points are decided here:
 
-- It prints sign(q) and k_v q; friction opposes the velocity, and that is what is meant.
-- sign is smoothed to tanh(q' / v_s): at rest the measured velocity changes sign with its noise, and a torque of
-  +-k_d each cycle would shake the joint.
-- The guide takes the two joints for separate inertias J, J q'' = u_v. They are not: hip and knee share the shank (3.6
-  kg m2 off the diagonal against 1.9 on it), so a torque on one throws the other, and a moving knee pulls at the hip.
-  `AssistedInertia` turns the torques meant for the separate inertias into those that give the coupled pair the same
-  accelerations, and gives the pair's velocity torques (centrifugal, Coriolis), which belong to u_i as gravity does.
+- The paper prints sign(q) and k_v q. Friction opposes the velocity, so this module uses q'.
+- The sign is smoothed to tanh(q' / v_s). At rest the measured velocity changes sign with its noise, and a torque of +-k_d in
+  each cycle would shake the joint.
+- The guide treats the two joints as separate inertias, J q'' = u_v. In fact hip and knee share the shank (3.6 kg m2 off the
+  diagonal of the mass matrix, 1.9 on it), so a torque on one joint accelerates the other, and a moving knee loads the hip.
+  `AssistedInertia` converts torques on the separate inertias to torques that cause the same accelerations of the coupled pair.
+  It adds the velocity torques of the pair (centrifugal, Coriolis), which are part of u_i like gravity.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ Pair = tuple[float, float]
 
 _ASSISTED = (LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"))
 
-#: What the merge knows of the assisted joints, SH and SK.
+#: Record of the parameters of `merge` for the assisted joints, SH and SK.
 LAW = np.dtype(
     [
-        ("fit", np.float64, (3, 3)),
-        ("inertias", np.float64, 2),
-        ("decoupled", np.bool_),
-        ("coulomb", np.float64, 2),
-        ("viscous", np.float64, 2),
-        ("smoothing", np.float64),
+        ("fit", np.float64, (3, 3)),  # kg m2, `AssistedInertia.fit`
+        ("inertias", np.float64, 2),  # kg m2, `AssistedInertia.inertias`
+        ("decoupled", np.bool_),  # true: convert the torques with the mass matrix
+        ("coulomb", np.float64, 2),  # Nm
+        ("viscous", np.float64, 2),  # Nm s/rad
+        ("smoothing", np.float64),  # rad/s
     ],
     align=True,
 )
@@ -44,10 +44,10 @@ LAW = np.dtype(
 
 @dataclass(frozen=True)
 class Friction:
-    """Joint friction as identified on the robot, each leg joint FH to HA.
+    """Joint friction as identified on the robot, for each leg joint FH to HA.
 
     Raises:
-        ValueError: not six values, a negative one, or a smoothing speed that is not positive.
+        ValueError: If a list does not have six values, a value is negative, or the smoothing speed is not positive.
     """
 
     coulomb: tuple[float, ...] = (4.0, 3.0, 5.0, 5.0, 2.0, 1.0)  # Nm, k_d
@@ -58,31 +58,37 @@ class Friction:
         for name in ("coulomb", "viscous"):
             values = getattr(self, name)
             if len(values) != len(LEG_JOINTS) or not all(math.isfinite(v) and v >= 0.0 for v in values):
-                raise ValueError(f"{name} is {len(LEG_JOINTS)} finite numbers, none negative, not {values!r}")
+                raise ValueError(f"{name} must be {len(LEG_JOINTS)} finite numbers of at least 0, got {values!r}")
         if not (math.isfinite(self.smoothing) and self.smoothing > 0.0):
-            raise ValueError(f"smoothing is a positive speed in rad/s, not {self.smoothing!r}")
+            raise ValueError(f"smoothing must be a positive speed in rad/s, got {self.smoothing!r}")
 
     def torque(self, joint: int, velocity: float) -> float:
-        """Compensation k_d tanh(q' / v_s) + k_v q' [Nm] of one of `LEG_JOINTS` by index."""
+        """Return the friction compensation k_d tanh(q' / v_s) + k_v q' of a joint [Nm].
+
+        Args:
+            joint: index in `LEG_JOINTS`.
+            velocity: q' [rad/s].
+        """
         return friction(velocity, self.coulomb[joint], self.viscous[joint], self.smoothing)
 
 
 class AssistedInertia:
-    """Mass matrix of SH and SK of one leg, which depends on the knee alone, in closed form.
+    """Mass matrix of SH and SK of one leg in closed form; it depends only on the knee angle.
 
-    The block is M(q_SK) = A + B cos q_SK + C sin q_SK; A, B, C come from three evaluations of Pinocchio's CRBA with the
-    other joints at rest in the middle of their swing.
+    The block is M(q_SK) = A + B cos q_SK + C sin q_SK. A, B and C follow from three evaluations of the CRBA of Pinocchio, with
+    the other joints at their mean angles of the swing.
 
     Attributes:
         inertias: J of SH and SK [kg m2], the largest diagonal of M along the swing.
-        fit: A, B, C of M11, of M12 and of M22, shape (3, 3) [kg m2].
+        fit: A, B, C (columns) of M11, M12 and M22 (rows), shape (3, 3) [kg m2].
     """
 
     def __init__(self, articulated: ArticulatedModel, swing: Vector) -> None:
-        """Identify the block of the left leg; the right one is the same by symmetry.
+        """Identify the block of the left leg; by symmetry it is also that of the right leg.
 
         Args:
-            swing: poses of a step the left leg swings in, shape (n, 12) [rad].
+            articulated: empty exoskeleton with the pelvis fixed.
+            swing: poses of a step in which the left leg swings, shape (n, 12) [rad].
         """
         posture = swing.mean(axis=0)
         model = articulated.model
@@ -105,30 +111,42 @@ class AssistedInertia:
         self.inertias: Pair = (float(blocks[:, 0].max()), float(blocks[:, 2].max()))
 
     def block(self, knee: float) -> tuple[float, float, float]:
-        """M11, M12, M22 [kg m2] at a knee angle [rad]; 1 is SH, 2 is SK."""
+        """Return M11, M12, M22 at a knee angle [kg m2]; index 1 is SH, index 2 is SK.
+
+        Args:
+            knee: angle of SK [rad].
+        """
         m11, m12, m22 = (self.fit[:, 0] + self.fit[:, 1] * math.cos(knee) + self.fit[:, 2] * math.sin(knee)).tolist()
         return m11, m12, m22
 
     def torques(self, knee: float, hip_rate: float, knee_rate: float, u: Pair) -> Pair:
-        """Torques of SH and SK [Nm] under which each moves as J q'' = u, while the leg's other joints rest.
+        """Return the torques of SH and SK under which each joint moves as J q'' = u, while the other joints rest [Nm].
 
         tau = M J^-1 u + c, with c the velocity torques of M(q_SK): c1 = M11' q1' q2' + M12' q2'^2, c2 = -M11' q1'^2 / 2.
 
         Args:
             knee: angle of SK [rad].
-            hip_rate, knee_rate: [rad/s].
-            u: torques meant for the separate inertias `inertias` [Nm].
+            hip_rate: speed of SH [rad/s].
+            knee_rate: speed of SK [rad/s].
+            u: torques on the separate inertias `inertias`, SH and SK [Nm].
         """
         return coupled(self.fit, self.inertias, knee, hip_rate, knee_rate, u)
 
     def ideal(self, knee: float, hip_rate: float, knee_rate: float, tau: Pair) -> Pair:
-        """Inverse of `torques`: what real torques `tau` without gravity are to the separate inertias [Nm]."""
+        """Return the torques on the separate inertias that are equivalent to real torques; inverse of `torques` [Nm].
+
+        Args:
+            knee: angle of SK [rad].
+            hip_rate: speed of SH [rad/s].
+            knee_rate: speed of SK [rad/s].
+            tau: real torques of SH and SK without gravity [Nm].
+        """
         c1, c2 = self.torques(knee, hip_rate, knee_rate, (0.0, 0.0))
         on_hip, on_knee = (self.ideal_of(knee) @ (tau[0] - c1, tau[1] - c2)).tolist()
         return on_hip, on_knee
 
     def ideal_of(self, knee: float) -> Vector:
-        """Return A = J M^-1, by which real torques without velocity torques count on the separate inertias. Shape (2, 2).
+        """Return A = J M^-1, which converts real torques, less velocity torques, to the separate inertias. Shape (2, 2).
 
         Args:
             knee: angle of SK [rad].
@@ -139,10 +157,12 @@ class AssistedInertia:
 
 
 def law_of(friction: Friction, inertia: AssistedInertia, decoupled: bool) -> npt.NDArray[np.void]:
-    """What `merge` knows, shape (1,).
+    """Return the parameters of `merge`, shape (1,), dtype LAW.
 
     Args:
-        decoupled: u_f + u_v are meant for the separate inertias and go through `AssistedInertia.torques`.
+        friction: friction to compensate.
+        inertia: mass matrix of SH and SK.
+        decoupled: whether u_f + u_v are torques on the separate inertias, which `AssistedInertia.torques` converts.
     """
     laws = np.zeros(1, LAW)
     law = laws[0]
@@ -155,15 +175,16 @@ def law_of(friction: Friction, inertia: AssistedInertia, decoupled: bool) -> npt
 def merge(
     laws: npt.NDArray[np.void], torque: Vector, gravity: Vector, q: Vector, qd: Vector, leg: int, w: float, u: Pair
 ) -> None:
-    """w u_t + (1 - w) (u_i + u_f + u_v) on SH and SK of the swing leg.
+    """Set the torque of SH and SK of the swing leg to w u_t + (1 - w) (u_i + u_f + u_v).
 
     Args:
-        laws: of `law_of`.
-        torque: u_t, shape (12,) [Nm]; those of SH and SK are overwritten.
+        laws: result of `law_of`.
+        torque: u_t, shape (12,) [Nm]; the entries of SH and SK are overwritten.
         gravity: u_g, shape (12,) [Nm].
-        q, qd: shape (12,) [rad], [rad/s].
-        leg: first joint of the swing leg.
-        w: share of the baseline in [0, 1).
+        q: measured angles, shape (12,) [rad].
+        qd: measured speeds, shape (12,) [rad/s].
+        leg: index of the first joint of the swing leg.
+        w: weight of the baseline in [0, 1).
         u: u_f + u_v of SH and SK [Nm].
     """
     law, hip, knee = laws[0], leg + _ASSISTED[0], leg + _ASSISTED[1]
@@ -176,12 +197,28 @@ def merge(
 
 
 def friction(velocity: float, coulomb: float, viscous: float, smoothing: float) -> float:
-    """Compensation k_d tanh(q' / v_s) + k_v q' [Nm]."""
+    """Return the friction compensation k_d tanh(q' / v_s) + k_v q' [Nm].
+
+    Args:
+        velocity: q' [rad/s].
+        coulomb: k_d [Nm].
+        viscous: k_v [Nm s/rad].
+        smoothing: v_s [rad/s].
+    """
     return coulomb * math.tanh(velocity / smoothing) + viscous * velocity
 
 
 def coupled(fit: Vector, inertias: Vector | Pair, knee: float, hip_rate: float, knee_rate: float, u: Pair) -> Pair:
-    """As `AssistedInertia.torques`."""
+    """Compute `AssistedInertia.torques` as a function, for the compiled kernel.
+
+    Args:
+        fit: `AssistedInertia.fit`.
+        inertias: `AssistedInertia.inertias`.
+        knee: angle of SK [rad].
+        hip_rate: speed of SH [rad/s].
+        knee_rate: speed of SK [rad/s].
+        u: torques on the separate inertias, SH and SK [Nm].
+    """
     c, s = math.cos(knee), math.sin(knee)
     m11, m12 = fit[0, 0] + fit[0, 1] * c + fit[0, 2] * s, fit[1, 0] + fit[1, 1] * c + fit[1, 2] * s
     m22 = fit[2, 0] + fit[2, 1] * c + fit[2, 2] * s

@@ -1,8 +1,8 @@
 """Joint PID of the baseline controller: `q_des, q_des' and measured q, q' -> tracking torque u_t` of twelve joints.
 
-Each leg has the gains of its role, stance or swing. The integral is a torque with a small limit of its own, and that of a joint
-whose torque was cut grows no further in the direction it was cut in, so that it cannot wind up; a joint led by the virtual guide
-integrates only as far as the baseline acts on it.
+Each leg has the gains of its role, stance or swing. The integral is a torque with a separate, small limit. Anti-windup: if the
+limiter reduced the torque of a joint, its integral does not grow further in that direction. The integral of a joint assisted by
+the virtual guide is scaled by the share of the baseline.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ LEFT, RIGHT = 0, 1
 
 @dataclass(frozen=True)
 class LegGains:
-    """PID gains of a leg's joints, FH to HA.
+    """PID gains of the joints of a leg, FH to HA.
 
     Raises:
-        ValueError: not six values, or one that is negative or not finite.
+        ValueError: If a list does not have six values, or if a value is negative or not finite.
     """
 
     kp: PerJoint  # Nm/rad
@@ -39,14 +39,14 @@ class LegGains:
         for name in ("kp", "ki", "kd"):
             values = getattr(self, name)
             if len(values) != len(LEG_JOINTS) or not all(math.isfinite(v) and v >= 0.0 for v in values):
-                raise ValueError(f"{name} is {len(LEG_JOINTS)} finite numbers, none negative, not {values!r}")
+                raise ValueError(f"{name} must be {len(LEG_JOINTS)} finite numbers of at least 0, got {values!r}")
 
 
 @dataclass(frozen=True)
 class PidGains:
     """Gains of both roles and the limit of the integral.
 
-    The defaults hold for walking on the ground, where the stance leg carries the robot.
+    The defaults are those for walking on the ground, where the stance leg carries the robot.
     """
 
     stance: LegGains = LegGains(
@@ -62,8 +62,8 @@ class PidGains:
     integral_limit: float = 10.0  # Nm
 
 
-#: In the air the stance leg carries nothing: its knee and ankle get the gains of a free leg, which would otherwise
-#: ring on the little inertia they move (0.16 and 0.04 kg m2 seen alone).
+#: Gains in the air. The stance leg carries no load there, so its TH, SK, SA and HA get the gains of a free leg. With the gains
+#: for the ground, knee and ankle would oscillate, because they move only a small inertia (0.16 and 0.04 kg m2).
 AIR_GAINS = PidGains(
     stance=LegGains(
         kp=(3000.0, 720.0, 3000.0, 900.0, 300.0, 180.0),
@@ -74,12 +74,13 @@ AIR_GAINS = PidGains(
 
 
 class Pid:
-    """The twelve PIDs. Call `start_step` at each step change, then `update` once a cycle.
+    """PIDs of the twelve joints. Call `start_step` at each step change, then `update` once a cycle.
 
     Attributes:
-        torque: last result, shape (12,) [Nm], overwritten by the next `update`; whoever asks for more than this adds it in place.
-        gains: Kp, Kd and what the integral grows by in a cycle, shape (3, 12).
-        integral: shape (12,) [Nm]; `limit`: the largest of it.
+        torque: last result, shape (12,) [Nm], overwritten by the next `update`. The caller adds further torques in place.
+        gains: Kp, Kd and Ki times the cycle, shape (3, 12).
+        integral: integral torque, shape (12,) [Nm].
+        limit: largest absolute value of the integral torque [Nm].
     """
 
     def __init__(self, gains: PidGains) -> None:
@@ -98,27 +99,27 @@ class Pid:
         self.update(np.zeros(2 * n), np.zeros(n), np.zeros(n))
 
     def reset(self) -> None:
-        """Empty the integrals."""
+        """Set all integrals to zero."""
         self.integral[:] = 0.0
 
     def start_step(self, stance: int, share: Vector) -> None:
-        """Give each leg the gains of its role.
+        """Set the gains of each leg according to its role.
 
         Args:
-            stance: LEFT or RIGHT.
-            share: how far the baseline acts on each joint, shape (12,) in [0, 1]; scales what is integrated.
+            stance: stance leg, LEFT or RIGHT.
+            share: share of the baseline in the torque of each joint, shape (12,), in [0, 1]; scales the integral gains.
         """
         self.gains[:] = self._gains_of[stance]
         self.gains[2] *= share
 
     def update(self, desired: Vector, q: Vector, qd: Vector, sent: Vector | None = None) -> Vector:
-        """u_t of one cycle.
+        """Compute the tracking torque u_t of one cycle.
 
         Args:
             desired: q_des [rad], then q_des' [rad/s], shape (24,).
-            q: shape (12,) [rad].
-            qd: shape (12,) [rad/s].
-            sent: what the limits left of `torque` as it is now, shape (12,) [Nm]; None: all of it.
+            q: measured angles, shape (12,) [rad].
+            qd: measured speeds, shape (12,) [rad/s].
+            sent: last `torque` after the limiter, shape (12,) [Nm]; None: not limited.
 
         Returns:
             `torque`.
@@ -131,7 +132,18 @@ class Pid:
 def control(
     desired: Vector, q: Vector, qd: Vector, gains: Vector, limit: float, sent: Vector, integral: Vector, torque: Vector
 ) -> None:
-    """u_t into `torque`, as in `Pid.update`."""
+    """Write u_t into `torque`, as in `Pid.update`.
+
+    Args:
+        desired: q_des [rad], then q_des' [rad/s], shape (24,).
+        q: measured angles, shape (12,) [rad].
+        qd: measured speeds, shape (12,) [rad/s].
+        gains: Kp, Kd and Ki times the cycle, shape (3, 12).
+        limit: largest absolute value of the integral torque [Nm].
+        sent: last `torque` after the limiter, shape (12,) [Nm].
+        integral: integral torque, shape (12,) [Nm], updated.
+        torque: last torque command, shape (12,) [Nm]; overwritten with u_t.
+    """
     n = len(q)
     for joint in range(n):
         error, rate = desired[joint] - q[joint], desired[n + joint] - qd[joint]

@@ -1,1 +1,1 @@
-"""Walk on the ground: detect contact of the swing foot."""
+"""Walking on the ground: contact detection of the swing foot."""

@@ -1,7 +1,7 @@
-"""Step switch: which leg stands, and when that changes. `foot force, time in the step -> step change`.
+"""Step switch on the ground: `foot force, time in the step -> step change`.
 
-On the ground a step ends when the swing foot has carried load for a few cycles on end; in the air, and on the ground
-never before a part of the step has passed, it ends by time (`gait.step_over`).
+On the ground a step ends when the swing foot has carried load for several consecutive cycles, but not before a given fraction
+of the step has passed. In the air a step ends by time (`gait.step_over`).
 """
 
 from __future__ import annotations
@@ -12,46 +12,46 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ImpactConfig:
-    """When a foot force counts as an impact.
+    """Thresholds of the impact detection.
 
     Raises:
-        ValueError: a release force not under the impact force, or a number out of range.
+        ValueError: If the release force is not below the impact force, or a number is out of range.
     """
 
     impact_force: float = 80.0  # N, vertical, on the swing foot
-    release_force: float = 30.0  # N, the foot must have been lighter than this since the last change
-    debounce: int = 5  # cycles on end over impact_force
-    earliest: float = 0.5  # fraction of the step before which nothing counts
+    release_force: float = 30.0  # N, the force must have been below this since the last step change
+    debounce: int = 5  # consecutive cycles at or above impact_force
+    earliest: float = 0.5  # fraction of the step before which no impact counts
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.release_force < self.impact_force < math.inf:
             raise ValueError(
-                f"release_force is not negative and under impact_force, in N, "
-                f"not {self.release_force!r} and {self.impact_force!r}"
+                f"release_force must be at least 0 N and below impact_force ({self.impact_force!r} N), "
+                f"got {self.release_force!r}"
             )
         if self.debounce < 1:
-            raise ValueError(f"debounce is at least 1 cycle, not {self.debounce!r}")
+            raise ValueError(f"debounce must be at least 1 cycle, got {self.debounce!r}")
         if not 0.0 <= self.earliest <= 1.0:
-            raise ValueError(f"earliest is a fraction of the step in [0, 1], not {self.earliest!r}")
+            raise ValueError(f"earliest must be a fraction of the step in [0, 1], got {self.earliest!r}")
 
 
 class ImpactDetector:
-    """Debounced impact of the swing foot."""
+    """Debounced detector of the impact of the swing foot."""
 
     def __init__(self, config: ImpactConfig) -> None:
         self._config = config
         self.start_step()
 
     def start_step(self) -> None:
-        """Forget the last step: the new swing foot has to leave the ground first."""
+        """Reset the detector; the new swing foot must leave the ground before an impact counts."""
         self._released, self._count = False, 0
 
     def update(self, vertical_force: float, phase: float) -> bool:
-        """True on the cycle the step ends. A force that is not a number counts as none.
+        """Return True in the cycle in which the step ends. A force of NaN counts as no force.
 
         Args:
-            vertical_force: on the swing foot, sum of its cells, upwards positive [N].
-            phase: time in the step over T.
+            vertical_force: force on the swing foot, sum of its cells, upwards positive [N].
+            phase: time in the step over its duration, t / T.
         """
         config = self._config
         if vertical_force < config.release_force:
