@@ -219,9 +219,7 @@ def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
         raise ArrayFileError(f"inputs must be {', '.join(INPUTS)}, got {about['inputs'].tolist()!r:.80}")
     for name, array in arrays.items():
         if name not in about and (array.dtype != np.float64 or not np.isfinite(array).all()):
-            raise ArrayFileError(
-                f"{name} must be an array of finite 64-bit floats, got {array.dtype} or a value not finite"
-            )
+            raise ArrayFileError(f"{name} must be an array of finite 64-bit floats, got {array.dtype}")
     layers = tuple(Layer(arrays[f"weights_{i}"], arrays[f"bias_{i}"]) for i in range(depth))
     low, high = arrays["low"], arrays["high"]
     width = len(INPUTS)

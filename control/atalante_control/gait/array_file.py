@@ -1,9 +1,9 @@
 """Small .npz files, read strictly: `file -> directory, sizes -> checksums -> headers -> named arrays`.
 
-A file decides nothing about memory. The directory of the zip archive is checked against the names and the size that the
-caller expects before a member is read, and decompression stops at the size that was declared. The CRC-32 of the zip format
-covers the bytes of each member but not which name they belong to, so one more member holds a SHA-256 over all names, types,
-shapes and bytes.
+The content of a file cannot cause a large memory allocation. Before a member is read, the directory of the zip archive is
+checked against the names and the size that the caller expects. Decompression stops at the declared size. The CRC-32 of the zip
+format covers the bytes of each member but not its name, so an additional member contains a SHA-256 over all names, types, shapes
+and bytes.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ _FLOAT: Final = np.dtype("<f8")
 
 
 class ArrayFileError(ValueError):
-    """The file does not hold the expected arrays; the message is a part of a sentence that does not name the file."""
+    """Error of a file without the expected arrays. The message does not contain the path; the caller adds it."""
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
-    """Write a file that `read_arrays` reads back to the bit. Write it completely or not at all.
+    """Write a file that `read_arrays` reads back bit for bit. The file is replaced as a whole or not at all.
 
     Args:
-        path: of the file, replaced if there is one.
+        path: path of the file, replaced if it exists.
         arrays: 64-bit floats and texts by name.
     """
     content = {**arrays, CHECKSUM: np.array(_checksum(arrays))}
@@ -53,28 +53,28 @@ def read_arrays(path: Path, allowed: Collection[str], size_max: int) -> dict[str
     """Read the arrays of a file that `write_arrays` wrote.
 
     Args:
-        path: of the file.
-        allowed: names of the arrays that the file may hold.
-        size_max: bytes the file may have, and bytes its members may have together after decompression.
+        path: path of the file.
+        allowed: valid names of arrays.
+        size_max: largest size of the file, and largest total size of its members after decompression, in bytes.
 
     Returns:
         The arrays by name, read-only, each 64-bit floats or text.
 
     Raises:
-        OSError: the file cannot be read.
-        ArrayFileError: anything else.
+        OSError: If the file cannot be read.
+        ArrayFileError: If the content of the file is not valid.
     """
     with path.open("rb") as stream:
         packed = stream.read(size_max + 1)
     if len(packed) > size_max:
-        raise ArrayFileError(f"it must have at most {size_max} bytes")
+        raise ArrayFileError(f"it must have at most {size_max} bytes, got more")
     try:
         with zipfile.ZipFile(io.BytesIO(packed)) as archive:
             members = _checked_directory(archive, allowed, size_max)
             arrays = {name: _array(name, _member(archive, member)) for name, member in members.items()}
     except ArrayFileError:
         raise
-    except Exception as error:  # zipfile and numpy raise a dozen types on damaged bytes, struct.error among them
+    except Exception as error:  # zipfile and numpy raise many types for damaged bytes, for example struct.error
         raise ArrayFileError(f"its zip archive or an array in it is damaged ({type(error).__name__})") from error
     expected = _checksum(arrays | {CHECKSUM: None})
     if (received := str(arrays.pop(CHECKSUM))) != expected:
@@ -83,16 +83,16 @@ def read_arrays(path: Path, allowed: Collection[str], size_max: int) -> dict[str
 
 
 def _checked_directory(archive: zipfile.ZipFile, allowed: Collection[str], size_max: int) -> dict[str, zipfile.ZipInfo]:
-    """Return the members by the name of their array, once their names, compression and declared sizes are as expected."""
+    """Return the members by array name after checking their names, compression and declared sizes."""
     members: dict[str, zipfile.ZipInfo] = {}
     for member in archive.infolist():
         name = member.filename.removesuffix(_SUFFIX)
         if member.filename != name + _SUFFIX or name not in (CHECKSUM, *allowed):
             raise ArrayFileError(
-                f"{member.filename[:40]!r} does not belong there; valid arrays are {', '.join(sorted(allowed))}"
+                f"{member.filename[:40]!r} is not a valid member; valid arrays are {', '.join(sorted(allowed))}"
             )
         if name in members:
-            raise ArrayFileError(f"{name} must be there once, got it twice")
+            raise ArrayFileError(f"{name} must occur once, got it twice")
         if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise ArrayFileError(f"{name} must be stored or deflated, got compression {member.compress_type}")
         members[name] = member
@@ -104,9 +104,9 @@ def _checked_directory(archive: zipfile.ZipFile, allowed: Collection[str], size_
 
 
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
-    """Return the bytes of a member, at most as many as declared; zipfile compares their CRC-32."""
+    """Return the bytes of a member, at most the declared size; zipfile checks their CRC-32."""
     with archive.open(member) as stream:
-        # With a size: `read()` would decompress everything there is before it looks at what was declared.
+        # `read()` without a size would decompress the whole member before the check of the declared size.
         content = stream.read(member.file_size + 1)
     if len(content) != member.file_size:
         raise ArrayFileError(f"{member.filename} must have the {member.file_size} bytes declared, got {len(content)}")
@@ -114,7 +114,7 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
 
 
 def _array(name: str, content: bytes) -> Array:
-    """Return the array of a .npy file in memory, read-only, which its bytes fill exactly."""
+    """Return the array of a .npy file in memory, read-only; the bytes must match its shape exactly."""
     stream = io.BytesIO(content)
     if (version := np.lib.format.read_magic(stream)) != (1, 0):
         raise ArrayFileError(f"{name} must have .npy version 1.0, got {version[0]}.{version[1]}")
@@ -124,21 +124,21 @@ def _array(name: str, content: bytes) -> Array:
     if fortran_order:
         raise ArrayFileError(f"{name} must be in C order")
     data = content[stream.tell() :]
-    # In integers of Python: a product of numpy's could wrap around.
+    # Python integers do not overflow; a NumPy product could.
     size = dtype.itemsize
     for length in shape:
         size *= length
     if len(data) != size:
         raise ArrayFileError(f"{name} must have the {size} bytes of its shape {shape}, got {len(data)}")
     if dtype.kind == "U":
-        data.decode("utf-32")  # numpy would notice only when the text is read
+        data.decode("utf-32")  # raises now; numpy would raise only when the text is used
     array = np.frombuffer(data, dtype).reshape(shape).copy()
     array.setflags(write=False)
     return array
 
 
 def _checksum(arrays: Mapping[str, Array | None]) -> str:
-    """Return the SHA-256 over name, type, shape and bytes of each array but the checksum, in hexadecimal digits."""
+    """Return the SHA-256 over name, type, shape and bytes of each array except the checksum, in hexadecimal digits."""
     digest = hashlib.sha256()
     for name, array in sorted(arrays.items()):
         if array is not None:

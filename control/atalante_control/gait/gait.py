@@ -1,8 +1,8 @@
 """Gait: twelve joint trajectories of one right-stance step as Bezier polynomials, read strictly from a file.
 
 `gait file -> Gait -> StepTables (1 ms) -> baseline controller, guide filter`. The left-stance step is the right-stance
-step of the mirrored robot: the legs swap and each joint takes its MIRROR_SIGN. A gait that does not continue through
-that swap, or that leaves the robot's limits, is refused when it is read, not when it is walked.
+step of the mirrored robot: the legs are swapped and each joint angle is multiplied by its MIRROR_SIGN. A gait that is not
+continuous at the step change, or that exceeds the limits of the robot, is rejected when the file is read.
 """
 
 from __future__ import annotations
@@ -26,69 +26,69 @@ Vector = npt.NDArray[np.float64]
 
 FORMAT = "atalante-gait/1"
 DEGREE = 7
-PERIOD = 1e-3  # s, the cycle; tables and step durations lie on it
+PERIOD = 1e-3  # s, control cycle; step durations are multiples of it
 AIRWALK_GAIT = Path(__file__).parents[1] / "gaits" / "airwalk.json"
 
-#: Joint i of the mirrored robot is joint SWAP[i] of the robot, times SIGN[i].
+#: Index and sign of mirroring: the angle of joint i of the mirrored robot is SIGN[i] times the angle of joint SWAP[i].
 SWAP = np.r_[len(LEG_JOINTS) : len(JOINTS), 0 : len(LEG_JOINTS)]
 SIGN = np.array(MIRROR_SIGN * len(SIDES), dtype=np.float64)
 
 POSITION_JUMP = math.radians(0.1)  # rad, largest discontinuity accepted at the step change
-VELOCITY_JUMP = 0.05  # rad/s
-DURATION_RANGE = (0.3, 3.0)  # s
-ROUNDING = 1e-9  # of the sums behind a table: a gait may touch a limit
+VELOCITY_JUMP = 0.05  # rad/s, largest discontinuity accepted at the step change
+DURATION_RANGE = (0.3, 3.0)  # s, shortest and longest step
+ROUNDING = 1e-9  # rounding error of a table entry, so that a gait may reach a limit exactly
 
 _REQUIRED = ("format", "name", "duration", "joints")
 _OPTIONAL = ("feedforward", "parameters", "solver")
 
 
 class GaitError(ValueError):
-    """The gait file is not a gait of this robot; the message names the key and what is valid."""
+    """Error of a gait that is not valid for this robot. The message gives the key and the valid values."""
 
     code = "GAIT_INVALID"
 
 
 @dataclass(frozen=True)
 class StepTables:
-    """A step sampled every cycle from 0 to T included: arrays of shape (N + 1, 12), read-only."""
+    """Step sampled at every cycle from 0 to T, both included: arrays of shape (N + 1, 12), read-only."""
 
     q: Vector  # rad
     qd: Vector  # rad/s
     qdd: Vector  # rad/s2
-    uf: Vector  # Nm, feedforward without gravity; zero where the gait has none
+    uf: Vector  # Nm, feedforward without gravity; zero if the gait has none
 
 
 @dataclass(frozen=True)
 class Gait:
-    """One right-stance step: the left leg swings. The step of the other leg is `mirrored()`."""
+    """Gait given by its right-stance step, in which the left leg swings. The left-stance step is `mirrored()`."""
 
     name: str
     duration: float  # s, T
     coefficients: Vector  # (12, 8) rad, Bezier control points in the order of JOINTS
-    feedforward: Vector | None = None  # (12, 8) Nm, Bezier control points of u_f, gravity not in it
-    parameters: Mapping[str, float] = field(default_factory=dict)  # what the gait was made for: patient, step length
-    solver: Mapping[str, Any] = field(default_factory=dict)  # how it was made; kept, never read
+    feedforward: Vector | None = None  # (12, 8) Nm, Bezier control points of u_f without gravity
+    parameters: Mapping[str, float] = field(default_factory=dict)  # parameters of patient and step
+    solver: Mapping[str, Any] = field(default_factory=dict)  # record of the solver, stored but not used
 
     @property
     def cycles(self) -> int:
-        """Cycles in a step, N."""
+        """Return the number of cycles in a step, N."""
         return round(self.duration / PERIOD)
 
     @property
     def hash32(self) -> int:
-        """CRC-32 of what is walked: duration, trajectories, feedforward."""
+        """Return the CRC-32 of duration, trajectories and feedforward."""
         content = np.float64(self.duration).tobytes() + np.ascontiguousarray(self.coefficients).tobytes()
         if self.feedforward is not None:
             content += np.ascontiguousarray(self.feedforward).tobytes()
         return zlib.crc32(content)
 
     def mirrored(self) -> Gait:
-        """The step with the other stance leg. Twice mirrored is the gait itself."""
+        """Return the step with the other stance leg. Mirroring twice gives the same gait."""
         feedforward = None if self.feedforward is None else _mirror(self.feedforward)
         return Gait(self.name, self.duration, _mirror(self.coefficients), feedforward, self.parameters, self.solver)
 
     def tables(self) -> StepTables:
-        """The step on the cycle grid."""
+        """Return the step sampled at every cycle."""
         phase = _cycle_phases(self)
         uf = np.zeros_like(self.coefficients) if self.feedforward is None else self.feedforward
         tables = (*motion(self.coefficients, self.duration, phase), bezier(uf, phase))
@@ -96,7 +96,15 @@ class Gait:
 
 
 def bezier(coefficients: Vector, phase: Vector) -> Vector:
-    """Bezier polynomials of control points (m, d + 1) at phases (n,) in [0, 1]. Shape (n, m)."""
+    """Evaluate Bezier polynomials.
+
+    Args:
+        coefficients: control points, shape (m, d + 1).
+        phase: phases in [0, 1], shape (n,).
+
+    Returns:
+        Values, shape (n, m).
+    """
     degree = coefficients.shape[1] - 1
     x = phase[:, None]
     k = np.arange(degree + 1)
@@ -106,12 +114,28 @@ def bezier(coefficients: Vector, phase: Vector) -> Vector:
 
 
 def derivative(coefficients: Vector) -> Vector:
-    """Control points of the derivative with respect to the phase: (m, d + 1) to (m, d)."""
+    """Return the control points of the derivative with respect to the phase.
+
+    Args:
+        coefficients: control points, shape (m, d + 1).
+
+    Returns:
+        Control points of the derivative, shape (m, d).
+    """
     return np.asarray((coefficients.shape[1] - 1) * np.diff(coefficients, axis=1))
 
 
 def motion(coefficients: Vector, duration: float, phase: Vector) -> tuple[Vector, Vector, Vector]:
-    """Angles, speeds and accelerations [rad, rad/s, rad/s2] of a step of `duration` [s] at phases (n,), each (n, m)."""
+    """Evaluate angles, speeds and accelerations of a step.
+
+    Args:
+        coefficients: Bezier control points of m joints, shape (m, d + 1) [rad].
+        duration: duration of the step [s].
+        phase: phases in [0, 1], shape (n,).
+
+    Returns:
+        Angles [rad], speeds [rad/s] and accelerations [rad/s2], each of shape (n, m).
+    """
     first = derivative(coefficients)
     return (
         bezier(coefficients, phase),
@@ -121,13 +145,28 @@ def motion(coefficients: Vector, duration: float, phase: Vector) -> tuple[Vector
 
 
 def control_points(phase: Vector, values: Vector) -> Vector:
-    """Control points of the polynomials nearest to samples: phases (n,), values (n, m), to (m, 8), read-only."""
+    """Return the control points of the polynomials of degree 7 that fit samples best (least squares).
+
+    Args:
+        phase: phases in [0, 1], shape (n,).
+        values: samples, shape (n, m).
+
+    Returns:
+        Control points, shape (m, 8), read-only.
+    """
     basis = bezier(np.eye(DEGREE + 1), phase)
     return _read_only(np.linalg.lstsq(basis, values, rcond=None)[0].T.astype(np.float64))
 
 
 def power_basis(coefficients: Vector) -> Vector:
-    """Coefficients in powers of the phase, lowest first, of Bezier control points. Shape kept, (m, d + 1)."""
+    """Convert Bezier control points to coefficients in powers of the phase, lowest first.
+
+    Args:
+        coefficients: control points, shape (m, d + 1).
+
+    Returns:
+        Coefficients, shape (m, d + 1).
+    """
     degree = coefficients.shape[1] - 1
     change = np.zeros((degree + 1, degree + 1))
     for power in range(degree + 1):
@@ -143,9 +182,13 @@ def load_gait(path: Path, robot: Robot) -> Gait:
     of the right-stance step); optional `feedforward` (the same, [Nm], gravity not in it), `parameters` (name: number),
     `solver` (anything).
 
+    Args:
+        path: path of the gait file.
+        robot: limits of the joints.
+
     Raises:
-        GaitError: unknown, missing or malformed key; a value that is not finite; a discontinuity through the step
-            change over 0.1 degrees or 0.05 rad/s; a position, speed or feedforward beyond the robot's limits.
+        GaitError: If a key is unknown, missing or malformed, if a value is not finite, if the discontinuity at the step change
+            exceeds 0.1 degrees or 0.05 rad/s, or if a position, speed or feedforward exceeds a limit of the robot.
     """
     try:
         document = json.loads(
@@ -156,20 +199,20 @@ def load_gait(path: Path, robot: Robot) -> Gait:
     except (ValueError, RecursionError) as error:
         raise GaitError(f"{path}: {error}") from error
     if not isinstance(document, dict):
-        raise GaitError(f"{path}: a gait file is a JSON object with the keys {', '.join(_REQUIRED)}")
+        raise GaitError(f"{path}: a gait file must be a JSON object with the keys {', '.join(_REQUIRED)}")
     if unknown := sorted(set(document) - {*_REQUIRED, *_OPTIONAL}):
         raise GaitError(f"{path}: {unknown[0]} is unknown; valid keys are {', '.join(_REQUIRED + _OPTIONAL)}")
     if missing := [key for key in _REQUIRED if key not in document]:
         raise GaitError(f"{path}: {missing[0]} is missing; required keys are {', '.join(_REQUIRED)}")
     if document["format"] != FORMAT:
-        raise GaitError(f"{path}: format is {FORMAT!r}, not {document['format']!r}")
+        raise GaitError(f"{path}: format must be {FORMAT!r}, got {document['format']!r}")
     name, parameters, solver = document["name"], document.get("parameters", {}), document.get("solver", {})
     if not (isinstance(name, str) and name):
-        raise GaitError(f"{path}: name is a text that is not empty, not {name!r}")
+        raise GaitError(f"{path}: name must be a text that is not empty, got {name!r}")
     if not isinstance(parameters, dict) or not all(_is_number(value) for value in parameters.values()):
-        raise GaitError(f"{path}: parameters is an object of finite numbers, not {parameters!r}")
+        raise GaitError(f"{path}: parameters must be an object of finite numbers, got {parameters!r}")
     if not isinstance(solver, dict):
-        raise GaitError(f"{path}: solver is an object, not {solver!r}")
+        raise GaitError(f"{path}: solver must be an object, got {solver!r}")
     gait = Gait(
         name,
         _check_duration(document["duration"], str(path)),
@@ -183,7 +226,12 @@ def load_gait(path: Path, robot: Robot) -> Gait:
 
 
 def write_gait(gait: Gait, path: Path) -> None:
-    """Write a gait file that `load_gait` reads back to the bit; it appears whole or not at all."""
+    """Write a gait file that `load_gait` reads back bit for bit. The file is replaced as a whole or not at all.
+
+    Args:
+        gait: gait to write.
+        path: path of the file, replaced if it exists.
+    """
     document: dict[str, Any] = {"format": FORMAT, "name": gait.name, "duration": gait.duration}
     document["joints"] = dict(zip(JOINTS, gait.coefficients.tolist(), strict=True))
     if gait.feedforward is not None:
@@ -197,19 +245,19 @@ def write_gait(gait: Gait, path: Path) -> None:
 def check_gait(
     gait: Gait, robot: Robot, where: str = "gait", gravity: Callable[[Vector], Vector] | None = None
 ) -> None:
-    """Refuse a gait that is malformed, jumps at the step change or leaves the robot's limits.
+    """Reject a gait that is malformed, jumps at the step change or exceeds the limits of the robot.
 
-    Angles, speeds and torques are compared with their limits in every cycle and at every turning point between cycles.
+    Angles, speeds and torques are compared with their limits at every cycle and at every extremum between cycles.
 
     Args:
-        gait: a right-stance step that repeats; its mirror image is checked too.
-        robot: with the limits.
+        gait: right-stance step that repeats; its mirror image is checked too.
+        robot: limits of the joints.
         where: first words of the message, for example the name of the file.
-        gravity: torque that the controller adds to the feedforward at a pose, (12,) [rad] to (12,) [Nm]; the torque limits
-            are those of the sum. Without it they are those of the feedforward alone.
+        gravity: function from a pose (12,) [rad] to the torque (12,) [Nm] that the controller adds to the feedforward. The torque
+            limits apply to the sum. None: they apply to the feedforward.
 
     Raises:
-        GaitError: names the joint, what is allowed, what was found and at which phase.
+        GaitError: If the gait is rejected. The message gives the joint, the limit, the value and the phase.
     """
     _check_form(gait, where)
     steps = {"right": gait, "left": gait.mirrored()}
@@ -222,17 +270,17 @@ def check_gait(
         worst = int(jump.argmax())
         if not jump[worst] <= limit:
             raise GaitError(
-                f"{where}: joints.{JOINTS[worst]} jumps by {jump[worst]:.4g} {unit} at the step change; "
-                f"at most {limit:.4g} {unit} is allowed against the mirrored start"
+                f"{where}: jump of joints.{JOINTS[worst]} at the step change must be at most {limit:.4g} {unit} to the "
+                f"mirrored start, got {jump[worst]:.4g} {unit}"
             )
-    # The mirrored step has mirrored limits: checking both steps also covers limits that are not symmetric.
+    # The limits of left and right joints may differ, so both steps are checked.
     for stance, step in steps.items():
         for phases in (_cycle_phases, _turning_points):
             _check_limits(step, phases(step), robot, gravity, where, stance)
 
 
 def _check_form(gait: Gait, where: str) -> None:
-    """Refuse arrays of another shape or type, numbers that are not finite and durations off the cycle grid."""
+    """Reject arrays of another shape or type, numbers that are not finite, and durations that are not whole cycles."""
     shape = len(JOINTS), DEGREE + 1
     for key, array in (("joints", gait.coefficients), ("feedforward", gait.feedforward)):
         if array is None and key == "feedforward":
@@ -248,13 +296,13 @@ def _check_form(gait: Gait, where: str) -> None:
             )
     _check_duration(
         float(gait.duration) if isinstance(gait.duration, float) else gait.duration, where
-    )  # numpy's is one
+    )  # converts a NumPy float, which is a subclass of float
 
 
 def _check_limits(
     gait: Gait, phase: Vector, robot: Robot, gravity: Callable[[Vector], Vector] | None, where: str, stance: str
 ) -> None:
-    """Refuse a step with an angle, speed or torque beyond its limit at one of the phases (n,)."""
+    """Reject a step with an angle, speed or torque beyond its limit at one of the phases (n,)."""
     q, qd, _ = motion(gait.coefficients, gait.duration, phase)
     torque = np.zeros_like(q) if gait.feedforward is None else bezier(gait.feedforward, phase)
     if gravity is not None:
@@ -277,14 +325,14 @@ def _check_limits(
 
 
 def _cycle_phases(gait: Gait) -> Vector:
-    """Return the phases of the cycles of a step, both ends included. Shape (N + 1,)."""
+    """Return the phases of the cycles of a step, both ends included, shape (N + 1,)."""
     return np.arange(gait.cycles + 1) / gait.cycles
 
 
 def _turning_points(gait: Gait) -> Vector:
-    """Return the phases in [0, 1] at which the angle, the speed or the feedforward of a joint is largest or smallest.
+    """Return the phases in [0, 1] at which the angle, speed or feedforward of a joint has an extremum, shape (n,).
 
-    A pair of roots that rounding made complex gives its real part, which is a phase like any other. Shape (n,).
+    Rounding can turn a double root into a complex pair, so the real part of every root is used. An extra phase does no harm.
     """
     slope = derivative(gait.coefficients)
     slopes = [slope, derivative(slope)]
@@ -296,7 +344,7 @@ def _turning_points(gait: Gait) -> Vector:
 
 
 def _check_duration(value: Any, where: str) -> float:
-    """Return a duration [s]. Raises `GaitError` unless it is a whole number of cycles in `DURATION_RANGE`."""
+    """Return a duration [s] after checking that it is a whole number of cycles in `DURATION_RANGE`."""
     low, high = DURATION_RANGE
     if not (_is_number(value) and low <= value <= high):
         raise GaitError(f"{where}: duration must be a number of seconds from {low} to {high}, got {value!r}")
@@ -308,24 +356,24 @@ def _check_duration(value: Any, where: str) -> float:
 
 def _control_points(path: Path, key: str, table: Any) -> Vector:
     if not isinstance(table, dict):
-        raise GaitError(f"{path}: {key} is an object with one list for each of {', '.join(JOINTS)}")
+        raise GaitError(f"{path}: {key} must be an object with one list for each of {', '.join(JOINTS)}")
     if unknown := sorted(set(table) - set(JOINTS)):
         raise GaitError(f"{path}: {key}.{unknown[0]} is unknown; valid joints are {', '.join(JOINTS)}")
     for joint in JOINTS:
         points = table.get(joint)
         if not isinstance(points, list) or len(points) != DEGREE + 1 or not all(_is_number(p) for p in points):
-            raise GaitError(f"{path}: {key}.{joint} is a list of {DEGREE + 1} finite numbers, not {points!r}")
+            raise GaitError(f"{path}: {key}.{joint} must be a list of {DEGREE + 1} finite numbers, got {points!r}")
     return _read_only(np.array([table[joint] for joint in JOINTS], dtype=np.float64))
 
 
 def _is_number(value: Any) -> bool:
     return (
         type(value) in (int, float) and abs(value) <= sys.float_info.max
-    )  # false for NaN, and no overflow of an integer
+    )  # false for NaN; an integer beyond the float range is compared without overflow
 
 
 def _refuse_constant(text: str) -> float:
-    raise ValueError(f"{text} is not allowed; every number in a gait file is finite")
+    raise ValueError(f"every number in a gait file must be finite, got {text}")
 
 
 def _without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -333,7 +381,7 @@ def _without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(found) < len(pairs):
         names = [name for name, _ in pairs]
         twin = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"{twin} is there twice; every key is given once")
+        raise ValueError(f"every key must occur once, got {twin} twice")
     return found
 
 
@@ -347,5 +395,10 @@ def _read_only(array: Vector) -> Vector:
 
 
 def step_over(cycle: int, cycles: int) -> bool:
-    """Step switch by time: True when `cycle` since the change has reached the step's length."""
+    """Return whether a step has ended by time.
+
+    Args:
+        cycle: cycles since the step change.
+        cycles: length of the step in cycles.
+    """
     return cycle >= cycles

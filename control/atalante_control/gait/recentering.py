@@ -1,10 +1,10 @@
-"""Re-centring, the paper's deadbeat: the cubic that joins the measured pose at a step change to the nominal trajectory.
+"""Re-centring ("deadbeat" in the paper): cubic from the measured pose at a step change to the nominal trajectory.
 
-`step change -> (q - q_nom, q' - q_nom') -> s(t) -> q_des(t) = q_nom(t) + s(t)`. The tracking error is exactly zero at
-the change and the nominal trajectory is met, with its velocity, alpha T later. s is linear in the two deviations:
-s(t) = s(0) c0(t) + s'(0) c1(t), and the guide filter uses the basis cubics c0 and c1 to prepare every response once.
+`step change -> (q - q_nom, q' - q_nom') -> s(t) -> q_des(t) = q_nom(t) + s(t)`. The tracking error is exactly zero at the step
+change. The desired trajectory reaches the nominal one, with its velocity, alpha T later. s is linear in the two deviations:
+s(t) = s(0) c0(t) + s'(0) c1(t). The guide filter therefore prepares every response once, from the basis cubics c0 and c1.
 
-The paper names the polynomial a deadbeat. It is a reference trajectory, not a finite-time (deadbeat) control law.
+The paper calls this polynomial a deadbeat. It is a reference trajectory, not a finite-time (deadbeat) control law.
 """
 
 from __future__ import annotations
@@ -20,41 +20,41 @@ Vector = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Deadbeat:
-    """Deadbeat of one gait.
+    """Re-centring ("deadbeat" in the paper) of one gait; a reference trajectory, not a finite-time control law.
 
     Raises:
-        ValueError: alpha outside (0, 1], or a duration that is not positive.
+        ValueError: If alpha is outside (0, 1], or the duration is not positive.
     """
 
     duration: float  # s, nominal duration of a step, T
-    alpha: float = 0.3  # fraction of T after which the nominal trajectory is met
+    alpha: float = 0.3  # fraction of T after which the nominal trajectory is reached
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.duration) and self.duration > 0.0):
-            raise ValueError(f"the step duration is positive and finite, in s, not {self.duration!r}")
+            raise ValueError(f"step duration must be positive and finite [s], got {self.duration!r}")
         if not 0.0 < self.alpha <= 1.0:
-            raise ValueError(f"the deadbeat's alpha is a fraction of a step in (0, 1], not {self.alpha!r}")
+            raise ValueError(f"alpha of the re-centring must be a fraction of a step in (0, 1], got {self.alpha!r}")
 
     @property
     def end(self) -> float:
-        """Time at which s and s' have become zero [s], alpha T."""
+        """Return the time alpha T from which s and s' are zero [s]."""
         return self.alpha * self.duration
 
     def polynomials(self) -> Vector:
-        """Basis cubics in powers of x = t / (alpha T): row 0 is c0, row 1 is c1 [s]. Shape (2, 4).
+        """Return the coefficients of c0 and c1 [s] in powers of x = t / (alpha T), shape (2, 4).
 
-        c0(0) = 1, c0'(0) = 0 and c1(0) = 0, c1'(0) = 1; both end at x = 1 with value and slope zero.
+        c0(0) = 1, c0'(0) = 0 and c1(0) = 0, c1'(0) = 1. At x = 1 the value and slope of both are zero.
         """
         return np.array([[1.0, 0.0, -3.0, 2.0], [0.0, self.end, -2.0 * self.end, self.end]])
 
     def basis(self, time: Vector) -> tuple[Vector, Vector, Vector]:
-        """Values, first and second time derivatives of c0 and c1, zero from alpha T on.
+        """Return the values and the first and second time derivatives of c0 and c1, zero from alpha T on.
 
         Args:
-            time: since the step change, shape (n,) [s], not negative.
+            time: time since the step change, shape (n,) [s], at least 0.
 
         Returns:
-            Three arrays of shape (2, n): of c0 [1, 1/s, 1/s2] and c1 [s, 1, 1/s].
+            Three arrays of shape (2, n), rows c0 and c1. Units of c0 are 1, 1/s, 1/s2; units of c1 are s, 1, 1/s.
         """
         x = time / self.end
         inside = x < 1.0
@@ -63,15 +63,15 @@ class Deadbeat:
         return tuple(np.where(inside, _values(p, x), 0.0) for p in (c, first, second))  # type: ignore[return-value]
 
     def s(self, time: Vector, deviation: Vector, rate: Vector) -> Vector:
-        """The cubic of the paper for deviations at the step change.
+        """Return s(t), the cubic of the paper, for given deviations at the step change.
 
         Args:
-            time: since the change, shape (n,) [s].
+            time: time since the step change, shape (n,) [s].
             deviation: q(t_i) - q_nom(0), shape (m,) [rad].
             rate: q'(t_i) - q_nom'(0), shape (m,) [rad/s].
 
         Returns:
-            s, shape (n, m) [rad].
+            Values of s, shape (n, m) [rad].
         """
         c0, c1 = self.basis(time)[0]
         return np.outer(c0, deviation) + np.outer(c1, rate)

@@ -1,4 +1,4 @@
-"""What a gait is asked for: who walks, how far and how fast a step. `Subject -> gait solver, library, network`."""
+"""Input of the gait computation: patient, step length and step duration. `Subject -> gait solver, library, network`."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from atalante_control.gait.gait import PERIOD
 from atalante_control.model import Patient
 
-STEP_LENGTH_RANGE = (0.05, 0.40)  # m, what may be asked for at all; the solver says what can be walked
-STEP_DURATION_RANGE = (0.4, 2.0)  # s
+STEP_LENGTH_RANGE = (0.05, 0.40)  # m, accepted input; not every step in this range has a feasible gait
+STEP_DURATION_RANGE = (0.4, 2.0)  # s, accepted input
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A patient and his step.
+    """Patient and step parameters.
 
     Raises:
-        ValueError: a step out of range, or a duration off the cycle grid.
+        ValueError: If the step is out of range, or the duration is not a whole number of cycles.
     """
 
     patient: Patient
@@ -29,13 +29,13 @@ class Subject:
             ("step duration", self.step_duration, STEP_DURATION_RANGE, "s"),
         ):
             if not low <= value <= high:
-                raise ValueError(f"a {name} is from {low:g} to {high:g} {unit}, not {value:g} {unit}")
+                raise ValueError(f"{name} must be {low:g} to {high:g} {unit}, got {value:g} {unit}")
         cycles = self.step_duration / PERIOD
         if abs(cycles - round(cycles)) > 1e-6:
-            raise ValueError(f"a step duration is a whole number of milliseconds, not {self.step_duration!r} s")
+            raise ValueError(f"step duration must be a whole number of milliseconds, got {self.step_duration!r} s")
 
     def parameters(self) -> dict[str, float]:
-        """What a gait file says under `parameters`."""
+        """Return the entry `parameters` of a gait file."""
         return {
             "patient_mass": self.patient.mass,
             "patient_height": self.patient.height,
@@ -46,6 +46,6 @@ class Subject:
         }
 
     def __str__(self) -> str:
-        """In one line, for a person."""
+        """Return one line of text for messages."""
         patient = self.patient
         return f"{patient.mass:g} kg, {patient.height:g} m, step {self.step_length:g} m in {self.step_duration:g} s"

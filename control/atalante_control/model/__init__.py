@@ -1,8 +1,8 @@
-"""The patient-exoskeleton model, from one set of parameters: what gait generation, controller, emulator and viewers load.
+"""Model of exoskeleton and patient, shared by gait optimization, controller, emulator and viewers.
 
 `ExoskeletonParameters, Patient -> links (left leg, right leg its mirror image) -> URDF text -> Pinocchio model`. Frames
-follow REP-103: x forward, y left, z up; a link's frame is its joint's frame, and all are parallel at the zero pose but
-the feet, which toe out.
+follow REP-103: x forward, y left, z up. The frame of a link is the frame of its joint. At the zero pose all frames are parallel
+except those of the feet, which are turned outwards by the toe-out angle.
 """
 
 from atalante_control.model.articulated import ArticulatedModel, pinocchio_model

@@ -1,4 +1,4 @@
-"""A URDF made here as a Pinocchio model, with the places of our joints in its vectors. `URDF -> ArticulatedModel`."""
+"""Pinocchio model of a URDF, with the indices of the joints in its vectors. `URDF -> ArticulatedModel`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from atalante_hal.robot import JOINTS
 
 
 class ArticulatedModel(NamedTuple):
-    """A Pinocchio model with the places of our joints in its vectors."""
+    """Pinocchio model with the indices of `JOINTS` in its vectors."""
 
     model: Any  # pinocchio.Model
     q: npt.NDArray[np.intp]  # (12,) index of each of JOINTS in a configuration vector
@@ -20,14 +20,17 @@ class ArticulatedModel(NamedTuple):
 
 
 def pinocchio_model(urdf_text: str, fixed_base: bool = True) -> ArticulatedModel:
-    """Pinocchio model of a URDF made here, gravity 9.81 m/s2 down; always index it through the joint map.
+    """Build the Pinocchio model of a URDF from `urdf`, with gravity 9.81 m/s2 downwards.
+
+    The joint order of Pinocchio can differ from `JOINTS`, so index its vectors only with `ArticulatedModel.q` and `.v`.
 
     Args:
-        fixed_base: the pelvis is welded to the world at its origin; otherwise it floats on a `JointModelFreeFlyer`,
-            which comes first in q and v.
+        urdf_text: URDF with all joints of `JOINTS`.
+        fixed_base: True: the pelvis is fixed to the world at its origin. False: it floats on a `JointModelFreeFlyer`, which
+            comes first in q and v.
 
     Raises:
-        ValueError: a joint of `JOINTS` is not in the text.
+        ValueError: If a joint of `JOINTS` is missing in the URDF.
     """
     if fixed_base:
         model = pinocchio.buildModelFromXML(urdf_text)

@@ -1,7 +1,7 @@
-"""The exoskeleton alone, and with a patient in it: `ExoskeletonParameters (, Patient) -> links`.
+"""Links of the exoskeleton, empty or with a patient: `ExoskeletonParameters (, Patient) -> links`.
 
-Left leg, and the right leg its mirror image; with a patient each of his segments is fused into the link that carries it.
-The exoskeleton alone is what joint idealization cancels; with the patient it is what walks.
+The right leg is the mirror image of the left leg. Each segment of a patient is fused into the link that carries it. Joint
+idealization compensates the empty exoskeleton; gaits are computed for the exoskeleton with the patient.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from atalante_control.model.rigid_body import ZERO, Box, Inertia, Link, Vector3
 from atalante_hal.robot import CELLS, LEG_JOINTS
 
 BASE_LINK = "pelvis"
-#: Link moved by each joint of a leg; prefixed with the side.
+#: Name of the link moved by each joint of a leg, without the prefix of the side.
 LEG_LINKS = dict(zip(LEG_JOINTS, ("frontal_hip", "transverse_hip", "thigh", "shank", "ankle", "foot"), strict=True))
 
 
 @dataclass(frozen=True)
 class ExoskeletonParameters:
-    """An Atalante-like exoskeleton. Left side; the right side is its mirror image in the sagittal plane.
+    """Parameters of an Atalante-like exoskeleton, left side; the right side is its mirror image in the sagittal plane.
 
-    Joint offsets, axes, masses, sole and sensor places are rounded public numbers; where in its link a mass sits is
-    chosen here. Thigh and shank adjust to the patient.
+    Joint offsets, axes, masses, sole and sensor positions are rounded public numbers. The positions of the masses in their links
+    are assumptions of this project. Thigh and shank are adjusted to the patient.
     """
 
     thigh_length: float = 0.38  # m, SH to SK
     shank_length: float = 0.408  # m, SK to SA
 
     pelvis_mass: float = 16.5  # kg, pelvis and back
-    frontal_hip_mass: float = 3.7  # kg, a side, like all below
+    frontal_hip_mass: float = 3.7  # kg, of one side, like all masses below
     transverse_hip_mass: float = 4.4
     thigh_mass: float = 9.0
     shank_mass: float = 11.0
     ankle_mass: float = 1.7
-    foot_mass: float = 3.2  # kg, with its force cells
+    foot_mass: float = 3.2  # kg, including the force cells
 
     fh_offset: Vector3 = (0.0, 0.089, 0.0)  # m, in the pelvis
     th_offset: Vector3 = (-0.135, 0.169, 0.0)  # m, in the frontal hip
@@ -49,31 +49,44 @@ class ExoskeletonParameters:
     sole_size: tuple[float, float] = (0.275, 0.119)  # m, length and width
     sole_centre: tuple[float, float] = (0.06, -0.165)  # m, x and z from the ankle
     cell_x: tuple[float, float] = (0.178, -0.064)  # m, front and rear force cells from the ankle
-    cell_y: float = 0.027  # m, either side of the foot's middle
+    cell_y: float = 0.027  # m, lateral distance of the force cells from the middle of the foot
     pad_radius: float = 0.005  # m, contact sphere under a cell, touching the sole plane
     pad_mass: float = 0.0015  # kg, taken from the foot
 
     torso_imu: Vector3 = (-0.14, 0.0, 0.50)  # m, in the pelvis link
     pelvis_imu: Vector3 = (-0.164, -0.015, 0.191)  # m, in the pelvis link
-    tibia_imu: Vector3 = (-0.13, -0.074, 0.018)  # m, in the left shank, but z from SA: it sits at the lower end
+    tibia_imu: Vector3 = (
+        -0.13,
+        -0.074,
+        0.018,
+    )  # m, in the left shank; z is measured from SA, because the IMU is at the lower end
 
     def __post_init__(self) -> None:
         for name in ("thigh_length", "shank_length"):
             if not 0.2 < getattr(self, name) < 0.7:
-                raise ValueError(f"{name} is a length in m between 0.2 and 0.7, not {getattr(self, name)!r}")
+                raise ValueError(f"{name} must be between 0.2 and 0.7 m, got {getattr(self, name)!r}")
         if not 0.0 < 4 * self.pad_mass < 0.1 * self.foot_mass:
-            raise ValueError(f"pad_mass is positive and four pads are under a tenth of the foot, not {self.pad_mass!r}")
+            raise ValueError(f"pad_mass must be positive and below 1/40 of foot_mass, got {self.pad_mass!r}")
 
     def fitted(self, patient: Patient) -> ExoskeletonParameters:
-        """The exoskeleton with its thigh and shank adjusted to a patient, nobody in it."""
+        """Return the empty exoskeleton with thigh and shank adjusted to a patient.
+
+        Args:
+            patient: patient whose leg lengths are used.
+        """
         return replace(self, thigh_length=patient.length("thigh"), shank_length=patient.length("shank"))
 
 
 def links(parameters: ExoskeletonParameters, patient: Patient | None = None) -> tuple[Link, ...]:
-    """Every body of the exoskeleton, parents first: pelvis, its IMUs, left leg, right leg.
+    """Return all links of the exoskeleton, parents first: pelvis, its IMUs, left leg, right leg.
 
-    With a patient, thigh and shank of the exoskeleton take his lengths and his segments are fused link by link: head,
-    arms and trunk into the pelvis, thigh, shank and foot into those of each leg. The names of the links stay.
+    With a patient, thigh and shank of the exoskeleton get the lengths of the patient, and the segments of the patient are fused
+    into the links: head, arms and trunk into the pelvis; thigh, shank and foot into those of each leg. The names of the links are
+    the same as without a patient.
+
+    Args:
+        parameters: geometry and masses of the exoskeleton.
+        patient: patient in the exoskeleton; None: empty.
     """
     p = parameters if patient is None else parameters.fitted(patient)
     pelvis = Box(p.pelvis_mass, (-0.13, 0.0, 0.12), (0.18, 0.36, 0.40))
@@ -87,20 +100,29 @@ def links(parameters: ExoskeletonParameters, patient: Patient | None = None) -> 
 
 
 def imu_link(imu: str) -> str:
-    """Link whose origin and axes are those of an IMU of `IMUS`."""
+    """Return the name of the link whose frame is that of an IMU.
+
+    Args:
+        imu: one of `IMUS`.
+    """
     return f"imu_{imu}"
 
 
 def pad_link(foot: str, cell: str) -> str:
-    """Link of the contact pad under a force cell; its axes are the foot's."""
+    """Return the name of the link of the contact pad under a force cell; its axes are those of the foot.
+
+    Args:
+        foot: left or right.
+        cell: one of `CELLS`.
+    """
     return f"{foot}_foot_{cell}"
 
 
 def _worn(p: ExoskeletonParameters, patient: Patient) -> dict[str, tuple[Box, Inertia]]:
-    """The patient's segments in the frames of the links that carry them, left side.
+    """Return the segments of the patient in the frames of the links that carry them, left side.
 
-    His hip is where the axes of FH and SH cross, his knee on that of SK, his ankle at SA: the machine's lateral offsets
-    put thigh and shank half a centimetre beside each other. His foot stands on the middle of the sole's length.
+    The hip of the patient is the intersection of the axes of FH and SH, the knee is on the axis of SK, and the ankle is at SA. The
+    lateral offsets of the exoskeleton shift thigh and shank by half a centimetre. The foot is centred along the sole.
     """
     hip = (-p.th_offset[0] - p.sh_offset[0], -p.th_offset[1] - p.sh_offset[1], -p.th_offset[2] - p.sh_offset[2])
     heel = (p.sole_centre[0] - 0.5 * patient.length("foot"), 0.0, -0.5 * ANKLE_HEIGHT * patient.height)
@@ -118,7 +140,7 @@ def _left_leg(p: ExoskeletonParameters) -> list[Link]:
     sk, sa = (0.0, p.knee_lateral, -p.thigh_length), (0.0, p.ankle_lateral, -p.shank_length)
     length, width = p.sole_size
     sole_x, sole_z = p.sole_centre
-    # Slender boxes between a joint and the next; hip and ankle bodies enclose the motors at their joint.
+    # A box from each joint to the next; the boxes of hip and ankle enclose the motors at their joint.
     chain = (
         ("FH", p.fh_offset, 0.0, (1.0, 0.0, 0.0), Box(p.frontal_hip_mass, _half(p.th_offset), (0.17, 0.19, 0.12))),
         ("TH", p.th_offset, 0.0, (0.0, 0.0, 1.0), Box(p.transverse_hip_mass, _half(p.sh_offset), (0.20, 0.10, 0.12))),
@@ -152,8 +174,8 @@ def _left_leg(p: ExoskeletonParameters) -> list[Link]:
     return legs
 
 
-def _imu(imu: str, parent: str, place: Vector3) -> Link:
-    return Link(imu_link(imu), parent, None, place, 0.0, ZERO, Inertia(0.0, ZERO, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)))
+def _imu(imu: str, parent: str, position: Vector3) -> Link:
+    return Link(imu_link(imu), parent, None, position, 0.0, ZERO, Inertia(0.0, ZERO, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)))
 
 
 def _half(vector: Vector3) -> Vector3:

@@ -1,6 +1,6 @@
-"""The patient as four kinds of rigid segments: `mass, height (, thigh, shank) -> Winter's table -> body of a segment`.
+"""Patient as four kinds of rigid segments: `mass, height (, thigh, shank) -> Winter's table -> body of a segment`.
 
-The exoskeleton's links fuse these bodies into their own (`exoskeleton.links`).
+`exoskeleton.links` fuses these bodies into the links of the exoskeleton.
 """
 
 from __future__ import annotations
@@ -12,26 +12,28 @@ from atalante_control.model.rigid_body import Box, Inertia, Vector3
 
 MASS_RANGE = (45.0, 110.0)  # kg
 HEIGHT_RANGE = (1.50, 2.00)  # m
-#: Thigh and shank [m] to which the exoskeleton's legs adjust; Winter's lengths of everybody in `HEIGHT_RANGE` are inside.
+#: Adjustment range of thigh and shank [m]. It contains Winter's lengths for every height in `HEIGHT_RANGE`.
 LEG_RANGE = (0.30, 0.55)
-#: Ankle over the sole, over the patient's height.
+#: Height of the ankle above the sole, as a fraction of the height of the patient.
 ANKLE_HEIGHT = 0.039
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A row of Winter's table."""
+    """Row of Winter's table."""
 
-    mass: float  # of the body's mass
-    centre: float  # centre of mass from the proximal end, of the segment's length
-    gyration: float  # radius about the centre of mass, any axis across the segment, of the segment's length
-    length: float  # of the body's height
+    mass: float  # fraction of the body mass
+    centre: float  # centre of mass from the proximal end, fraction of the segment length
+    gyration: (
+        float  # radius of gyration about a transverse axis through the centre of mass, fraction of the segment length
+    )
+    length: float  # fraction of the body height
     density: float  # kg/m3
 
 
-#: D. A. Winter, Biomechanics and Motor Control of Human Movement, 4th ed. 2009: tables 4.1 (mass, centre, gyration, density)
-#: and figure 4.1 (length, after Drillis and Contini). HAT is head, arms and trunk from the hips to the shoulders, its
-#: density that of its parts together; thigh, shank and foot are of one side.
+#: Segments from D. A. Winter, Biomechanics and Motor Control of Human Movement, 4th ed. 2009: table 4.1 (mass, centre, gyration,
+#: density) and figure 4.1 (length, after Drillis and Contini). HAT is head, arms and trunk, with the length from hips to
+#: shoulders and the mean density of its parts. Thigh, shank and foot are those of one side.
 SEGMENTS = {
     "HAT": Segment(0.678, 0.626, 0.496, 0.288, 1050.0),
     "thigh": Segment(0.100, 0.433, 0.323, 0.245, 1050.0),
@@ -42,10 +44,10 @@ SEGMENTS = {
 
 @dataclass(frozen=True)
 class Patient:
-    """Who wears the exoskeleton. Lengths left out are Winter's for the height.
+    """Patient in the exoskeleton. Lengths that are None are those of Winter's table for the height.
 
     Raises:
-        ValueError: a number outside its range; the message gives the range.
+        ValueError: If a number is outside its range; the message gives the range.
     """
 
     mass: float  # kg
@@ -61,23 +63,28 @@ class Patient:
             ("shank length", self.length("shank"), LEG_RANGE, "m"),
         ):
             if not low <= value <= high:
-                raise ValueError(f"a patient's {name} is from {low:g} to {high:g} {unit}, not {value:g} {unit}")
+                raise ValueError(f"{name} of the patient must be {low:g} to {high:g} {unit}, got {value:g} {unit}")
 
     def length(self, segment: str) -> float:
-        """Length of one of `SEGMENTS` [m]."""
+        """Return the length of a segment [m].
+
+        Args:
+            segment: one of `SEGMENTS`.
+        """
         given = {"thigh": self.thigh_length, "shank": self.shank_length}.get(segment)
         return SEGMENTS[segment].length * self.height if given is None else given
 
     def body(self, segment: str, proximal: Vector3, axis: int, direction: int) -> tuple[Box, Inertia]:
-        """One of `SEGMENTS` in the frame of a link: how to draw it, and its mass properties.
+        """Return the box to draw and the mass properties of a segment, in the frame of a link.
 
-        The table gives the moments across the segment, m (gyration length)^2. Along it, where the table has none, they
-        are those of the square prism of the segment's length and density, which is also what is drawn.
+        The table gives the moment of inertia about transverse axes, m (gyration length)^2. It has none about the axis of the
+        segment, so that moment is the one of a square prism with the length and density of the segment. The box is this prism.
 
         Args:
-            proximal: upper end of the segment, the heel of the foot, in the link frame [m].
-            axis: axis of the link the segment lies along, 0 to 2.
-            direction: +1 or -1, the way from the proximal end.
+            segment: one of `SEGMENTS`.
+            proximal: upper end of the segment, or the heel of the foot, in the link frame [m].
+            axis: axis of the link parallel to the segment, 0 to 2.
+            direction: direction along the axis from the proximal end, +1 or -1.
         """
         row, length = SEGMENTS[segment], self.length(segment)
         mass = row.mass * self.mass

@@ -1,6 +1,6 @@
-"""Rigid bodies and the links of a tree, with the two laws the model is built by: fusion and reflection.
+"""Rigid bodies and the links of a tree, with fusion of bodies and reflection in the sagittal plane.
 
-`Box` (what one draws) -> `Inertia` (what moves) -> `Link` (a body with the joint that carries it).
+`Box` (shape for viewers) -> `Inertia` (mass properties) -> `Link` (body with the joint that moves it).
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ ZERO: Vector3 = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Box:
-    """Homogeneous solid that stands for a link's mass: mass [kg], centre [m] and edge lengths [m] in the link frame."""
+    """Homogeneous box that represents the mass of a link: mass [kg], centre [m] and edge lengths [m] in the link frame."""
 
     mass: float
     centre: Vector3
     size: Vector3
 
     def inertia(self) -> Inertia:
-        """Mass properties of the box, edges along the link's axes."""
+        """Return the mass properties of the box, whose edges are parallel to the axes of the link."""
         x, y, z = (edge * edge * self.mass / 12.0 for edge in self.size)
         return Inertia(self.mass, self.centre, (y + z, 0.0, 0.0, x + z, 0.0, x + y))
 
@@ -36,20 +36,24 @@ class Inertia:
 
     mass: float  # kg
     centre: Vector3  # m, centre of mass
-    tensor: tuple[float, float, float, float, float, float]  # kg m2 about it: xx, xy, xz, yy, yz, zz
+    tensor: tuple[float, float, float, float, float, float]  # kg m2 about the centre of mass: xx, xy, xz, yy, yz, zz
 
     def matrix(self) -> npt.NDArray[np.float64]:
-        """The tensor as a symmetric matrix, shape (3, 3) [kg m2]."""
+        """Return the tensor as a symmetric matrix, shape (3, 3) [kg m2]."""
         xx, xy, xz, yy, yz, zz = self.tensor
         return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
     def mirrored(self) -> Inertia:
-        """The same body reflected in the sagittal plane, y to -y."""
+        """Return the body reflected in the sagittal plane, y to -y."""
         xx, xy, xz, yy, yz, zz = self.tensor
         return Inertia(self.mass, mirrored(self.centre), (xx, -xy, xz, yy, -yz, zz))
 
     def fused(self, other: Inertia) -> Inertia:
-        """Both bodies moving as one, in the frame they share: parallel axes, with the reduced mass of the two."""
+        """Return the mass properties of two bodies fixed to each other (parallel axis theorem with the reduced mass).
+
+        Args:
+            other: mass properties of the second body in the same link frame.
+        """
         mass = self.mass + other.mass
         (ax, ay, az), (bx, by, bz) = self.centre, other.centre
         share, reduced = other.mass / mass, self.mass * other.mass / mass
@@ -63,7 +67,7 @@ class Inertia:
 
 @dataclass(frozen=True)
 class Link:
-    """One body of the tree with the joint that carries it. `joint` is one of `JOINTS`, or None for a fixed link."""
+    """Body of the tree with the joint that moves it. `joint` is one of `JOINTS`, or None for a fixed link."""
 
     name: str
     parent: str
@@ -72,17 +76,22 @@ class Link:
     yaw: float  # rad, about the parent's z
     axis: Vector3  # in the link's own frame; unused when fixed
     inertia: Inertia
-    boxes: tuple[Box, ...] = ()  # drawn
-    pad: float = 0.0  # m, radius of a contact sphere at the link's origin; 0: touches nothing
+    boxes: tuple[Box, ...] = ()  # shapes for viewers
+    pad: float = 0.0  # m, radius of a contact sphere at the origin of the link; 0: no contact
 
     def fused(self, box: Box, inertia: Inertia) -> Link:
-        """The link with a second body fixed in it, and drawn."""
+        """Return the link with a second body fixed to it.
+
+        Args:
+            box: shape of the second body, added for viewers.
+            inertia: mass properties of the second body in the link frame.
+        """
         return replace(self, inertia=self.inertia.fused(inertia), boxes=(*self.boxes, box))
 
     def mirrored(self) -> Link:
-        """The link of the right leg. The axis stays: the mirrored joint's angle changes sign instead (MIRROR_SIGN)."""
+        """Return the link of the right leg. The axis is the same; the angle changes sign instead (MIRROR_SIGN)."""
         name = _right(self.name)
-        if self.pad:  # the cell that lies in the mirror is named for its own side of the foot
+        if self.pad:  # mirroring swaps the left and the right cell of a foot
             name = name[:-1] + {"L": "R", "R": "L"}[name[-1]]
         return Link(
             name,
@@ -98,7 +107,11 @@ class Link:
 
 
 def mirrored(vector: Vector3) -> Vector3:
-    """A polar vector reflected in the sagittal plane."""
+    """Return a polar vector reflected in the sagittal plane.
+
+    Args:
+        vector: polar vector such as a position, x forward, y left, z up.
+    """
     return (vector[0], -vector[1], vector[2])
 
 

@@ -1,4 +1,4 @@
-"""URDF of a tree of links: the one text that PyBullet, Pinocchio and viewers load. `links, robot limits -> URDF`."""
+"""URDF of a tree of links, loaded by PyBullet, Pinocchio and viewers. `links, robot limits -> URDF`."""
 
 from __future__ import annotations
 
@@ -11,18 +11,26 @@ from atalante_hal.robot import JOINTS, Robot
 
 
 def urdf(parameters: ExoskeletonParameters, robot: Robot, patient: Patient | None = None) -> str:
-    """URDF of the exoskeleton, empty or worn.
+    """Return the URDF of the exoskeleton, empty or with a patient.
 
-    Joints are those of `JOINTS` in that order; limits come from `robot`. Bodies touch the world with the eight pads
-    alone. IMU links are massless frames. The same parameters give the same text, every number with all its digits.
+    The joints are `JOINTS` in their order. Only the eight pads have collision shapes. IMU links are massless frames. The same
+    parameters give the same text, with all digits of every number.
 
-    Source: geometry and masses of `ExoskeletonParameters`, a link being a homogeneous box; segments of `Patient`.
+    Args:
+        parameters: geometry and masses of the exoskeleton; each link is a homogeneous box.
+        robot: limits of the joints.
+        patient: patient in the exoskeleton; None: empty.
     """
     return urdf_text(links(parameters, patient), robot)
 
 
 def urdf_text(bodies: Sequence[Link], robot: Robot) -> str:
-    """URDF of a tree of links, parents first."""
+    """Return the URDF of a tree of links.
+
+    Args:
+        bodies: links of the tree, parents first.
+        robot: limits of the joints.
+    """
     lines = ['<?xml version="1.0"?>', '<robot name="atalante_like">']
     for link in bodies:
         lines += _link_xml(link)
@@ -37,7 +45,9 @@ def _numbers(values: Sequence[float]) -> str:
 
 
 def _number(value: float) -> str:
-    return repr(float(value) + 0.0)  # every digit; + 0.0: no negative zero; float: a scalar of numpy prints its type
+    return repr(
+        float(value) + 0.0
+    )  # repr: all digits; float: a NumPy scalar would print its type; + 0.0: no negative zero
 
 
 def _link_xml(link: Link) -> list[str]:
