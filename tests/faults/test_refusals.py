@@ -178,7 +178,7 @@ class TestF55GaitInvalid:
     def test_f55_a_jump_at_the_step_change(self, tmp_path: Path, joint: str, by: float, point: int, sign: int) -> None:
         moved = GAIT["joints"][joint][point] + sign * by
         said = gait_refusal_of(gait_with(tmp_path / "gait.json", ("joints", joint, point), moved))
-        assert re.search(r"joints\.(left|right)_(FH|TH|SH|SK|SA|HA) (jumps by|must be )", said)
+        assert re.search(r"joints\.(left|right)_(FH|TH|SH|SK|SA|HA) (at the step change )?must be ", said)
 
     def test_f55_degrees_are_not_radians(self, tmp_path: Path) -> None:
         degrees = {joint: np.degrees(points).tolist() for joint, points in GAIT["joints"].items()}
@@ -201,7 +201,7 @@ class TestF55GaitInvalid:
     def test_f55_a_key_given_twice(self, tmp_path: Path) -> None:
         path = tmp_path / "gait.json"
         path.write_text(AIRWALK_GAIT.read_text().replace("{", '{"duration": 0.8, ', 1))
-        assert "duration is there twice" in gait_refusal_of(path)
+        assert "every key must occur once, got duration twice" in gait_refusal_of(path)
 
     @anywhere
     @given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode) | st.just(b"[" * 100_000))

@@ -179,7 +179,7 @@ def load_gait(path: Path, robot: Robot) -> Gait:
     """Read a gait file (JSON) strictly and check it against the robot.
 
     Keys: `format` ("atalante-gait/1"), `name`, `duration` [s], `joints` (each of JOINTS: 8 Bezier control points [rad]
-    of the right-stance step); optional `feedforward` (the same, [Nm], gravity not in it), `parameters` (name: number),
+    of the right-stance step); optional `feedforward` (the same form, [Nm], without gravity), `parameters` (name: number),
     `solver` (anything).
 
     Args:

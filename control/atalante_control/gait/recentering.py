@@ -63,7 +63,7 @@ class Deadbeat:
         return tuple(np.where(inside, _values(p, x), 0.0) for p in (c, first, second))  # type: ignore[return-value]
 
     def s(self, time: Vector, deviation: Vector, rate: Vector) -> Vector:
-        """Return s(t), the cubic of the paper, for given deviations at the step change.
+        """Return the cubic s of the paper for given deviations at the step change.
 
         Args:
             time: time since the step change, shape (n,) [s].

@@ -121,8 +121,8 @@ def pad_link(foot: str, cell: str) -> str:
 def _worn(p: ExoskeletonParameters, patient: Patient) -> dict[str, tuple[Box, Inertia]]:
     """Return the segments of the patient in the frames of the links that carry them, left side.
 
-    The hip of the patient is the intersection of the axes of FH and SH, the knee is on the axis of SK, and the ankle is at SA. The
-    lateral offsets of the exoskeleton shift thigh and shank by half a centimetre. The foot is centred along the sole.
+    The hip of the patient is the intersection of the axes of FH and SH, the knee is on the axis of SK, and the ankle is at SA.
+    The lateral offsets of the exoskeleton shift thigh and shank by half a centimetre. The foot is centred along the sole.
     """
     hip = (-p.th_offset[0] - p.sh_offset[0], -p.th_offset[1] - p.sh_offset[1], -p.th_offset[2] - p.sh_offset[2])
     heel = (p.sole_centre[0] - 0.5 * patient.length("foot"), 0.0, -0.5 * ANKLE_HEIGHT * patient.height)

@@ -107,12 +107,21 @@ def test_feedforward_is_the_inverse_dynamics_of_the_trajectory() -> None:
     [
         (
             lambda low, high: Subject(Patient(high[0] + 1.0, 1.75), 0.15, 0.9),
-            "knows a mass from 58 to 91 kg, not 92 kg",
+            "mass for the gait network must be 58 to 91 kg, got 92 kg",
         ),
-        (lambda low, high: Subject(Patient(75.0, low[1] - 0.01), 0.15, 0.9), "knows a height from"),
-        (lambda low, high: Subject(Patient(75.0, 1.75), high[2] + 0.01, 0.9), "knows a step length from"),
-        (lambda low, high: Subject(Patient(75.0, 1.75), 0.15, high[3] + 0.1), "knows a step duration from"),
-        (lambda low, high: Subject(Patient(75.0, 1.75, 0.47), 0.15, 0.9), "knows legs of Winter's proportions"),
+        (lambda low, high: Subject(Patient(75.0, low[1] - 0.01), 0.15, 0.9), "height for the gait network must be"),
+        (
+            lambda low, high: Subject(Patient(75.0, 1.75), high[2] + 0.01, 0.9),
+            "step length for the gait network must be",
+        ),
+        (
+            lambda low, high: Subject(Patient(75.0, 1.75), 0.15, high[3] + 0.1),
+            "step duration for the gait network must be",
+        ),
+        (
+            lambda low, high: Subject(Patient(75.0, 1.75, 0.47), 0.15, 0.9),
+            "thigh length for the gait network must be that of Winter's table",
+        ),
     ],
 )
 def test_subject_out_of_range_is_rejected_with_the_range(
@@ -142,18 +151,18 @@ def test_saved_network_is_loaded_bit_for_bit(tmp_path: Path) -> None:
         ({"format": np.array("atalante-gait-network/9")}, "format must be"),
         ({"inputs": np.array(["mass"])}, "inputs must be mass, height, step_length, step_duration"),
         ({"format": np.zeros(())}, "format must be text"),
-        ({"surprise": np.zeros(3)}, "'surprise.npy' does not belong there"),
+        ({"surprise": np.zeros(3)}, "'surprise.npy' is not a valid member"),
         ({"bias_1": None}, "bias_1 is missing"),
         ({"weights_3": np.zeros((4, 5))}, "weights_2 is missing"),
         ({"low": np.zeros(3)}, "low and high must be 4 numbers"),
-        ({"weights_0": np.full((4, 5), np.nan)}, "weights_0 must be an array of finite 64-bit numbers"),
-        ({"weights_0": np.full((4, 5), np.inf)}, "weights_0 must be an array of finite 64-bit numbers"),
-        ({"weights_0": np.full((4, 5), "1.0")}, "weights_0 must be an array of finite 64-bit numbers"),
+        ({"weights_0": np.full((4, 5), np.nan)}, "weights_0 must be an array of finite 64-bit floats"),
+        ({"weights_0": np.full((4, 5), np.inf)}, "weights_0 must be an array of finite 64-bit floats"),
+        ({"weights_0": np.full((4, 5), "1.0")}, "weights_0 must be an array of finite 64-bit floats"),
         ({"weights_0": np.zeros((3, 5))}, "weights_0 must have 4 rows"),
-        ({"bias_0": np.zeros(4)}, "weights_0 must have 4 rows and as many columns, 1 to 128, as bias_0"),
+        ({"bias_0": np.zeros(4)}, "weights_0 must have 4 rows, and 1 to 128 columns, as many as bias_0"),
         ({"weights_0": np.zeros((4, 129)), "bias_0": np.zeros(129)}, "weights_0 must have 4 rows"),
         ({"weights_1": np.zeros((5, 8)), "bias_1": np.zeros(8)}, f"last layer must have {OUTPUTS} columns"),
-        ({"bias_1": np.arange(96.0)}, "the angles of a gait must continue in the next step"),
+        ({"bias_1": np.arange(96.0)}, "the angles of a gait must be continuous at the step change"),
     ],
 )
 def test_invalid_network_file_is_rejected(tmp_path: Path, change: dict[str, np.ndarray | None], sentence: str) -> None:

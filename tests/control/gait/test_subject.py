@@ -23,9 +23,9 @@ def test_parameters_are_those_of_a_gait_file() -> None:
 @pytest.mark.parametrize(
     ("length", "duration", "sentence"),
     [
-        (16.0, 0.8, "a step length is from 0.05 to 0.4 m, not 16 m"),
-        (0.16, 0.2, "a step duration is from 0.4 to 2 s, not 0.2 s"),
-        (0.16, 0.8004, "a step duration is a whole number of milliseconds, not 0.8004 s"),
+        (16.0, 0.8, "step length must be 0.05 to 0.4 m, got 16 m"),
+        (0.16, 0.2, "step duration must be 0.4 to 2 s, got 0.2 s"),
+        (0.16, 0.8004, "step duration must be a whole number of milliseconds, got 0.8004 s"),
     ],
 )
 def test_an_impossible_step_is_refused(length: float, duration: float, sentence: str) -> None:

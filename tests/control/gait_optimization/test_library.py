@@ -130,8 +130,8 @@ def test_invalid_grid_file_is_rejected(tmp_path: Path, content: str) -> None:
     [
         ({"mass": (60.0, 70.0)}, "mass has at least 3 levels that rise"),
         ({"step_duration": (0.7, 0.9, 0.8)}, "step_duration has at least 3 levels that rise"),
-        ({"height": (1.4, 1.6, 1.8)}, "a patient's height is from 1.5 to 2 m, not 1.4 m"),
-        ({"step_length": (0.1, 0.2, 0.5)}, "a step length is from 0.05 to 0.4 m, not 0.5 m"),
+        ({"height": (1.4, 1.6, 1.8)}, "height of the patient must be 1.5 to 2 m, got 1.4 m"),
+        ({"step_length": (0.1, 0.2, 0.5)}, "step length must be 0.05 to 0.4 m, got 0.5 m"),
     ],
 )
 def test_invalid_grid_is_rejected(levels: dict[str, tuple[float, ...]], sentence: str) -> None:

@@ -134,7 +134,7 @@ def test_a_drive_too_weak_is_told():
     weak = replace(CONFIG, policies=(replace(POLICIES[0], torque_limit=60.0), POLICIES[1]))
     certificate = certify(guide("constant", weak), 0.5, BOX)
     assert not certificate.certified
-    assert "the backup policy of SH needs 215 % of the torque" in certificate.reason
+    assert "the backup policy of SH needs 215 % of its torque limit" in certificate.reason
 
 
 def test_an_underdamped_policy_pays_for_its_ringing():

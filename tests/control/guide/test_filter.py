@@ -310,7 +310,7 @@ def test_a_ringing_loop_counts_the_worst_signal_not_the_two_extremes():
 )
 def test_refuses_a_configuration_that_is_none(bad: dict[str, object]):
     (name,) = bad
-    with pytest.raises(ValueError, match=rf"{name}.* not "):
+    with pytest.raises(ValueError, match=rf"{name}.* got "):
         replace(CONFIG, **bad)
 
 

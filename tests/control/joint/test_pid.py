@@ -124,5 +124,5 @@ def test_gains_in_the_air_free_knee_and_ankle_of_the_stance_leg():
 def test_refuses_gains_that_are_none():
     good = (1.0,) * 6
     for bad in ((1.0,) * 5, (1.0,) * 5 + (-1.0,), (1.0,) * 5 + (float("nan"),)):
-        with pytest.raises(ValueError, match="kd is 6 finite numbers"):
+        with pytest.raises(ValueError, match="kd must be 6 finite numbers"):
             LegGains(good, good, bad)  # type: ignore[arg-type]

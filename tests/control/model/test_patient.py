@@ -136,12 +136,12 @@ def test_a_number_of_numpy_is_written_as_a_number() -> None:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ((44.9, 1.75), "a patient's mass is from 45 to 110 kg, not 44.9 kg"),
-        ((75.0, 2.01), "a patient's height is from 1.5 to 2 m, not 2.01 m"),
-        ((75.0, 175.0), "a patient's height is from 1.5 to 2 m, not 175 m"),
-        ((75.0, 1.75, 0.6), "a patient's thigh length is from 0.3 to 0.55 m, not 0.6 m"),
-        ((75.0, 1.75, None, 0.2), "a patient's shank length is from 0.3 to 0.55 m, not 0.2 m"),
-        ((math.nan, 1.75), "a patient's mass is from 45 to 110 kg, not nan kg"),
+        ((44.9, 1.75), "mass of the patient must be 45 to 110 kg, got 44.9 kg"),
+        ((75.0, 2.01), "height of the patient must be 1.5 to 2 m, got 2.01 m"),
+        ((75.0, 175.0), "height of the patient must be 1.5 to 2 m, got 175 m"),
+        ((75.0, 1.75, 0.6), "thigh length of the patient must be 0.3 to 0.55 m, got 0.6 m"),
+        ((75.0, 1.75, None, 0.2), "shank length of the patient must be 0.3 to 0.55 m, got 0.2 m"),
+        ((math.nan, 1.75), "mass of the patient must be 45 to 110 kg, got nan kg"),
     ],
 )
 def test_a_patient_out_of_range_is_refused(arguments: tuple[float, ...], sentence: str) -> None:

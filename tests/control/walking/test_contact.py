@@ -60,5 +60,5 @@ def test_step_over_by_time():
     ],
 )
 def test_refuses_a_configuration_that_is_none(bad: dict[str, float]):
-    with pytest.raises(ValueError, match=r"not "):
+    with pytest.raises(ValueError, match=r"got "):
         ImpactConfig(**bad)  # type: ignore[arg-type]

@@ -31,8 +31,8 @@ PATIENT = ("--mass", "75", "--height", "175")
         (["emulator", "-i", "pcan", "-c", "x", "--seed", "-1"], "-1 is not in the range x>=0"),
         (["gait", "check", "--seed", "-1"], "-1 is not in the range x>=0"),
         (["dbc", "c-code", "-o", "never", "--seed", "-1"], "-1 is not in the range x>=0"),
-        (["demo", *PATIENT, "--step-length", "0"], "a step length is from 0.05 to 0.4 m, not 0 m"),
-        (["demo", *PATIENT, "--step-duration", "0"], "a step duration is from"),
+        (["demo", *PATIENT, "--step-length", "0"], "step length must be 0.05 to 0.4 m, got 0 m"),
+        (["demo", *PATIENT, "--step-duration", "0"], "step duration must be"),
         (
             ["emulator", "-i", "virtual", "-c", "x"],
             "virtual works inside one process only: use a CAN adapter, or Linux vcan",

@@ -374,8 +374,12 @@ def test_a_patient_s_gait_of_the_network_is_walked_inside_a_certified_guide(tmp_
 @pytest.mark.parametrize(
     ("arguments", "code", "says"),
     [
-        (["--mass", "110", "--height", "175"], 1, "the gait network knows a mass from 58 to 91 kg, not 110 kg"),
-        (["--mass", "75", "--height", "175", "--step-length", "0.35"], 1, "a step length from 0.1 to 0.2 m"),
+        (["--mass", "110", "--height", "175"], 1, "mass for the gait network must be 58 to 91 kg, got 110 kg"),
+        (
+            ["--mass", "75", "--height", "175", "--step-length", "0.35"],
+            1,
+            "step length for the gait network must be 0.1 to 0.2 m",
+        ),
         (["--mass", "75"], 2, "a patient needs --mass and --height"),
         (["--step-length", "0.15"], 2, "need a patient"),
         (["--mass", "75", "--height", "175", "--step-duration", "0.85123"], 2, "a whole number of milliseconds"),
