@@ -1,5 +1,5 @@
-"""Gait generation: partial hybrid zero dynamics as one nonlinear program a step.
+"""Gait optimization: partial hybrid zero dynamics as one nonlinear program for each step.
 
-`links -> symbolic dynamics (CasADi) -> step problem (NLP, built once) -> solve (IPOPT) -> Gait`, and `verify` judges the gait
-with Pinocchio alone. Nothing here runs on the robot, and nothing outside this package imports CasADi (extra `gaits`).
+`links -> symbolic dynamics (CasADi) -> step problem (NLP, built once) -> solve (IPOPT) -> Gait`. `verify` checks the gait
+independently with Pinocchio. This package does not run on the robot, and no other package imports CasADi (extra `gaits`).
 """

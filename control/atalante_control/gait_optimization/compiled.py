@@ -1,7 +1,7 @@
-"""The program's functions as machine code: `CasADi functions -> C -> gcc -> shared library, kept in a cache`.
+"""Compilation of the functions of the program: `CasADi functions -> C -> gcc -> shared library in a cache`.
 
-Interpreted and compiled functions do the same operations in the same order, without contraction into fused ones, so a gait
-is the same with either. Without a compiler, or when anything about it fails, the interpreted functions serve.
+Interpreted and compiled functions execute the same operations in the same order, without fused multiply-add, so both give the
+same gait. If there is no compiler, or if the compilation fails, the interpreted functions are used.
 """
 
 from __future__ import annotations
@@ -19,21 +19,28 @@ import casadi
 from atalante_control.gait_optimization.nlp import Functions
 
 COMPILER = "gcc"
-#: Functions of 60,000 statements: -O0 compiles them in 13 s to 4 times the interpreter's speed; -O1 takes 95 s for another
-#: factor of 2, which is a tenth of a solve. Contracted multiply-adds would round differently.
+#: Compiler options. The functions have 60,000 statements: -O0 takes 13 s and gives 4 times the speed of the interpreter. -O1
+#: takes 95 s for another factor of 2, which saves a tenth of a solve. Fused multiply-adds would round differently.
 OPTIONS = ("-O0", "-fPIC", "-shared", "-ffp-contract=off")
 CACHE_VARIABLE = "ATALANTE_CACHE"
 
 
 def cache_directory() -> Path:
-    """Where compiled functions are kept: $ATALANTE_CACHE, else the user's cache directory."""
+    """Return the directory of the compiled functions: $ATALANTE_CACHE, or else the cache directory of the user."""
     if given := os.environ.get(CACHE_VARIABLE):
         return Path(given)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "atalante"
 
 
 def compiled(functions: Functions) -> Functions | None:
-    """The functions from a shared library, made once for their exact code; None where that cannot be had."""
+    """Compile functions to a shared library, or load it from the cache.
+
+    Args:
+        functions: interpreted functions of the program.
+
+    Returns:
+        The compiled functions; None if they cannot be compiled or stored.
+    """
     if shutil.which(COMPILER) is None:
         return None
     with tempfile.TemporaryDirectory() as directory:
@@ -53,7 +60,7 @@ def compiled(functions: Functions) -> Functions | None:
                 return None
             try:
                 library.parent.mkdir(parents=True, exist_ok=True)
-                # In one move: another process may be doing the same.
+                # The file is replaced atomically, because another process may write it at the same time.
                 staged = library.with_suffix(f".{os.getpid()}")
                 shutil.copy(built, staged)
                 staged.replace(library)

@@ -1,13 +1,14 @@
-"""Fit the gait network to a library: `gaits -> what of them varies -> perceptron -> GaitNetwork`.
+"""Fit of the gait network to a library: `gaits -> principal directions -> perceptron -> GaitNetwork`.
 
-The network is not asked for the 96 control points, most of which follow from the others, but for the few directions in
-which the library varies. Linear maps lead there and back, and the way back is multiplied into the last layer:
+The 96 control points depend on each other, so the perceptron does not learn them directly. It learns the coordinates along the
+few directions in which the library varies. The linear map back to the control points is multiplied into the last layer.
 
-1. *Periodic gaits.* Angles continue exactly in the next step: 84 dimensions are left. Speeds jump a little at an impact;
-   the fit keeps `JUMP_KEPT` of it, as a compromise between a smooth walk and the solved gait's accelerations.
-2. *Errors as they are felt.* Distance is measured by what deviates: the angles along the step, those at its ends several
-   times, for there a foot lands, and the accelerations, which the feedforward is made of. The principal directions of the
-   library in that measure, down to `RESOLUTION`, are what the perceptron learns.
+1. *Periodic gaits.* The angles are exactly continuous at the step change, which leaves 84 dimensions. The speeds jump slightly
+   at the impact. The fit keeps the fraction `JUMP_KEPT` of this jump, as a compromise between a smooth walk and the accelerations
+   of the solved gait.
+2. *Weighted errors.* The distance of two gaits is the deviation of the angles along the step and of the accelerations, which
+   determine the feedforward. The ends of the step have a larger weight, because the foot lands there. The perceptron learns the
+   principal directions of the library in this metric, down to `RESOLUTION`.
 """
 
 from __future__ import annotations
@@ -31,34 +32,34 @@ from atalante_hal.robot import JOINTS
 Vector = npt.NDArray[np.float64]
 
 HIDDEN = (64, 64)
-ITERATIONS = 3000  # of L-BFGS in one of `ROUNDS`, each of which begins where the last one stopped
-ROUNDS = 2
-RESOLUTION = math.radians(0.003)  # rad, what is left of the library outside the directions that are learned
-JUMP_KEPT = 0.45  # of the speed jumps of the library
-END_WEIGHT = 20.0  # of a sample at either end against one between
-ACCELERATION_WEIGHT = 5e-2  # s2, rad of angle that 1 rad/s2 of acceleration counts as
-ALPHA = 1e-7  # weight of the squared weights: smooth between the points of the grid
-SEED = 1
-_SAMPLES = 41  # phases
+ITERATIONS = 3000  # largest number of L-BFGS iterations in a round
+ROUNDS = 2  # number of optimiser runs; each continues from the result of the last one
+RESOLUTION = math.radians(0.003)  # rad, rms of the library outside the learned directions
+JUMP_KEPT = 0.45  # fraction of the speed jumps of the library
+END_WEIGHT = 20.0  # weight of a sample at either end of the step, relative to the other samples
+ACCELERATION_WEIGHT = 5e-2  # s2, weight of acceleration (rad/s2) relative to angle (rad)
+ALPHA = 1e-7  # factor of the squared weights in the cost; makes the result smooth between the points of the grid
+SEED = 1  # seed of the initial weights
+_SAMPLES = 41  # number of phases of the metric
 
 
 class Fit(NamedTuple):
-    """A network and how close it came to the gaits it was fitted to."""
+    """Fitted network with its errors on the gaits of the fit."""
 
     network: GaitNetwork
-    directions: int  # learned
-    rms: float  # rad, of the joint angles along the steps
-    worst: float  # rad
+    directions: int  # number of learned directions
+    rms: float  # rad, rms error of the joint angles along the steps
+    worst: float  # rad, largest error of the joint angles
 
 
 def fit(gaits: Sequence[Gait], grid: Grid, *, hidden: Sequence[int] = HIDDEN, iterations: int = ITERATIONS) -> Fit:
     """Fit a network to gaits of a library; the same gaits give the same network.
 
     Args:
-        gaits: with the parameters of their subjects.
-        grid: its ends become the range of the network.
-        hidden: neurons of each hidden layer.
-        iterations: of the optimiser, at most.
+        gaits: gaits with the parameters of their subjects.
+        grid: grid of the library; its limits become the range of the network.
+        hidden: number of neurons of each hidden layer.
+        iterations: largest number of iterations of the optimiser in a round.
     """
     low, high = (np.array([axis[end] for axis in grid.axes()]) for end in (0, -1))
     x = (np.array([inputs(gait) for gait in gaits]) - low) * (2.0 / (high - low)) - 1.0
@@ -71,7 +72,7 @@ def fit(gaits: Sequence[Gait], grid: Grid, *, hidden: Sequence[int] = HIDDEN, it
     root = np.linalg.cholesky(measure)
     deviations = (points - mean) @ root
     _, spread, directions = np.linalg.svd(deviations, full_matrices=False)
-    outside = np.sqrt(np.cumsum(spread[::-1] ** 2)[::-1] / len(gaits))  # rms left by the first k directions
+    outside = np.sqrt(np.cumsum(spread[::-1] ** 2)[::-1] / len(gaits))  # rms of the rest after the first k directions
     directions = directions[: int((outside > RESOLUTION).sum())]
     scores = deviations @ directions.T
     unit = float(np.sqrt((scores**2).sum(axis=1).mean()))
@@ -81,7 +82,7 @@ def fit(gaits: Sequence[Gait], grid: Grid, *, hidden: Sequence[int] = HIDDEN, it
         max_iter=iterations, max_fun=2 * iterations, random_state=SEED, warm_start=True,
     )  # fmt: skip
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # ending at the last iteration is the rule, not a defect
+        warnings.simplefilter("ignore", ConvergenceWarning)  # the optimiser usually ends at the iteration limit
         for _ in range(ROUNDS):
             perceptron.fit(x, scores / unit)
     back = unit * directions @ np.linalg.inv(root)
@@ -95,13 +96,17 @@ def fit(gaits: Sequence[Gait], grid: Grid, *, hidden: Sequence[int] = HIDDEN, it
 
 
 def inputs(gait: Gait) -> Vector:
-    """What the network is told of a gait's subject, in the order of its INPUTS. Shape (4,)."""
+    """Return the inputs of the network for the subject of a gait, in the order of INPUTS, shape (4,).
+
+    Args:
+        gait: gait with the parameters of its subject.
+    """
     names = ("patient_mass", "patient_height", "step_length", "step_duration")
     return np.array([gait.parameters[name] for name in names])
 
 
 def _metric(duration: float) -> Vector:
-    """Mean square of the deviation a difference of control points makes, as a quadratic form. Shape (96, 96)."""
+    """Return the quadratic form from a difference of control points to the mean square deviation, shape (96, 96)."""
     phase = np.linspace(0.0, 1.0, _SAMPLES)
     angle = bezier(np.eye(DEGREE + 1), phase)
     acceleration = bezier(derivative(derivative(np.eye(DEGREE + 1))), phase) / duration**2
@@ -111,6 +116,6 @@ def _metric(duration: float) -> Vector:
 
 
 def _null_space(rows: Vector) -> Vector:
-    """Orthonormal basis of what satisfies rows x = 0, in columns."""
+    """Return an orthonormal basis of the solutions of rows x = 0, in columns."""
     _, singular, right = np.linalg.svd(rows)
     return np.asarray(right[len(singular[singular > 1e-12]) :].T)

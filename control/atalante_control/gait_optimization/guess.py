@@ -1,6 +1,6 @@
-"""Where the optimiser starts: a plain step by inverse kinematics, pelvis swaying over the stance foot, knees bent.
+"""Initial guess of the optimiser: a simple step by inverse kinematics, pelvis over the stance foot, knees bent.
 
-Every solution of the library begins here or at a neighbour that did, so that all lie in one valley.
+All gaits of the library start from this guess, so that they converge to similar local minima.
 """
 
 from __future__ import annotations
@@ -17,14 +17,24 @@ from atalante_hal.robot import JOINTS
 
 Vector = npt.NDArray[np.float64]
 
-_BEND = 0.96  # height of the pelvis over the ankle, of the straight leg
-_WIDTH, _SWAY, _LIFT = 0.20, 0.03, 0.06  # m, between the ankles; of the pelvis to the stance side; of the swing foot
-_CROUCH = {"SH": -0.25, "SK": 0.5, "SA": -0.2}  # rad, where the search for a pose starts
-_ITERATIONS, _TOLERANCE, _LARGEST = 50, 1e-6, 0.2  # of Gauss-Newton; m and rad; rad a joint and iteration
+_BEND = 0.96  # height of the pelvis above the ankle, fraction of the straight leg
+_WIDTH, _SWAY, _LIFT = (
+    0.20,
+    0.03,
+    0.06,
+)  # m, distance of the ankles, lateral motion of the pelvis, lift of the swing foot
+_CROUCH = {"SH": -0.25, "SK": 0.5, "SA": -0.2}  # rad, initial pose of the inverse kinematics
+_ITERATIONS, _TOLERANCE, _LARGEST = 50, 1e-6, 0.2  # iterations; tolerance [m, rad]; largest step of a joint [rad]
 
 
 def guess(problem: StepProblem, parameters: Vector, subject: Subject) -> Vector:
-    """Bezier control points (12, 8) [rad] of a plausible step."""
+    """Return the Bezier control points of an initial guess of a step, shape (12, 8) [rad].
+
+    Args:
+        problem: program of the step.
+        parameters: parameters of the program.
+        subject: patient and step parameters.
+    """
     patient, step_length = subject.patient, subject.step_length
     height = _BEND * (patient.length("thigh") + patient.length("shank"))
     start, end = {"periodic": (-1.0, 1.0), "start": (0.0, 1.0), "stop": (-1.0, 0.0)}[problem.kind]
@@ -41,7 +51,7 @@ def guess(problem: StepProblem, parameters: Vector, subject: Subject) -> Vector:
 
 
 def _reach(errors: Any, pose: Vector, target: Vector, parameters: Vector) -> Vector:
-    """Joint angles that bring pelvis and swing ankle to the target with both level, by damped Gauss-Newton."""
+    """Return joint angles that move pelvis and swing ankle to the target, both level, by damped Gauss-Newton."""
     for _ in range(_ITERATIONS):
         error, jacobian = (np.array(value) for value in errors(pose, target, parameters))
         if np.abs(error).max() < _TOLERANCE:

@@ -1,8 +1,8 @@
-"""A library of gaits over a grid of subjects: resumable, fanned out over processes or a cluster, nothing silently missing.
+"""Library of gaits over a grid of subjects, computed by processes or a cluster; the computation can be resumed.
 
-`Grid, solve -> one file a gait -> fit`. Every gait is solved cold, so it depends on nothing but its own parameters: not on
-its neighbours, the number of processes or how often the work was interrupted. That the neighbours follow one local minimum
-all the same is what the fit shows.
+`Grid, solve -> one file for each gait -> fit`. Every gait is solved without a warm start, so it depends only on its own
+parameters and not on its neighbours, the number of processes or interruptions. The small error of the fit shows that neighbours still
+converge to similar local minima. Failures are recorded in files.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from atalante_control.model import Patient
 from atalante_hal.robot import Robot, load_robot
 
 FORMAT = "atalante-library/1"
-LEVELS_MIN = 3  # an axis: with two, a fit is off by 10 degrees between them
+LEVELS_MIN = 3  # smallest number of levels of a parameter; with two, the fit errs by 10 degrees between them
 
 Index = tuple[int, ...]
-#: What solves one gait; a function of a module, for other processes to find it.
+#: Function that solves one gait. It must be defined at module level, so that other processes can import it.
 Solve = Callable[[Subject], SolvedGait]
 
 
 class LibraryError(ValueError):
-    """The folder does not hold the library that was asked for; the message says what does."""
+    """Error of a folder without the requested library. The message gives the remedy."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Levels of each parameter; the default encloses the paper's subjects, who are 58 to 91 kg and 1.62 to 1.93 m.
+    """Levels of each parameter; the default covers the subjects of the paper (58 to 91 kg, 1.62 to 1.93 m).
 
     Raises:
-        ValueError: fewer than three levels, levels that do not rise, or a subject out of range.
+        ValueError: If there are fewer than three levels, levels are not ascending, or a subject is out of range.
     """
 
     mass: tuple[float, ...] = (58.0, 68.0, 80.0, 91.0)  # kg
@@ -52,45 +52,50 @@ class Grid:
     def __post_init__(self) -> None:
         for name, levels in zip(self.names(), self.axes(), strict=True):
             if len(levels) < LEVELS_MIN or any(b <= a for a, b in pairwise(levels)):
-                raise ValueError(f"{name} has at least {LEVELS_MIN} levels that rise, not {list(levels)}")
+                raise ValueError(f"{name} must have at least {LEVELS_MIN} ascending levels, got {list(levels)}")
         for index in (tuple(0 for _ in self.shape), tuple(n - 1 for n in self.shape)):
             self.subject(index)
 
     @staticmethod
     def names() -> tuple[str, ...]:
-        """The parameters, in the order of an index."""
+        """Return the names of the parameters, in the order of an index."""
         return tuple(field.name for field in fields(Grid))
 
     def axes(self) -> tuple[tuple[float, ...], ...]:
-        """The levels of each parameter."""
+        """Return the levels of each parameter."""
         return (self.mass, self.height, self.step_length, self.step_duration)
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Levels of each parameter."""
+        """Return the number of levels of each parameter."""
         return tuple(map(len, self.axes()))
 
     def subject(self, index: Index) -> Subject:
-        """Who stands at a point of the grid; leg lengths are Winter's."""
+        """Return the subject at a point of the grid, with leg lengths of Winter's table.
+
+        Args:
+            index: index of the level of each parameter.
+        """
         mass, height, length, duration = (levels[i] for levels, i in zip(self.axes(), index, strict=True))
         return Subject(Patient(mass, height), length, duration)
 
     def points(self) -> list[Index]:
-        """Every point of the grid."""
+        """Return the indices of all points of the grid."""
         return list(product(*map(range, self.shape)))
 
 
 class Library:
-    """The folder of a library: `grid.json`, `gaits/` with one gait file each, `failed/` with the record of each failure."""
+    """Folder of a library: `grid.json`, `gaits/` with one file for each gait, `failed/` with one record for each failure."""
 
     def __init__(self, folder: Path, grid: Grid | None = None) -> None:
-        """Open a library, or begin one.
+        """Open a library, or create it.
 
         Args:
-            grid: what is wanted; None takes the folder's own.
+            folder: folder of the library.
+            grid: required grid; None: the grid of the folder.
 
         Raises:
-            LibraryError: there is none and no grid to begin one, or the folder's is another.
+            LibraryError: If the folder has no library and no grid is given, or if the grid of the folder is another one.
         """
         self.folder = folder
         path = folder / "grid.json"
@@ -102,26 +107,43 @@ class Library:
             raise LibraryError(f"{path}: {error}") from error
         if found is None:
             if grid is None:
-                raise LibraryError(f"{folder} holds no library; `atalante gait library --out {folder}` makes one")
+                raise LibraryError(
+                    f"{folder} contains no library: create it with `atalante gait library --out {folder}`"
+                )
             for name in ("gaits", "failed"):
                 (folder / name).mkdir(parents=True, exist_ok=True)
             path.write_text(json.dumps({"format": FORMAT, **asdict(grid)}, indent=1) + "\n", encoding="utf-8")
         elif grid is not None and grid != found:
-            raise LibraryError(f"{folder} holds a library over another grid, {found}; choose another folder")
+            raise LibraryError(f"{folder} contains a library with another grid, {found}: choose another folder")
         self.grid = grid or found or Grid()
 
     def gait(self, index: Index, robot: Robot) -> Gait | None:
-        """The gait of a point; None while there is none. Raises `GaitError`."""
+        """Return the gait of a point of the grid, or None if it is not solved yet.
+
+        Args:
+            index: index of the level of each parameter.
+            robot: limits of the joints.
+
+        Raises:
+            GaitError: If the gait file is not valid.
+        """
         path = self._path("gaits", index)
         return load_gait(path, robot) if path.exists() else None
 
     def gaits(self, robot: Robot) -> dict[Index, Gait]:
-        """Every gait there is. Raises `GaitError`."""
+        """Return all gaits of the library.
+
+        Args:
+            robot: limits of the joints.
+
+        Raises:
+            GaitError: If a gait file is not valid.
+        """
         found = ((index, self.gait(index, robot)) for index in self.grid.points())
         return {index: gait for index, gait in found if gait is not None}
 
     def failures(self) -> dict[Index, str]:
-        """Why the last attempt failed, of every point where it did."""
+        """Return the reason of the last failure for each point that failed."""
         failed = ((index, self._path("failed", index)) for index in self.grid.points())
         return {
             index: str(json.loads(path.read_text(encoding="utf-8"))["status"])
@@ -130,20 +152,21 @@ class Library:
         }
 
     def missing(self) -> list[Index]:
-        """Points without a gait, failed or not yet tried."""
+        """Return the points without a gait: failed, or not tried yet."""
         return [index for index in self.grid.points() if not self._path("gaits", index).exists()]
 
     def generate(
         self, solve: Solve, *, jobs: int = 1, cluster: str | None = None
     ) -> Generator[tuple[Subject, SolvedGait], None, None]:
-        """Solve what is missing, and tell of each point once it is on the disk.
+        """Solve the missing gaits, and yield each result after it is written to disk.
 
         Args:
-            jobs: processes on this machine.
-            cluster: address of a dask scheduler whose workers solve instead.
+            solve: function that solves one gait, defined at module level.
+            jobs: number of processes on this machine.
+            cluster: address of a dask scheduler whose workers are used instead of processes.
 
         Raises:
-            FanOutError: they cannot, see `fan_out`.
+            FanOutError: If the calls cannot be distributed, see `fan_out`.
         """
         tasks = [(index, self.grid.subject(index)) for index in self.missing()]
         for index, solved in fan_out(partial(_solve, solve), tasks, jobs=jobs, cluster=cluster):
@@ -169,22 +192,40 @@ class Library:
 
 
 def solve_subject(subject: Subject) -> SolvedGait:
-    """The gait of a subject, cold, and then verified by Pinocchio alone."""
+    """Solve the gait of a subject without a warm start, and verify it with Pinocchio.
+
+    Args:
+        subject: patient and step parameters.
+    """
     return verified(subject, solve(subject))
 
 
 def solve_compiled(subject: Subject) -> SolvedGait:
-    """The same gait by functions that are compiled first, once on a machine: minutes, and then half the time a gait."""
+    """Solve the same gait as `solve_subject` with compiled functions.
+
+    The compilation is done once on a machine. Afterwards a gait takes half the time.
+
+    Args:
+        subject: patient and step parameters.
+    """
     return verified(subject, solve(subject, machine_code=True))
 
 
 def verified(subject: Subject, solved: SolvedGait) -> SolvedGait:
-    """The gait as it is, or failed where the verification does not agree that it is one."""
+    """Return the solved gait, with the status of a failure if the independent verification fails.
+
+    Args:
+        subject: patient and step parameters.
+        solved: result of the solver.
+    """
     if not solved.solved:
         return solved
     for check in Verifier(load_robot(), subject.patient).verify(solved.gait):
         if not check.holds:
-            status = f"{subject}: {check.name} is {check.value:.3g} {check.unit} when verified, over {check.limit:.3g}"
+            status = (
+                f"{subject}: {check.name} must be at most {check.limit:.3g} {check.unit} in the verification, "
+                f"got {check.value:.3g}"
+            )
             return replace(solved, status=status)
     return solved
 
@@ -197,11 +238,11 @@ def _solve(solve: Solve, task: tuple[Index, Subject]) -> tuple[Index, SolvedGait
 def _read_grid(path: Path) -> Grid:
     document = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(document, dict) or document.pop("format", None) != FORMAT:
-        raise ValueError(f"format is {FORMAT!r} in the grid of a library")
+        raise ValueError(f"format of the grid of a library must be {FORMAT!r}")
     return Grid(**{name: _levels(name, values) for name, values in document.items()})
 
 
 def _levels(name: str, values: Any) -> tuple[float, ...]:
     if not isinstance(values, Sequence) or not all(type(value) in (int, float) for value in values):
-        raise ValueError(f"{name} is a list of numbers, not {values!r}")
+        raise ValueError(f"{name} must be a list of numbers, got {values!r}")
     return tuple(map(float, values))

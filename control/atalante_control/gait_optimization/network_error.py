@@ -1,7 +1,7 @@
-"""How far a gait of the network is from the solved one of the same subject, and whether that is near enough to walk.
+"""Deviation of gaits of the network from solved gaits of the same subjects, compared with limits.
 
-`GaitNetwork, freshly solved gaits -> Deviation each -> findings against the limits`. Off the grid: at the points of the
-library a fit is always good, and a distorted gait may still walk.
+`GaitNetwork, newly solved gaits -> Deviation of each -> findings against the limits`. The subjects are not on the grid of the
+library, because the fit is always good there.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ Vector = npt.NDArray[np.float64]
 
 
 class Deviation(NamedTuple):
-    """One subject's."""
+    """Deviation of the gait of one subject."""
 
-    angles: Vector  # (n, 12) rad, absolute, along the step
-    landing_position: float  # m, of the swing foot when it lands, in the frame of the stance foot
-    landing_attitude: float  # rad
-    position_defect: float  # rad, largest jump of a joint into the mirrored step
-    speed_defect: float  # rad/s
-    feedforward: float  # rms of the difference over rms of the solved one
-    within_limits: bool  # positions, speeds and feedforward of both steps
+    angles: Vector  # (n, 12) rad, absolute deviation along the step
+    landing_position: float  # m, deviation of the swing foot at the landing, in the frame of the stance foot
+    landing_attitude: float  # rad, deviation of the swing foot at the landing
+    position_defect: float  # rad, largest jump of a joint angle at the step change
+    speed_defect: float  # rad/s, largest jump of a joint speed at the step change
+    feedforward: float  # rms of the difference over rms of the solved feedforward
+    within_limits: bool  # whether positions, speeds and feedforward of both steps are within the limits
 
 
 class Finding(NamedTuple):
-    """A line of the report."""
+    """Line of the report: a value with its limit."""
 
     name: str
     value: float
@@ -45,12 +45,19 @@ class Finding(NamedTuple):
 
     @property
     def ok(self) -> bool:
-        """Whether the limit is kept."""
+        """Return whether the value is within the limit."""
         return self.value <= self.limit
 
 
 def random_subjects(low: Vector, high: Vector, count: int, seed: int) -> Iterator[Subject]:
-    """Subjects anywhere in the box of a network, as a rule off the grid. `low`, `high`: shape (4,), its INPUTS."""
+    """Yield random subjects within the range of a network.
+
+    Args:
+        low: smallest values of INPUTS, shape (4,).
+        high: largest values of INPUTS, shape (4,).
+        count: number of subjects.
+        seed: seed of the random generator.
+    """
     rng = np.random.default_rng(seed)
     for _ in range(count):
         mass, height, length, duration = rng.uniform(low, high).tolist()
@@ -58,7 +65,14 @@ def random_subjects(low: Vector, high: Vector, count: int, seed: int) -> Iterato
 
 
 def deviation(subject: Subject, gait: Gait, solved: Gait, robot: Robot) -> Deviation:
-    """Compare the network's gait with the solved one."""
+    """Compare the gait of the network with the solved gait.
+
+    Args:
+        subject: patient and step parameters of both gaits.
+        gait: gait of the network.
+        solved: solved gait.
+        robot: limits of the joints.
+    """
     ours, theirs = gait.tables(), solved.tables()
     mirrored = gait.mirrored().tables()
     dynamics = stance_dynamics(robot, subject.patient)
@@ -80,7 +94,11 @@ def deviation(subject: Subject, gait: Gait, solved: Gait, robot: Robot) -> Devia
 
 
 def findings(deviations: Sequence[Deviation]) -> list[Finding]:
-    """The report: the worst of all subjects unless the line says otherwise."""
+    """Return the report: the worst value of all subjects, except for the percentile.
+
+    Args:
+        deviations: deviation of each subject.
+    """
     angles = np.degrees(np.concatenate([d.angles.ravel() for d in deviations]))
     worst = {name: max(getattr(d, name) for d in deviations) for name in Deviation._fields[1:-1]}
     return [

@@ -1,8 +1,8 @@
-"""A sparse nonlinear program put together from small functions, each repeated over groups of unknowns.
+"""Sparse nonlinear program built from small functions, each repeated over groups of unknowns.
 
 `Rows (SX expressions of a few unknowns) -> NonlinearProgram.add -> f, g and their exact sparse derivatives as five functions`.
-It knows nothing of walking; `step_problem` does. Every repeated function is differentiated once, in scalars; what belongs to
-the whole program are the places its results go to.
+The module is independent of walking, which is modelled in `step_problem`. Every repeated function is differentiated once, in
+scalars. The program stores the indices at which the results of the repetitions are inserted.
 """
 
 from __future__ import annotations
@@ -20,60 +20,62 @@ Symbol = Any  # casadi.SX or casadi.MX
 
 
 class Rows(NamedTuple):
-    """Constraints that say one thing: lower <= values <= upper."""
+    """Constraints of one name: lower <= values <= upper."""
 
-    name: str  # as people call it: "swing clearance"
-    unit: str
-    size: float  # [unit] what counts as one in the program
+    name: str  # readable name, for example "swing clearance"
+    unit: str  # SI unit
+    size: float  # [unit] scale, the value that equals 1 in the program
     values: Symbol  # SX, shape (m,) [unit]
-    lower: Vector  # shape (m,) or, where it changes from place to place, (places, m) [unit]
-    upper: Vector
+    lower: Vector  # shape (m,), or (repetitions, m) if it differs between repetitions [unit]
+    upper: Vector  # as `lower`
 
 
 class Group(NamedTuple):
-    """Where constraints of one name stand in g."""
+    """Row indices in g of the constraints of one name."""
 
-    name: str
-    unit: str
-    size: float
-    rows: Places
+    name: str  # as in `Rows`
+    unit: str  # as in `Rows`
+    size: float  # as in `Rows`
+    rows: Places  # row indices in g
 
 
 class Functions(NamedTuple):
-    """What the solver calls, in the order of `NAMES`; x are the unknowns, p the parameters."""
+    """Functions for the solver, in the order of `NAMES`; x are the unknowns, p the parameters."""
 
     objective: Any  # x, p -> f
     constraints: Any  # x, p -> g
     gradient: Any  # x, p -> f, df/dx
     jacobian: Any  # x, p -> g, dg/dx
-    hessian: Any  # x, p, lam_f, lam_g -> upper triangle of the Lagrangian's second derivative
+    hessian: Any  # x, p, lam_f, lam_g -> upper triangle of the second derivative of the Lagrangian
 
 
 NAMES = ("nlp_f", "nlp_g", "nlp_grad_f", "nlp_jac_g", "nlp_hess_l")
 
 
 class _Block(NamedTuple):
-    """An expression repeated over places: rows of g, or with weights a part of the objective."""
+    """Expression repeated over groups of unknowns: rows of g, or a part of the objective if it has weights."""
 
-    expression: Symbol
-    x: Symbol
-    at: Places  # (places, n)
-    weights: Vector | None
+    expression: Symbol  # SX
+    x: Symbol  # SX symbols of the unknowns of one repetition, shape (n,)
+    at: Places  # indices of the unknowns, shape (repetitions, n)
+    weights: Vector | None  # weight of each repetition in the objective; None: rows of g
 
 
 class NonlinearProgram:
-    """minimise f(x, p) subject to lower <= g(x, p) <= upper.
+    """Nonlinear program: minimise f(x, p) subject to lower <= g(x, p) <= upper.
 
     Attributes:
-        lower, upper: bounds of g, each row over its group's size.
-        groups: the rows by name.
+        lower: lower bounds of g, each row divided by the size of its group.
+        upper: upper bounds of g, each row divided by the size of its group.
+        groups: groups of rows by name.
     """
 
     def __init__(self, unknowns: int, parameters: Symbol) -> None:
-        """Start without rows.
+        """Create a program without rows.
 
         Args:
-            parameters: SX symbols all expressions may use.
+            unknowns: number of unknowns.
+            parameters: SX symbols that all expressions may use.
         """
         self.unknowns = unknowns
         self._p = parameters
@@ -83,18 +85,26 @@ class NonlinearProgram:
         self.groups: list[Group] = []
 
     def add_linear(self, name: str, unit: str, matrix: Vector, value: Vector) -> None:
-        """Constrain matrix @ x = value. Comes before all other rows."""
-        assert not self._blocks, "linear rows come first"
+        """Add the constraint matrix @ x = value. Linear constraints must be added before all others.
+
+        Args:
+            name: name of the group.
+            unit: SI unit of the rows.
+            matrix: coefficients, shape (m, unknowns).
+            value: right-hand side, shape (m,).
+        """
+        assert not self._blocks, "linear rows must be added before all others"
         self.groups.append(Group(name, unit, 1.0, len(self.lower) + np.arange(len(value))))
         self._linear = np.concatenate([self._linear, matrix])
         self.lower, self.upper = np.append(self.lower, value), np.append(self.upper, value)
 
     def add(self, rows: Sequence[Rows], x: Symbol, places: Sequence[Places]) -> None:
-        """Constrain: the same rows at each of the places.
+        """Add the same constraints for several groups of unknowns.
 
         Args:
-            x: SX symbols the rows depend on, shape (n,).
-            places: which of the program's unknowns they are, n indices a place.
+            rows: constraints to repeat.
+            x: SX symbols on which the rows depend, shape (n,).
+            places: indices of the unknowns for each repetition, n indices each.
         """
         first, height, count = len(self.lower), sum(row.values.shape[0] for row in rows), len(places)
         lower, upper = np.zeros((count, height)), np.zeros((count, height))
@@ -110,11 +120,18 @@ class NonlinearProgram:
         self._blocks.append(_Block(expression, x, np.array(places), None))
 
     def minimise(self, cost: Symbol, x: Symbol, places: Sequence[Places], weights: Vector) -> None:
-        """Add the weighted sum of a scalar expression over the places to the objective."""
+        """Add the weighted sum of a repeated scalar expression to the objective.
+
+        Args:
+            cost: scalar SX expression.
+            x: SX symbols on which the cost depends, shape (n,).
+            places: indices of the unknowns for each repetition, n indices each.
+            weights: weight of each repetition.
+        """
         self._blocks.append(_Block(cost, x, np.array(places), weights))
 
     def functions(self) -> Functions:
-        """The five functions."""
+        """Build the five functions for the solver."""
         x, p = casadi.MX.sym("x", self.unknowns), casadi.MX.sym("p", self._p.shape[0])
         lam_f, lam_g = casadi.MX.sym("lam_f"), casadi.MX.sym("lam_g", len(self.lower))
         gradient = _Sparse(self.unknowns, 1)
@@ -159,15 +176,15 @@ class NonlinearProgram:
 
 
 class _Entries(NamedTuple):
-    """A function that returns the entries of a sparse matrix, and where they stand."""
+    """Function that returns the entries of a sparse matrix, with their row and column indices."""
 
-    function: Any
-    rows: Places
-    columns: Places
+    function: Any  # casadi.Function
+    rows: Places  # row index of each entry
+    columns: Places  # column index of each entry
 
 
 def _derivatives(block: _Block, p: Symbol) -> tuple[Any, _Entries, _Entries]:
-    """The expression, its Jacobian, the upper triangle of its Hessian weighted with multipliers."""
+    """Return the expression, its Jacobian, and the upper triangle of its Hessian weighted with multipliers."""
     lam = casadi.SX.sym("lam", block.expression.shape[0])
     slopes = casadi.jacobian(block.expression, block.x)
     curvature = casadi.triu(casadi.hessian(casadi.dot(lam, block.expression), block.x)[0])
@@ -177,14 +194,14 @@ def _derivatives(block: _Block, p: Symbol) -> tuple[Any, _Entries, _Entries]:
         ("hessian", curvature, [block.x, p, lam]),
     ):
         rows, columns = matrix.sparsity().get_triplet()
-        # No common subexpressions are looked for: that takes longer than all the rest and finds 3 % of the operations.
+        # Common subexpressions are not eliminated: this would save only 3 % of the operations and dominate the build time.
         function = casadi.Function(name, arguments, [casadi.vertcat(*matrix.nonzeros())])
         entries.append(_Entries(function, np.array(rows, np.intp), np.array(columns, np.intp)))
     return casadi.Function("values", [block.x, p], [block.expression]), entries[0], entries[1]
 
 
 class _Sparse:
-    """A sparse matrix in the making: entries at the same place add up."""
+    """Sparse matrix under construction; entries with the same row and column are added."""
 
     def __init__(self, rows: int, columns: int) -> None:
         self._shape = (rows, columns)
@@ -192,12 +209,18 @@ class _Sparse:
         self._values: list[Symbol] = []
 
     def add(self, rows: Places, columns: Places, values: Symbol) -> None:
-        """Entries a place: index arrays (places, n), values of shape (n, places)."""
+        """Add entries of repeated expressions.
+
+        Args:
+            rows: row indices, shape (repetitions, n).
+            columns: column indices, shape (repetitions, n).
+            values: values of the entries, shape (n, repetitions).
+        """
         self._keys.append((columns * self._shape[0] + rows).ravel())
         self._values.append(casadi.vec(values))
 
     def matrix(self) -> Symbol:
-        """The matrix as an MX."""
+        """Return the matrix as an MX."""
         keys = np.concatenate(self._keys)
         distinct, place = np.unique(keys, return_inverse=True)
         height = self._shape[0]

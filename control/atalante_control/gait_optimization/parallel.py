@@ -1,6 +1,6 @@
-"""Many calls over processes or the workers of a cluster, results as they come: what gait library and fault campaign share.
+"""Parallel calls in processes or workers of a cluster, for the gait library and the fault campaign.
 
-`joblib.Parallel`, on its own processes or, when a scheduler is named, on dask's workers.
+The calls use `joblib.Parallel`, with its own processes, or with the workers of dask if a scheduler is given.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import Final, TypeVar
 
 _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
-#: Longest wait for a scheduler.
+#: Timeout of the connection to a scheduler.
 _MEETING: Final = "10s"
 _LOKY_THREAD: Final = "ExecutorManagerThread"
 
 
 class FanOutError(RuntimeError):
-    """The calls cannot be spread as asked; the message says what to type."""
+    """Error of calls that cannot be distributed. The message gives the remedy."""
 
 
 def fan_out(
@@ -32,19 +32,20 @@ def fan_out(
     cluster: str | None = None,
     patience: float | None = None,
 ) -> Generator[_Result, None, None]:
-    """Results in the order in which they come.
+    """Call a function for many tasks in parallel, and yield the results in the order of completion.
 
-    Ctrl-C is for the caller alone: the processes do not hear it, and end with the iteration, however that ends.
+    Only the caller receives Ctrl-C. The processes ignore it and end when the iteration ends or is closed.
 
     Args:
-        call: a function of a module, for other processes to find it.
-        jobs: processes on this computer; 1 is this process.
-        cluster: address of a dask scheduler, such as tcp://127.0.0.1:8786, whose workers have the project installed.
-        patience: longest wait for a result of a process [s].
+        call: function to call, defined at module level, so that other processes can import it.
+        tasks: argument of each call.
+        jobs: number of processes on this computer; 1: this process.
+        cluster: address of a dask scheduler such as tcp://127.0.0.1:8786. The project must be installed on its workers.
+        patience: longest time without a result of the processes [s]; None: unlimited.
 
     Raises:
-        FanOutError: joblib or dask is missing, or the scheduler does not answer.
-        TimeoutError: there was no result for `patience`.
+        FanOutError: If joblib or dask is missing, or the scheduler does not respond.
+        TimeoutError: If there is no result for `patience`.
     """
     if jobs == 1 and not cluster:
         yield from map(call, tasks)
@@ -53,7 +54,7 @@ def fan_out(
         from joblib import Parallel, delayed, parallel_config
     except ModuleNotFoundError as error:
         raise FanOutError(
-            "several processes need joblib: type `pip install 'atalante-hal[campaign]'`, or --jobs 1"
+            "several processes need joblib: install it with `pip install 'atalante-hal[campaign]'`, or use --jobs 1"
         ) from error
     with ExitStack() as stack:
         if cluster:
@@ -65,21 +66,21 @@ def fan_out(
         with _without_ctrl_c():
             results = pool(delayed(call)(task) for task in tasks)
         try:
-            for result in results:  # noqa: UP028 - `yield from` would close the results by itself, and not quietly
+            for result in results:  # noqa: UP028 - `yield from` would close the results outside the block that suppresses warnings
                 yield result
-        except multiprocessing.TimeoutError as error:  # which is no TimeoutError
+        except multiprocessing.TimeoutError as error:  # not a subclass of TimeoutError
             raise TimeoutError(f"no result for {patience:g} s") from error
         finally:
             with warnings.catch_warnings(), _without_stumbles():
-                warnings.simplefilter("ignore", UserWarning)  # that results are left is what was wanted
+                warnings.simplefilter("ignore", UserWarning)  # unused results are expected here
                 results.close()
 
 
 @contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """Processes begun inside inherit that Ctrl-C is not for them: their parent ends them.
+    """Ignore Ctrl-C in this context, so that processes started in it inherit this; their parent ends them.
 
-    Blocking the signal would not do: what joblib starts first, its resource tracker, unblocks it for those that follow.
+    Blocking the signal is not sufficient, because the resource tracker of joblib unblocks it for the processes started later.
     """
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -90,19 +91,20 @@ def _without_ctrl_c() -> Iterator[None]:
 
 @contextmanager
 def _without_stumbles() -> Iterator[None]:
-    """Nothing is said of a KeyError in loky's thread.
+    """Suppress the report of a KeyError in the executor thread of loky.
 
-    Told to kill its processes, it forgets the calls that wait, kills, and then looks one of them up if it was just about to hand
-    it out (`add_call_item_to_queue` in loky 3.6): nothing is left to be done by then.
+    On a kill, loky clears the pending calls and then kills its processes. A call that is being queued at that moment is then
+    looked up in vain (`add_call_item_to_queue` in loky 3.6). The error has no effect, because all calls are cancelled.
     """
     before = threading.excepthook
 
-    def tell(said: threading.ExceptHookArgs) -> None:
-        stumbled = said.exc_type is KeyError and said.thread is not None and said.thread.name == _LOKY_THREAD
-        if not stumbled:
-            before(said)
+    def report(failure: threading.ExceptHookArgs) -> None:
+        thread = failure.thread
+        expected = failure.exc_type is KeyError and thread is not None and thread.name == _LOKY_THREAD
+        if not expected:
+            before(failure)
 
-    threading.excepthook = tell
+    threading.excepthook = report
     try:
         yield
     finally:
@@ -111,14 +113,16 @@ def _without_stumbles() -> Iterator[None]:
 
 @contextmanager
 def _client(address: str) -> Iterator[None]:
-    """A client of the scheduler, which joblib's backend `dask` finds by itself."""
+    """Connect to the scheduler; the backend `dask` of joblib uses this client."""
     try:
         from distributed import Client
     except ModuleNotFoundError as error:
-        raise FanOutError("--dask needs dask: type `pip install 'atalante-hal[dask]'`") from error
+        raise FanOutError("--dask needs dask: install it with `pip install 'atalante-hal[dask]'`") from error
     try:
         client = Client(address, timeout=_MEETING)  # type: ignore[no-untyped-call]
     except (OSError, TimeoutError, ValueError) as error:
-        raise FanOutError(f"no dask scheduler at {address}: {error}; start one with `dask scheduler`") from error
+        raise FanOutError(
+            f"no dask scheduler responds at {address} ({error}): start one with `dask scheduler`"
+        ) from error
     with client:
         yield

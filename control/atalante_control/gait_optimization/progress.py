@@ -1,4 +1,4 @@
-"""What IPOPT is doing, once an iteration: `iterate -> iteration number, largest violation`."""
+"""Progress report of IPOPT at each iteration: `iterate -> iteration number, largest violation`."""
 
 from __future__ import annotations
 
@@ -10,39 +10,45 @@ import numpy as np
 import numpy.typing as npt
 
 Vector = npt.NDArray[np.float64]
-#: Called once an iteration with its number and the largest violation in the program's scale.
+#: Function called at each iteration with its number and the largest violation in the scale of the program.
 Progress = Callable[[int, float], None]
 
 
 class Watch(casadi.Callback):
-    """CasADi's iteration callback."""
+    """Iteration callback of CasADi that reports the progress."""
 
     def __init__(self, unknowns: int, bounds: tuple[Vector, Vector], progress: Progress) -> None:
-        """Take the bounds of the rows."""
+        """Create the callback.
+
+        Args:
+            unknowns: number of unknowns of the program.
+            bounds: lower and upper bounds of the rows.
+            progress: function to call at each iteration.
+        """
         casadi.Callback.__init__(self)
         self._unknowns, self._bounds, self._progress, self._iteration = unknowns, bounds, progress, 0
         self.construct("watch", {})
 
     def get_n_in(self) -> int:
-        """What a solver hands out."""
+        """Return the number of outputs of a solver, which are the inputs of the callback."""
         return int(casadi.nlpsol_n_out())
 
     def get_n_out(self) -> int:
-        """Nonzero to stop."""
+        """Return the number of outputs of the callback: one flag, nonzero to stop the solver."""
         return 1
 
     def get_name_in(self, index: int) -> str:
-        """As the solver calls it."""
+        """Return the name of an output of the solver."""
         return str(casadi.nlpsol_out(index))
 
     def get_sparsity_in(self, index: int) -> Any:
-        """Shapes of the solver's results; nothing for parameters."""
+        """Return the shape of an output of the solver, empty for the multipliers of the parameters."""
         name, rows = self.get_name_in(index), len(self._bounds[0])
         length = {"f": 1, "x": self._unknowns, "lam_x": self._unknowns, "g": rows, "lam_g": rows}.get(name, 0)
         return casadi.Sparsity.dense(length, 1 if length else 0)
 
     def eval(self, arguments: Sequence[Any]) -> list[int]:
-        """Count, judge, go on."""
+        """Report the iteration and its largest violation, and let the solver continue."""
         rows = np.array(arguments[casadi.nlpsol_out().index("g")]).ravel()
         outside = np.maximum(self._bounds[0] - rows, rows - self._bounds[1])
         self._progress(self._iteration, max(0.0, float(outside.max())))

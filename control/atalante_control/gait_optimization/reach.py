@@ -1,7 +1,7 @@
-"""Whether the landing pose exists at all, before a gait is looked for: `problem, subject -> sentence or nothing`.
+"""Check that a landing pose exists before a gait is solved: `problem, subject -> reason of refusal or None`.
 
-The pose with both feet flat on the ground, step length apart, is sought with joint limits that may give; the joint that has
-to leave its range furthest is the reason why there is no such gait.
+The search finds a pose with both feet flat on the ground, one step length apart, with soft joint limits. If a joint must leave
+its range, the joint with the largest violation is reported as the reason why there is no gait.
 """
 
 from __future__ import annotations
@@ -18,16 +18,20 @@ from atalante_hal.robot import JOINTS
 
 Vector = npt.NDArray[np.float64]
 
-_TOLERANCE = math.radians(0.5)  # what the optimiser's other freedoms may still make up for
-_NEAR = 1e-6  # weight of staying near the middle of the ranges, against giving way
+_TOLERANCE = math.radians(0.5)  # rad, violation that is accepted, because the optimiser can choose another pose
+_NEAR = 1e-6  # weight of the distance to the middle of the ranges, relative to the violation
 _OPTIONS: dict[str, Any] = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "error_on_fail": False}
 
 
 class Reach:
-    """The search for a landing pose, built once for a program."""
+    """Search for a landing pose, built once for a program."""
 
     def __init__(self, problem: StepProblem) -> None:
-        """Build it."""
+        """Build the search.
+
+        Args:
+            problem: program of the step.
+        """
         self._low, self._high = problem.joint_range()
         q, give = casadi.SX.sym("q", len(JOINTS)), casadi.SX.sym("give", len(JOINTS))
         rows = [*problem.landing(q), *problem.attitude(q)]
@@ -46,7 +50,12 @@ class Reach:
         self._solver: Any = casadi.nlpsol("reach", "ipopt", program, _OPTIONS)
 
     def refusal(self, parameters: Vector, step_length: float) -> str | None:
-        """Why the landing pose cannot be, or None."""
+        """Return the reason why there is no landing pose, or None if there is one.
+
+        Args:
+            parameters: parameters of the program.
+            step_length: distance of the feet along the walking direction [m].
+        """
         middle = np.clip(0.0, self._low, self._high)
         start = np.concatenate([middle, np.zeros(len(JOINTS))])
         low = np.concatenate([np.full(len(JOINTS), -np.pi), np.zeros(len(JOINTS))])
@@ -59,4 +68,4 @@ class Reach:
         if give[worst] < _TOLERANCE:
             return None
         angle, end = np.degrees([pose[worst], np.clip(pose[worst], self._low, self._high)[worst]])
-        return f"{apart} {JOINTS[worst]} would be at {angle:.1f} degrees; a gait uses it to {end:.1f} degrees at most"
+        return f"{apart} {JOINTS[worst]} would be at {angle:.1f} degrees; the limit for gaits is {end:.1f} degrees"

@@ -1,4 +1,4 @@
-"""What a solver of gaits hands back. `solve -> SolvedGait -> library, command line`."""
+"""Result of the gait solver. `solve -> SolvedGait -> library, command line`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SOLVED: Final = "solved"
 
 
 class Residual(NamedTuple):
-    """The largest violation of one group of constraints."""
+    """Largest violation of one group of constraints."""
 
     value: float
     unit: str
@@ -23,17 +23,17 @@ class Residual(NamedTuple):
 
 @dataclass(frozen=True)
 class SolvedGait:
-    """A gait with the record of its making, which `gait.solver` holds too."""
+    """Solved gait with the record of the solver, which is also in `gait.solver`."""
 
-    gait: Gait  # the last iterate where the solver failed
-    status: str  # SOLVED, or a sentence that names the constraint that does not hold
-    max_residual: float  # largest constraint violation, each in its own SI unit
-    solve_s: float
-    iterations: int
+    gait: Gait  # the last iterate if the solver failed
+    status: str  # SOLVED, or a sentence with the violated constraint
+    max_residual: float  # largest violation of all constraints, each in its SI unit
+    solve_s: float  # s, computing time
+    iterations: int  # iterations of the optimiser
     residuals: Mapping[str, Residual] = field(default_factory=dict)  # by group of constraints
     peak_torque: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (12,) Nm, at the nodes
 
     @property
     def solved(self) -> bool:
-        """Whether every constraint holds."""
+        """Return whether every constraint holds."""
         return self.status == SOLVED

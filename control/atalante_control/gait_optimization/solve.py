@@ -1,7 +1,7 @@
-"""Solve one step: `subject -> first guess or neighbour -> IPOPT -> gait with its residuals in physical units`.
+"""Solver of one step: `subject -> initial guess or neighbour -> IPOPT -> gait with its residuals in physical units`.
 
-The program of each kind of step is built once a process and serves every subject. Where the optimiser starts makes it
-faster, not different: in all cases tried, cold and warm starts ended in the same gait.
+The program of each kind of step is built once in a process and used for every subject. A warm start is faster. In all cases
+tried, solves with and without a warm start converged to the same gait.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from atalante_hal.robot import ROBOT_FILE, load_robot
 
 Vector = npt.NDArray[np.float64]
 
-RESIDUAL = 1e-6  # SI unit of each constraint, the largest a solved gait may have
+RESIDUAL = 1e-6  # largest violation of each constraint in a solved gait, in its SI unit
 _OPTIONS: dict[str, Any] = {
-    "ipopt.nlp_scaling_method": "none",  # rows and unknowns have their sizes already
+    "ipopt.nlp_scaling_method": "none",  # rows and unknowns are scaled already
     "ipopt.max_iter": 150,
     "ipopt.tol": 1e-8,
     "ipopt.constr_viol_tol": 1e-10,
@@ -45,11 +45,11 @@ _OPTIONS: dict[str, Any] = {
     "print_time": False,
     "error_on_fail": False,
     "calc_lam_p": False,
-    "no_nlp_grad": True,  # only for sensitivities, which compiled functions do not have
+    "no_nlp_grad": True,  # needed only for sensitivities, which compiled functions do not provide
 }
-#: From a neighbour: begin with small barriers, but not at the bounds. 17 to 21 iterations instead of 34 to 36.
+#: IPOPT options of a warm start: small initial barrier, but not at the bounds. 17 to 21 iterations instead of 34 to 36.
 _WARM: dict[str, Any] = {"ipopt.mu_init": 1e-3, "ipopt.bound_mult_init_method": "mu-based"}
-#: Everything that decides a gait.
+#: Source files that determine a gait, for `code_version`.
 _SOURCES = (
     *(
         f"gait_optimization/{module}.py"
@@ -68,17 +68,18 @@ def solve(
 ) -> SolvedGait:
     """Optimise a gait.
 
-    A start step leads from rest on both feet to the end of the subject's periodic step, a stop step from its beginning to
-    rest; both take `step_problem.TRANSITION` seconds, whatever the step duration.
+    A start step leads from rest on both feet to the end of the periodic step of the subject. A stop step leads from the start of
+    the periodic step to rest. Both take `step_problem.TRANSITION` seconds for every step duration.
 
     Args:
-        warm_start: a neighbour to start from.
-        kind: `periodic`, `start` or `stop`.
-        machine_code: compile the program first if that was not done on this machine yet: some 15 s, once. It pays for a
-            library.
+        subject: patient and step parameters.
+        warm_start: gait of a neighbour as the initial guess; None: `guess`.
+        kind: kind of step, `periodic`, `start` or `stop`.
+        progress: function to call at each iteration; None: no report.
+        machine_code: use compiled functions. The first use on a machine compiles them, about 15 s. This pays off for a library.
 
     Returns:
-        The gait; where none was found, the last iterate, with a status that names the constraint that cannot hold.
+        The gait. If the solver failed: the last iterate, with a status that gives the violated constraint.
     """
     around = None if kind == "periodic" else solve(subject, machine_code=machine_code)
     if around is not None and not around.solved:
@@ -127,7 +128,7 @@ def solve(
 
 @cache
 def code_version() -> str:
-    """The package's version and a hash of what decides a gait: program, model, feedforward, robot file."""
+    """Return the version of the package and a hash of program, model, feedforward and robot file."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256(ROBOT_FILE.read_bytes())
     for pattern in _SOURCES:
@@ -137,10 +138,10 @@ def code_version() -> str:
 
 
 def _unmet(problem: StepProblem, residuals: Mapping[str, Residual]) -> str:
-    """The constraint that is furthest from holding, against what counts as one of it."""
+    """Return a sentence with the constraint of the largest violation relative to its size."""
     name = max(residuals, key=lambda group: residuals[group].value / problem.units[group][1])
     value, unit = residuals[name]
-    return f"the {name} cannot hold, {value:.3g} {unit} are missing"
+    return f"the constraint '{name}' is violated by {value:.3g} {unit}"
 
 
 @cache

@@ -1,12 +1,12 @@
-"""The walking step as a nonlinear program: its unknowns, its constraints in named groups, its cost.
+"""Walking step as a nonlinear program: unknowns, constraints in named groups, and cost.
 
-`Chain, Requirements -> rows of one node, of both ends, of the impact -> NonlinearProgram`, built once for a kind of step:
-subject, step length and duration are parameters. Bezier control points determine the motion. At each node stand the joint
-angles, their first and second derivative by the phase, the torques and the ground wrench, tied to the control points by linear
-and to each other by dynamic equations. That is redundant on purpose: the equations become short and the matrix sparse.
+`Chain, Requirements -> rows of one node, of both ends, of the impact -> NonlinearProgram`, built once for a kind of step.
+Subject, step length and duration are parameters. Bezier control points determine the motion. The unknowns of a node are the
+joint angles, their first and second derivatives with respect to the phase, the torques and the ground wrench. Linear equations connect
+them to the control points, dynamic equations to each other. The redundant unknowns keep the equations short and the matrix sparse.
 
-Stance foot and swing foot are flat rigid bodies on flat ground; the stance foot does not move, which makes it partial
-hybrid zero dynamics without a zero dynamics: every step is fully actuated, and the impact map closes the cycle.
+Stance foot and swing foot are flat rigid bodies on flat ground, and the stance foot does not move. Every step is fully actuated,
+so the partial hybrid zero dynamics has no zero dynamics. The impact map closes the cycle.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ GRAVITY = 9.81  # m/s2
 _N = len(JOINTS)
 _POINTS = _N * (DEGREE + 1)  # unknowns before the nodes: control points, joint after joint
 _NODE = 4 * _N + 6  # unknowns of a node: q, dq/ds, d2q/ds2, torque, ground force, ground moment
-_TORQUE, _FORCE, _MOMENT = 100.0, 1500.0, 1500.0  # Nm, N, Nm: what counts as one in the unknowns
+_TORQUE, _FORCE, _MOMENT = 100.0, 1500.0, 1500.0  # Nm, N, Nm: scales of the unknowns
 _BOUND_UNITS = {
     "joint limits": ("rad", 0.1),
     "speed limits": ("rad/s", 1.0),
@@ -44,20 +44,28 @@ _BOUND_UNITS = {
     "vertical ground force": ("N", _FORCE),
 }
 _KNEES = [i for i, joint in enumerate(JOINTS) if joint.endswith("SK")]
-_MIRROR = casadi.DM([1.0, -1.0, 1.0])  # of a polar vector in the sagittal plane; an axial one takes the negative
+_MIRROR = casadi.DM(
+    [1.0, -1.0, 1.0]
+)  # reflects a polar vector in the sagittal plane; an axial vector needs the negative
 
 
 class StepProblem:
-    """The program of one kind of step, for any subject, step length and duration.
+    """Program of one kind of step, for any subject, step length and duration.
 
     Attributes:
-        program: rows and bounds.
-        phases: of the nodes, shape (nodes,).
-        symbols: the parameters.
+        program: nonlinear program with rows and bounds.
+        phases: phases of the nodes, shape (nodes,).
+        symbols: symbols of the parameters.
     """
 
     def __init__(self, kind: Kind, robot: Robot, requirements: Requirements) -> None:
-        """Build it; takes some seconds, so build it once (`functions` of the program are the costly part)."""
+        """Build the program. This takes some seconds, so it is done once; the functions of the program take most of it.
+
+        Args:
+            kind: kind of step, `periodic`, `start` or `stop`.
+            robot: limits of the joints.
+            requirements: constraints and cost weights.
+        """
         self.kind, self.robot, self.requirements = kind, robot, requirements
         self.exoskeleton = ExoskeletonParameters()
         self.chain = Chain(links(self.exoskeleton, Patient(75.0, 1.75)))
@@ -70,22 +78,32 @@ class StepProblem:
         self._yaw = casadi.DM(_about_z(self.chain.stance_yaw))  # stance foot to walking direction
         self.program = NonlinearProgram(_POINTS + requirements.nodes * _NODE, self.symbols)
         self._build()
-        #: Unit of each group of constraints, and how many of it count as much.
+        #: Unit and size of each group of constraints.
         self.units = {group.name: (group.unit, group.size) for group in self.program.groups} | _BOUND_UNITS
 
     def parameters(self, patient: Patient, duration: float, step_length: float) -> Vector:
-        """Parameters of the program."""
+        """Return the parameters of the program.
+
+        Args:
+            patient: patient in the exoskeleton.
+            duration: duration of the step [s].
+            step_length: step length [m].
+        """
         numbers = self.chain.values(links(self.exoskeleton, patient))
         return np.concatenate([numbers, [duration, step_length if self.kind == "periodic" else 0.0]])
 
     def joint_range(self) -> tuple[Vector, Vector]:
-        """Lowest and highest angles a gait may use, shape (12,) [rad]."""
+        """Return the smallest and the largest joint angles that a gait may use, each of shape (12,) [rad]."""
         low = self.robot.position_min + self.requirements.joint_margin
         low[_KNEES] = np.maximum(low[_KNEES], self.requirements.knee_min)
         return low, self.robot.position_max - self.requirements.joint_margin
 
     def bounds(self, duration: float) -> tuple[Vector, Vector]:
-        """Lower and upper bounds of the unknowns: joint, speed and torque limits, vertical force."""
+        """Return the lower and upper bounds of the unknowns: joint, speed and torque limits, vertical force.
+
+        Args:
+            duration: duration of the step [s].
+        """
         requirements, robot = self.requirements, self.robot
         low, high = self.joint_range()
         speed = requirements.speed_share * robot.velocity_max * duration
@@ -98,34 +116,48 @@ class StepProblem:
         return np.concatenate([-points, np.tile(lower, nodes)]), np.concatenate([points, np.tile(upper, nodes)])
 
     def unknowns(self, coefficients: Vector, parameters: Vector) -> Vector:
-        """All unknowns of a motion: control points (12, 8) [rad] to shape (unknowns,); torques by inverse dynamics."""
+        """Return all unknowns of a motion, shape (unknowns,), with torques from inverse dynamics.
+
+        Args:
+            coefficients: Bezier control points, shape (12, 8) [rad].
+            parameters: parameters of the program.
+        """
         motion = np.stack([basis @ coefficients.T for basis in self._bases], axis=1)  # (nodes, 3, 12)
         loads = self._loads.map(len(self.phases))(motion.reshape(len(motion), -1).T, parameters)
         nodes = np.concatenate([motion.reshape(len(motion), -1), np.array(loads).T], axis=1)
         return np.concatenate([coefficients.ravel(), nodes.ravel()])
 
     def coefficients(self, unknowns: Vector) -> Vector:
-        """Control points (12, 8) of a solution."""
+        """Return the control points of a solution, shape (12, 8) [rad].
+
+        Args:
+            unknowns: solution, shape (unknowns,).
+        """
         return np.asarray(unknowns[:_POINTS].reshape(_N, DEGREE + 1))
 
     def torques(self, unknowns: Vector) -> Vector:
-        """Joint torques at the nodes of a solution, shape (nodes, 12) [Nm]."""
+        """Return the joint torques at the nodes of a solution, shape (nodes, 12) [Nm].
+
+        Args:
+            unknowns: solution, shape (unknowns,).
+        """
         return np.asarray(unknowns[_POINTS:].reshape(-1, _NODE)[:, 3 * _N : 4 * _N] * _TORQUE)
 
     @property
     def basis(self) -> Vector:
-        """Angles at the nodes from control points, shape (nodes, 8)."""
+        """Return the matrix from control points to angles at the nodes, shape (nodes, 8)."""
         return self._bases[0]
 
     def residuals(
         self, unknowns: Vector, rows: Vector, bounds: tuple[Vector, Vector], duration: float
     ) -> dict[str, Residual]:
-        """Largest violation of each group of constraints, in its unit.
+        """Return the largest violation of each group of constraints, in its unit.
 
         Args:
-            unknowns: of `unknowns`, so that torques and ground forces follow from the motion.
-            rows: g there.
-            bounds: of the rows.
+            unknowns: result of `unknowns`, so that torques and ground forces follow from the motion.
+            rows: g at these unknowns.
+            bounds: lower and upper bounds of the rows.
+            duration: duration of the step [s].
         """
         outside, found = _outside(rows, bounds), dict[str, float]()
         for group in self.program.groups:
@@ -139,7 +171,11 @@ class StepProblem:
         return {name: Residual(value, self.units[name][0]) for name, value in found.items()}
 
     def node(self, index: int) -> Places:
-        """Places of a node's unknowns."""
+        """Return the indices of the unknowns of a node.
+
+        Args:
+            index: index of the node.
+        """
         return _POINTS + index * _NODE + np.arange(_NODE)
 
     def _build(self) -> None:
@@ -179,7 +215,10 @@ class StepProblem:
         program.minimise(cost, z, [self.node(n) for n in range(requirements.nodes)], weights)
 
     def _reach_function(self, q: Symbol) -> Any:
-        """pose, (pelvis, swing ankle) [m] in the walking frame, parameters -> error of both with their attitudes, Jacobian."""
+        """Return the function for the inverse kinematics: pose, target, parameters -> error and its Jacobian.
+
+        The target is the position of pelvis and swing ankle in the walking frame [m]. The error includes their attitudes.
+        """
         target = casadi.SX.sym("target", 6)
         frames = self.chain.frames(q, casadi.SX(_N, 1))
         pelvis, foot = frames[self.chain.pelvis], frames[self.chain.swing_foot]
@@ -192,7 +231,7 @@ class StepProblem:
         return casadi.Function("reach", [q, target, self.symbols], [error, casadi.jacobian(error, q)])
 
     def _trajectory_rows(self) -> Vector:
-        """Nodes follow from the control points: q, dq/ds, d2q/ds2 minus basis times points is zero."""
+        """Return the rows by which the nodes follow from the control points: q, dq/ds, d2q/ds2 less basis times points is 0."""
         rows = np.zeros((self.requirements.nodes, 3, _N, self.program.unknowns))
         for node in range(self.requirements.nodes):
             for order, basis in enumerate(self._bases):
@@ -203,7 +242,7 @@ class StepProblem:
         return rows.reshape(-1, self.program.unknowns)
 
     def _control_point(self, index: int) -> Vector:
-        """Rows that pick a control point of every joint, shape (12, unknowns)."""
+        """Return the rows that select a control point of every joint, shape (12, unknowns)."""
         rows = np.zeros((_N, self.program.unknowns))
         rows[np.arange(_N), np.arange(_N) * (DEGREE + 1) + index % (DEGREE + 1)] = 1.0
         return rows
@@ -214,7 +253,7 @@ class StepProblem:
             rows = point(0) - SIGN[:, None] * point(-1)[SWAP]
             program.add_linear("periodicity", "rad", rows, np.zeros(_N))
             return
-        # At one end the gait's control points are given (`constraint_bounds`), at the other the robot rests.
+        # At one end the control points are those of the gait (`constraint_bounds`); at the other end the robot is at rest.
         given, rest = ((-1, -2), (0, 1, 2)) if self.kind == "start" else ((0, 1), (-1, -2, -3))
         for name, index in zip(("gait pose", "gait speed"), given, strict=True):
             program.add_linear(name, "rad", point(index), np.zeros(_N))
@@ -222,12 +261,16 @@ class StepProblem:
             program.add_linear(name, "rad", point(rest[0]) - point(index), np.zeros(_N))
 
     def constraint_bounds(self, around: Gait | None = None) -> tuple[Vector, Vector]:
-        """Bounds of the rows; `around` is the periodic gait that a start step leads to and a stop step comes from."""
+        """Return the lower and upper bounds of the rows.
+
+        Args:
+            around: periodic gait after a start step or before a stop step; None for a periodic step.
+        """
         lower, upper = self.program.lower.copy(), self.program.upper.copy()
         if around is not None:
             end, next_one = (-1, -2) if self.kind == "start" else (0, 1)
             pose, other = around.coefficients[:, end], around.coefficients[:, next_one]
-            # The same speed, over a step of another duration.
+            # The speed is the same, but the duration of the step differs.
             points = {"gait pose": pose, "gait speed": pose + (other - pose) * TRANSITION / around.duration}
             for group in self.program.groups:
                 if group.name in points:
@@ -243,12 +286,12 @@ class StepProblem:
         ]
 
     def _pressure_moment(self, wrench: Symbol) -> Symbol:
-        """Ground moment about the sole's centre [Nm]."""
+        """Return the ground moment about the centre of the sole [Nm]."""
         x, z = self.exoskeleton.sole_centre
         return wrench[3:] * _MOMENT - casadi.cross(casadi.DM([x, 0.0, z]), wrench[:3] * _FORCE)
 
     def _ground(self, wrench: Symbol) -> list[Rows]:
-        """Friction cone; centre of pressure and yaw moment, as vertical force left over [N]."""
+        """Return the rows of the friction cone, centre of pressure and yaw moment, as margins of the vertical force [N]."""
         requirements, exo = self.requirements, self.exoskeleton
         force, moment = wrench[:3] * _FORCE, self._pressure_moment(wrench)
         length, width = exo.sole_size
@@ -260,7 +303,7 @@ class StepProblem:
         def within(value: Symbol, lever: float) -> Symbol:
             return casadi.vertcat(force[2] - value / lever, force[2] + value / lever)
 
-        # The cone as a difference of squares over its size: N, and smooth everywhere.
+        # The cone is a difference of squares divided by the size, which is smooth everywhere and has the unit N.
         cone = (force[2] ** 2 - (force[0] ** 2 + force[1] ** 2) / requirements.friction**2) / _FORCE
         return [
             _positive("ground friction", "N", _FORCE, cone),
@@ -270,14 +313,18 @@ class StepProblem:
         ]
 
     def attitude(self, q: Symbol) -> list[Rows]:
-        """The pelvis upright and forward."""
+        """Return the rows that keep the pelvis upright and facing forward.
+
+        Args:
+            q: joint angles, SX of shape (12,) [rad].
+        """
         requirements = self.requirements
         tilt = _tilt(self._yaw @ self.chain.frames(q, casadi.SX(_N, 1))[self.chain.pelvis].rotation)
         limit = np.sin([requirements.roll, requirements.pitch, requirements.yaw])
         return [Rows("pelvis attitude", "rad", 0.1, tilt, -limit, limit)]
 
     def _swing(self, q: Symbol, rate: Symbol) -> list[Rows]:
-        """Clearance of the four corners of the swing sole; corridor of its ankle."""
+        """Return the rows for the clearance of the four corners of the swing sole and for the corridor of its ankle."""
         requirements = self.requirements
         foot = self.chain.frames(q, rate)[self.chain.swing_foot]
         ground = self.exoskeleton.sole_centre[1]
@@ -302,10 +349,14 @@ class StepProblem:
         ]
 
     def landing(self, q: Symbol) -> list[Rows]:
-        """Swing foot flat on the ground, toes out as the stance foot's, step length ahead."""
+        """Return the rows of the landing: swing foot flat on the ground, mirrored toe-out, one step length ahead.
+
+        Args:
+            q: joint angles, SX of shape (12,) [rad].
+        """
         foot = self.chain.frames(q, casadi.SX(_N, 1))[self.chain.swing_foot]
         position = self._yaw @ foot.position
-        tilt = _tilt(self._yaw @ self._yaw @ foot.rotation)  # the stance foot's toe-out, mirrored
+        tilt = _tilt(self._yaw @ self._yaw @ foot.rotation)  # with the mirrored toe-out of the stance foot
         zero, requirements = np.zeros(3), self.requirements
         place = casadi.vertcat(position[0] - self._length, position[2])
         return [
@@ -322,7 +373,7 @@ class StepProblem:
         ]
 
     def _touchdown(self, q: Symbol, rate: Symbol) -> list[Rows]:
-        """Soft landing: the foot comes down slowly and hardly slides or turns."""
+        """Return the rows of a soft landing, with limits of the vertical, sliding and angular speed of the foot."""
         requirements = self.requirements
         foot = self.chain.frames(q, rate)[self.chain.swing_foot]
         speed = self._yaw @ foot.rotation @ foot.linear
@@ -336,9 +387,10 @@ class StepProblem:
         ]
 
     def _add_impact(self) -> None:
-        """The impact map to the mirrored start: no joint impulse, ground impulse upwards, the foot that leaves hardly sinks.
+        """Add the impact map to the mirrored start: no joint impulse, upward ground impulse, limited sinking of the leaving foot.
 
-        In the mirrored robot the landing foot is the stance foot: from its twist to rest, from the old rates to the new.
+        In the mirrored robot the landing foot is the stance foot. The impact changes its twist to zero and the joint speeds to
+        those of the next step.
         """
         requirements, program, duration = self.requirements, self.program, self._duration
         q0, v0, q1, v1 = (casadi.SX.sym(name, _N) for name in ("q0", "v0", "q1", "v1"))
@@ -381,7 +433,7 @@ def _outside(values: Vector, bounds: tuple[Vector, Vector]) -> Vector:
 
 
 def _tilt(rotation: Symbol) -> Symbol:
-    """Small rotation as three numbers, zero when there is none."""
+    """Return a small rotation as three numbers, which are zero for the identity."""
     return casadi.vertcat(rotation[2, 1], -rotation[2, 0], rotation[1, 0])
 
 

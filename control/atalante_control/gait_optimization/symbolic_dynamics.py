@@ -1,9 +1,9 @@
 """Inverse dynamics and kinematics of the walking chain in CasADi symbols, from the flat stance foot to the swing foot.
 
-`links of the model -> bodies -> Chain (topology, numbers as parameters) -> expressions for the program`. The tree of the
-model is rooted at the pelvis; the right foot stands, so it is walked from there: up the stance leg against the joints'
-direction, down the swing leg along it. Vectors are those of Featherstone's recursive Newton-Euler algorithm in link
-frames, accelerations of a frame's origin with gravity in them; the root frame is the stance foot's, flat on the ground.
+`links of the model -> bodies -> Chain (topology, numbers as parameters) -> expressions for the program`. The tree of the model is
+rooted at the pelvis, but the right foot is at rest. The recursion therefore starts at the right foot: up the stance leg against
+the direction of the joints, then down the swing leg. The algorithm is Featherstone's recursive Newton-Euler algorithm in link
+frames. Accelerations are those of the frame origins and include gravity. The root frame is that of the stance foot.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ Symbol = Any  # casadi.SX
 
 _LEFT, _RIGHT = SIDES
 STANCE_FOOT, SWING_FOOT = f"{_RIGHT}_{LEG_LINKS['HA']}", f"{_LEFT}_{LEG_LINKS['HA']}"
-_NUMBERS = 13  # of a body: mass, first moment (3), inertia about the origin (6), joint origin (3)
+_NUMBERS = 13  # numbers of a body: mass, first moment (3), inertia about the origin (6), joint origin (3)
 
 
 @dataclass(frozen=True)
 class Body:
-    """A link that moves, with the links fixed to it. Inertia about the link's origin."""
+    """Moving link with the links fixed to it, and the inertia about the origin of the link."""
 
-    name: str
-    parent: str
+    name: str  # of the link
+    parent: str  # name of the parent link
     joint: int  # index in JOINTS, -1 for the pelvis
-    origin: Vector3  # m, joint in the parent's frame
-    yaw: float  # rad, about the parent's z
-    axis: Vector3
+    origin: Vector3  # m, position of the joint in the frame of the parent
+    yaw: float  # rad, rotation about z of the parent
+    axis: Vector3  # joint axis in the frame of the link
     mass: float  # kg
     moment: Vector3  # kg m, mass times centre of mass
     inertia: Vector  # (6,) kg m2 about the origin: xx, xy, xz, yy, yz, zz
@@ -45,7 +45,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Wrench:
-    """What the ground does to the stance foot, at the foot link's origin, in its axes."""
+    """Wrench of the ground on the stance foot, at the origin and in the axes of the foot link."""
 
     force: Symbol  # (3,) N
     moment: Symbol  # (3,) Nm
@@ -53,19 +53,22 @@ class Wrench:
 
 @dataclass(frozen=True)
 class Frame:
-    """Pose and, where asked for, velocity of a link in the stance foot's frame."""
+    """Pose and velocity of a link in the frame of the stance foot."""
 
     rotation: Symbol  # (3, 3), link to stance foot
     position: Symbol  # (3,) m
-    angular: Symbol  # (3,) rad/s, in the link's own axes
-    linear: Symbol  # (3,) m/s, of the link's origin, in the link's own axes
+    angular: Symbol  # (3,) rad/s, in the axes of the link
+    linear: Symbol  # (3,) m/s, velocity of the origin of the link, in the axes of the link
 
 
 def bodies(links: Sequence[Link]) -> tuple[Body, ...]:
-    """The pelvis and the twelve bodies the joints move, in the order of `JOINTS`; fixed links become part of theirs.
+    """Return the pelvis and the twelve bodies moved by the joints, in the order of `JOINTS`, with fixed links fused into them.
+
+    Args:
+        links: links of the model, parents first.
 
     Raises:
-        ValueError: a fixed link is turned or carries a moving one: this generator makes none.
+        ValueError: If a fixed link is rotated or fixed to another fixed link; both are not supported.
     """
     carriers = {link.name: link for link in links if link.joint or link.name == BASE_LINK}
     mass = dict.fromkeys(carriers, 0.0)
@@ -75,7 +78,7 @@ def bodies(links: Sequence[Link]) -> tuple[Body, ...]:
         carrier, place = (link.name, np.zeros(3)) if link.name in carriers else (link.parent, np.array(link.origin))
         if carrier not in carriers or (carrier != link.name and link.yaw):
             raise ValueError(
-                f"link {link.name} is fixed to {link.parent} with a turn, or to a fixed link; neither is known"
+                f"fixed link {link.name} must have yaw 0 and a moving parent, got yaw {link.yaw} and parent {link.parent}"
             )
         centre = place + np.array(link.inertia.centre)
         mass[carrier] += link.inertia.mass
@@ -102,13 +105,17 @@ def bodies(links: Sequence[Link]) -> tuple[Body, ...]:
 
 
 class Chain:
-    """The chain with its numbers as symbols: one set of expressions serves every subject.
+    """Walking chain with its numbers as symbols, so that one set of expressions is valid for every subject.
 
-    Axes and toe-out are constants. Numbers that are zero in the reference stay zero, which keeps the expressions small.
+    Axes and toe-out are constants. Numbers that are zero in the reference remain zero, which keeps the expressions small.
     """
 
     def __init__(self, reference: Sequence[Link]) -> None:
-        """Take topology, axes and the pattern of zeros from a reference robot."""
+        """Build the chain.
+
+        Args:
+            reference: links of a reference robot, which define topology, axes and the pattern of zeros.
+        """
         self.bodies = bodies(reference)
         numbers = _numbers(self.bodies)
         self._used = np.flatnonzero(numbers)
@@ -119,7 +126,7 @@ class Chain:
         width = numbers.shape[1]
         self._rows = [casadi.vertcat(*flat[i * width : (i + 1) * width]) for i in range(len(self.bodies))]
         by_name = {body.name: i for i, body in enumerate(self.bodies)}
-        self._route: list[tuple[int, int, bool]] = []  # (known body, next body, the next is the known one's parent)
+        self._route: list[tuple[int, int, bool]] = []  # (body, next body, whether the next body is the parent)
         place = by_name[STANCE_FOOT]
         while self.bodies[place].parent:
             parent = by_name[self.bodies[place].parent]
@@ -129,14 +136,17 @@ class Chain:
             (by_name[body.parent], by_name[body.name], False) for body in self.bodies if body.name.startswith(_LEFT)
         ]
         self.root, self.pelvis, self.swing_foot = by_name[STANCE_FOOT], by_name[BASE_LINK], by_name[SWING_FOOT]
-        #: rad, of the stance foot when the pelvis faces forward and all joints are zero.
+        #: Yaw of the stance foot with the pelvis facing forward and all joints at zero [rad].
         self.stance_yaw = math.fsum(body.yaw for body in self.bodies if body.name.startswith(_RIGHT))
 
     def values(self, links: Sequence[Link]) -> Vector:
-        """Numbers of a robot for `symbols`.
+        """Return the numbers of a robot for `symbols`.
+
+        Args:
+            links: links of the robot.
 
         Raises:
-            ValueError: the robot has another topology than the reference.
+            ValueError: If the topology of the robot differs from the reference.
         """
         robot = bodies(links)
         same = all(
@@ -150,7 +160,12 @@ class Chain:
         return np.asarray(numbers[self._used])
 
     def frames(self, q: Symbol, qd: Symbol) -> dict[int, Frame]:
-        """Pose and velocity of every body, keyed by its index in `bodies`, with the stance foot at rest."""
+        """Return pose and velocity of every body by its index in `bodies`, with the stance foot at rest.
+
+        Args:
+            q: joint angles, SX of shape (12,) [rad].
+            qd: joint speeds, SX of shape (12,) [rad/s].
+        """
         zero = casadi.SX(3, 1)
         frames = {self.root: Frame(casadi.SX.eye(3), zero, zero, zero)}
         for known, new, upwards in self._route:
@@ -173,12 +188,17 @@ class Chain:
     def inverse_dynamics(
         self, q: Symbol, qd: Symbol, qdd: Symbol, linear: Symbol, angular: Symbol
     ) -> tuple[Symbol, Wrench]:
-        """Joint torques (12,) [Nm] and ground wrench of a motion of the chain.
+        """Return the joint torques (12,) [Nm] and the ground wrench of a motion of the chain.
+
+        The angular velocity of the stance foot is zero. If velocity changes are given instead of accelerations and `qd` is zero,
+        the results are the joint impulses and the ground impulse of an impact.
 
         Args:
-            linear, angular: acceleration of the stance foot's origin in its own axes, gravity as an acceleration upwards;
-                the foot does not turn. With velocities in the place of accelerations and `qd` zero, torques are joint
-                impulses and the wrench is that of an impact.
+            q: joint angles, SX of shape (12,) [rad].
+            qd: joint speeds, SX of shape (12,) [rad/s].
+            qdd: joint accelerations, SX of shape (12,) [rad/s2].
+            linear: acceleration of the origin of the stance foot in its axes, with gravity as an upward acceleration [m/s2].
+            angular: angular acceleration of the stance foot in its axes [rad/s2].
         """
         omega, alpha, acceleration = {self.root: casadi.SX(3, 1)}, {self.root: angular}, {self.root: linear}
         turns, origins, axes = {}, {}, {}
@@ -220,7 +240,7 @@ class Chain:
         return casadi.vertcat(*torque), Wrench(force[self.root], moment[self.root])
 
     def _joint(self, child: int, q: Symbol) -> tuple[Symbol, Symbol, Symbol]:
-        """Rotation child to parent, joint origin in the parent's frame, axis in the child's."""
+        """Return the rotation from child to parent, the joint origin in the parent frame, and the axis in the child frame."""
         body = self.bodies[child]
         norm = math.hypot(*body.axis)
         axis = np.array(body.axis) / norm
@@ -235,7 +255,7 @@ class Chain:
 
 
 def _carried(omega: Symbol, alpha: Symbol, lever: Symbol) -> Symbol:
-    """Acceleration of a point at `lever` over that of the origin."""
+    """Return the acceleration of a point at `lever` relative to the origin."""
     return casadi.cross(alpha, lever) + casadi.cross(omega, casadi.cross(omega, lever))
 
 

@@ -1,9 +1,9 @@
-"""An independent judgement of a gait: `gait, patient -> Pinocchio -> what it demands of joints, ground and impact`.
+"""Independent verification of a gait: `gait, patient -> Pinocchio -> checks of joints, ground forces and impact`.
 
-Nothing is shared with the optimiser: polynomials by de Casteljau, the model through its URDF, the pelvis as a floating base
-whose motion is reconstructed from the stance foot at rest, torques and ground wrench from recursive Newton-Euler on that
-base, and the impact as the KKT system of the floating robot. And it looks every few milliseconds, where the optimiser
-looked at its nodes alone.
+No code is shared with the optimiser. Polynomials are evaluated by de Casteljau, and the model is the URDF. The pelvis is a
+floating base, whose motion follows from the stance foot at rest. Torques and ground wrench come from recursive Newton-Euler on this base,
+and the impact is the KKT system of the floating robot. The step is sampled every few milliseconds, not only at the nodes of the
+optimiser.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from atalante_hal.robot import SIDES, Robot
 Vector = npt.NDArray[np.float64]
 
 _LEFT, _RIGHT = (f"{side}_{LEG_LINKS['HA']}" for side in SIDES)
-_SAMPLES = 201  # over a step
+_SAMPLES = 201  # number of samples of a step
 _LOCAL = pinocchio.ReferenceFrame.LOCAL
-_EXACT = 1e-6  # SI units, for what an optimiser claims to have met exactly
-_SLIDING = 1.0  # Ns, that friction need not hold at the impact: with all the mass behind it some millimetres a second
-_SINKING = 1e-3  # m, of the foot that leaves, in its first moments
+_EXACT = 1e-6  # SI units, tolerance of equality constraints of the optimiser
+_SLIDING = 1.0  # Ns, accepted impulse beyond friction at the impact; it changes the speed of the robot by some mm/s
+_SINKING = 1e-3  # m, accepted depth of the leaving foot at the start of its swing
 
 
 class Check(NamedTuple):
-    """One demand on a gait: the largest value found and what is allowed."""
+    """Check of a gait: the largest value found, and its limit."""
 
     name: str
     value: float
@@ -39,7 +39,7 @@ class Check(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether it is met."""
+        """Return whether the value is within the limit."""
         return self.value <= self.limit
 
 
@@ -52,10 +52,15 @@ class _Motion(NamedTuple):
 
 
 class Verifier:
-    """A patient in the exoskeleton, on a floating base."""
+    """Verifier for the exoskeleton with a patient, modelled with a floating base."""
 
     def __init__(self, robot: Robot, patient: Patient) -> None:
-        """Build the Pinocchio model from the URDF."""
+        """Build the Pinocchio model from the URDF.
+
+        Args:
+            robot: limits of the joints.
+            patient: patient in the exoskeleton.
+        """
         self._robot, self._exo = robot, ExoskeletonParameters()
         self._articulated = pinocchio_model(urdf(self._exo, robot, patient), fixed_base=False)
         model = self._articulated.model
@@ -64,17 +69,24 @@ class Verifier:
         self.weight = pinocchio.computeTotalMass(model) * 9.81  # N
 
     def verify(self, gait: Gait, kind: str = "periodic") -> tuple[Check, ...]:
-        """Everything a right-stance step has to keep.
+        """Run all checks of a right-stance step.
 
         Args:
-            kind: `periodic`, or `start` and `stop`, which rest at one end and do not hit the ground.
+            gait: gait to verify.
+            kind: `periodic`, or `start` or `stop`, which are at rest at one end and have no impact.
         """
         motion = _sampled(gait, np.linspace(0.0, 1.0, _SAMPLES))
         checks = [*self._joints(motion), *self._loads(motion), *self._swing(motion)]
         return (*checks, *(self._cycle(motion) if kind == "periodic" else self._rest(motion, kind)))
 
     def loads(self, q: Vector, qd: Vector, qdd: Vector) -> tuple[Vector, Vector]:
-        """Joint torques (12,) [Nm] and ground wrench (6,) [N, Nm] at the stance foot's origin, in its axes."""
+        """Return joint torques (12,) [Nm] and ground wrench (6,) [N, Nm] at the origin and in the axes of the stance foot.
+
+        Args:
+            q: joint angles, shape (12,) [rad].
+            qd: joint speeds, shape (12,) [rad/s].
+            qdd: joint accelerations, shape (12,) [rad/s2].
+        """
         model, data, place = self._articulated.model, self._data, self._articulated.v
         configuration, speed, acceleration = self._on_right_foot(q), np.zeros(model.nv), np.zeros(model.nv)
         speed[place], acceleration[place] = qd, qdd
@@ -89,9 +101,16 @@ class Verifier:
         return (demanded - jacobian.T @ wrench)[place], wrench
 
     def impact(self, q: Vector, qd: Vector) -> tuple[Vector, Vector, Vector]:
-        """The left foot lands flat and stays: rates after (12,) [rad/s], impulse (6,) on it, twist (6,) of the right foot.
+        """Compute the impact of the left foot, which lands flat and does not rebound.
 
         Source: [M -J'; J 0] (v+, impulse) = (M v-, 0), J the Jacobian of the foot that lands.
+
+        Args:
+            q: joint angles, shape (12,) [rad].
+            qd: joint speeds before the impact, shape (12,) [rad/s].
+
+        Returns:
+            Joint speeds after the impact (12,) [rad/s], impulse on the left foot (6,), and twist of the right foot (6,).
         """
         model, data, place = self._articulated.model, self._data, self._articulated.v
         configuration, before = self._on_right_foot(q), np.zeros(model.nv)
@@ -154,10 +173,10 @@ class Verifier:
         ]
 
     def _cycle(self, motion: _Motion) -> list[Check]:
-        """The step closes: landing pose, periodicity, impact map."""
+        """Return the checks of a periodic step: landing pose, periodicity, impact map."""
         after, impulse, leaving = self.impact(motion.q[-1], motion.qd[-1])
         mirrored_q, mirrored_qd = SIGN * motion.q[0][SWAP], SIGN * motion.qd[0][SWAP]
-        # The landing is so soft that the impulse is about that of a dropped book: what friction lacks is small, not none.
+        # The impulse of the soft landing is small, so a small impulse beyond friction is accepted.
         sliding = math.hypot(impulse[0], impulse[1]) - 0.5 * impulse[2]
         sinking = -min(leaving[2] + np.cross(leaving[3:], corner)[2] for corner in self._corners())
         return [
@@ -178,7 +197,7 @@ class Verifier:
         ]
 
     def _landing(self, q: Vector) -> list[Check]:
-        """The left foot stands flat, turned as the right one's mirror image."""
+        """Return the checks that the left foot is flat on the ground and is the mirror image of the right foot."""
         stance, swing, _ = self._poses(q)
         relative = stance.actInv(swing)
         turned = self._forward() @ self._forward()
@@ -190,7 +209,7 @@ class Verifier:
         ]
 
     def _poses(self, q: Vector) -> tuple[Any, Any, Any]:
-        """Right foot, left foot, pelvis."""
+        """Return the poses of right foot, left foot and pelvis."""
         configuration = pinocchio.neutral(self._articulated.model)
         configuration[self._articulated.q] = q
         pinocchio.framesForwardKinematics(self._articulated.model, self._data, configuration)
@@ -198,7 +217,7 @@ class Verifier:
         return frames[self._right].copy(), frames[self._left].copy(), frames[self._pelvis].copy()
 
     def _on_right_foot(self, q: Vector) -> Vector:
-        """Configuration of the floating robot whose right foot is the world's frame."""
+        """Return the configuration of the floating robot with the right foot as the world frame."""
         stance, _, pelvis = self._poses(q)
         configuration = pinocchio.neutral(self._articulated.model)
         configuration[self._articulated.q] = q
@@ -206,17 +225,17 @@ class Verifier:
         return np.asarray(configuration)
 
     def _forward(self) -> Vector:
-        """Walking frame in the stance foot's, which toes out."""
+        """Return the rotation from the walking frame to the frame of the stance foot, which is turned by the toe-out."""
         return np.asarray(pinocchio.utils.rotate("z", self._exo.toe_out))
 
     def _corners(self) -> Vector:
-        """Of the sole, in the foot's frame, shape (4, 3) [m]."""
+        """Return the corners of the sole in the frame of the foot, shape (4, 3) [m]."""
         x, z = self._exo.sole_centre
         length, width = self._exo.sole_size
         return np.array([(x + i * length / 2, j * width / 2, z) for i in (1, -1) for j in (1, -1)])
 
     def _foot_width(self) -> float:
-        """Distance of the ankles at which the heels, which toe-out brings together, touch [m]."""
+        """Return the distance of the ankles at which the heels touch [m]; the toe-out moves the heels inwards."""
         inner = self._forward().T @ (self._corners() * [1.0, -1.0, 1.0]).T
         return float(2.0 * inner[1].max())
 

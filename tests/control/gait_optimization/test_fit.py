@@ -204,12 +204,12 @@ class TestCommand:
     @pytest.mark.parametrize(
         ("arguments", "sentence"),
         [
-            (["library", "--out", "x", "--mass", "60,70"], "mass has at least 3 levels that rise"),
+            (["library", "--out", "x", "--mass", "60,70"], "mass must have at least 3 ascending levels"),
             (
                 ["library", "--out", "x", "--mass", "60,a"],
                 "levels must be numbers separated by commas (58,75,91), got '60,a'",
             ),
-            (["fit", "--library", "nowhere", "--out", "x.npz"], "nowhere holds no library"),
+            (["fit", "--library", "nowhere", "--out", "x.npz"], "nowhere contains no library"),
             (["check", "--network", "nowhere.npz"], "nowhere.npz"),
         ],
     )

@@ -103,9 +103,9 @@ def test_exception_in_the_solver_is_raised(tmp_path: Path) -> None:
 def test_folder_keeps_its_grid(tmp_path: Path) -> None:
     Library(tmp_path, GRID)
     assert Library(tmp_path).grid == GRID
-    with pytest.raises(LibraryError, match="holds a library over another grid"):
+    with pytest.raises(LibraryError, match="contains a library with another grid"):
         Library(tmp_path, Grid())
-    with pytest.raises(LibraryError, match="holds no library"):
+    with pytest.raises(LibraryError, match="contains no library"):
         Library(tmp_path / "nowhere")
 
 
@@ -128,8 +128,8 @@ def test_invalid_grid_file_is_rejected(tmp_path: Path, content: str) -> None:
 @pytest.mark.parametrize(
     ("levels", "sentence"),
     [
-        ({"mass": (60.0, 70.0)}, "mass has at least 3 levels that rise"),
-        ({"step_duration": (0.7, 0.9, 0.8)}, "step_duration has at least 3 levels that rise"),
+        ({"mass": (60.0, 70.0)}, "mass must have at least 3 ascending levels"),
+        ({"step_duration": (0.7, 0.9, 0.8)}, "step_duration must have at least 3 ascending levels"),
         ({"height": (1.4, 1.6, 1.8)}, "height of the patient must be 1.5 to 2 m, got 1.4 m"),
         ({"step_length": (0.1, 0.2, 0.5)}, "step length must be 0.05 to 0.4 m, got 0.5 m"),
     ],
@@ -155,7 +155,7 @@ def test_gait_that_fails_verification_is_not_solved(monkeypatch: pytest.MonkeyPa
         outcome = solve(subject)
         assert not outcome.solved
         assert outcome.status.startswith(f"{subject}: ")
-        assert " when verified, over " in outcome.status
+        assert " in the verification, got " in outcome.status
 
 
 def test_failed_gait_is_not_verified() -> None:

@@ -32,7 +32,7 @@ def test_what_is_out_of_reach_is_said_by_joint_and_angle(problem: StepProblem, r
     refusal = reach.refusal(problem.parameters(Patient(110.0, 1.5), 0.8, 0.4), 0.4)
     assert refusal is not None
     assert "0.4 m apart right_SA would be at -15" in refusal
-    assert "-14.0 degrees at most" in refusal
+    assert "limit for gaits is -14.0 degrees" in refusal
 
 
 def test_further_is_worse(problem: StepProblem, reach: Reach) -> None:

@@ -97,7 +97,7 @@ def test_what_is_out_of_reach_is_said_at_once() -> None:
 def test_what_cannot_be_walked_is_named_by_its_constraint() -> None:
     outcome = solve(Subject(Patient(75.0, 1.75), 0.4, 0.4))
     assert not outcome.solved
-    assert "cannot hold" in outcome.status
+    assert "is violated by" in outcome.status
     assert any(name in outcome.status for name in outcome.residuals)
     assert isinstance(outcome.gait, Gait)
 
