@@ -2,8 +2,9 @@
 
 `Chain, Requirements -> rows of one node, of both ends, of the impact -> NonlinearProgram`, built once for a kind of step.
 Subject, step length and duration are parameters. Bezier control points determine the motion. The unknowns of a node are the
-joint angles, their first and second derivatives with respect to the phase, the torques and the ground wrench. Linear equations connect
-them to the control points, dynamic equations to each other. The redundant unknowns keep the equations short and the matrix sparse.
+joint angles, their first and second derivatives with respect to the phase, the torques and the ground wrench. Linear equations
+connect them to the control points, dynamic equations to each other. The redundant unknowns keep the equations short and the
+matrix sparse.
 
 Stance foot and swing foot are flat rigid bodies on flat ground, and the stance foot does not move. Every step is fully actuated,
 so the partial hybrid zero dynamics has no zero dynamics. The impact map closes the cycle.

@@ -1,9 +1,9 @@
 """Independent verification of a gait: `gait, patient -> Pinocchio -> checks of joints, ground forces and impact`.
 
 No code is shared with the optimiser. Polynomials are evaluated by de Casteljau, and the model is the URDF. The pelvis is a
-floating base, whose motion follows from the stance foot at rest. Torques and ground wrench come from recursive Newton-Euler on this base,
-and the impact is the KKT system of the floating robot. The step is sampled every few milliseconds, not only at the nodes of the
-optimiser.
+floating base, whose motion follows from the stance foot at rest. Torques and ground wrench come from recursive Newton-Euler on
+this base, and the impact is the KKT system of the floating robot. The step is sampled every few milliseconds, not only at the
+nodes of the optimiser.
 """
 
 from __future__ import annotations
