@@ -1,8 +1,8 @@
 """Library of gaits over a grid of subjects, computed by processes or a cluster; the computation can be resumed.
 
 `Grid, solve -> one file for each gait -> fit`. Every gait is solved without a warm start, so it depends only on its own
-parameters and not on its neighbours, the number of processes or interruptions. The small error of the fit shows that neighbours still
-converge to similar local minima. Failures are recorded in files.
+parameters and not on its neighbours, the number of processes or interruptions. The small error of the fit shows that neighbours
+still converge to similar local minima. Failures are recorded in files.
 """
 
 from __future__ import annotations
