@@ -22,9 +22,7 @@ class Requirements:
     sole_share: float = 0.6  # fraction of the sole that may contain the centre of pressure
     cell_share: float = 0.8  # fraction of the rectangle of the force cells that may contain the centre of pressure
     yaw_lever: float = 0.03  # m, largest yaw moment about the centre of the sole over vertical force
-    clearance: float = (
-        0.05  # m, smallest height of the swing sole at mid-swing, scaled by sin(pi t / T)^2 along the step
-    )
+    clearance: float = 0.05  # m, smallest height of the swing sole at mid-swing, scaled by sin(pi t / T)^2
     corridor: tuple[float, float] = (0.17, 0.28)  # m, lateral distance of the ankles
     roll: float = math.radians(5.0)  # rad, largest roll of the pelvis
     pitch: float = math.radians(6.0)  # rad, largest pitch of the pelvis
