@@ -89,5 +89,5 @@ def test_what_is_missing_is_said_with_what_to_type(monkeypatch: pytest.MonkeyPat
     with pytest.raises(FanOutError, match=r"pip install 'atalante-hal\[dask\]'"):
         list(fan_out(doubled, [1], cluster="tcp://127.0.0.1:1"))
     monkeypatch.setitem(sys.modules, "joblib", None)
-    with pytest.raises(FanOutError, match="or --jobs 1"):
+    with pytest.raises(FanOutError, match="or use --jobs 1"):
         list(fan_out(doubled, [1], jobs=2))
