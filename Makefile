@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 OUT ?= runs
 
-.PHONY: help demo test test-vcan fuzz coverage mutation lint docs bench messages supervisor-table clean
+.PHONY: help demo test test-vcan lowest fuzz coverage mutation lint docs bench messages supervisor-table clean
 
 help: ## list the targets (the default)
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -17,6 +17,13 @@ test: .venv/installed-dev lint ## run linters, type checks and all tests except 
 
 test-vcan: .venv/installed-vcan ## run the tests on real SocketCAN, in a virtual machine if this kernel has none
 	PYTHON=$(BIN)/python tests/vcan/run.sh
+
+lowest: ## install the lowest versions that pyproject.toml allows into .venv-lowest and try a command for each extra
+	rm -rf .venv-lowest
+	$(PYTHON) -m venv .venv-lowest
+	.venv-lowest/bin/pip install --quiet --disable-pip-version-check uv
+	.venv-lowest/bin/uv pip install --quiet --python .venv-lowest/bin/python --resolution lowest-direct --editable '.[all,decode,dask]'
+	.venv-lowest/bin/python tests/lowest/try_lowest.py
 
 fuzz: .venv/installed-dev ## send 10 million random and mutated frames to the HAL and to every emulated node
 	PYTHONPATH=tests/fuzz $(BIN)/python tests/fuzz/frame_fuzzer.py --frames 10000000
@@ -49,8 +56,8 @@ messages: .venv/installed-dev ## write messages.binpb after a change of atalante
 supervisor-table: .venv/installed-dev ## write SUPERVISOR.md after a change of the supervisor or of the diagnostics
 	$(BIN)/python -m atalante_tools.supervisor_table SUPERVISOR.md
 
-clean: ## remove .venv, runs and site
-	rm -rf .venv $(OUT) site
+clean: ## remove the environments, runs and site
+	rm -rf .venv .venv-lowest $(OUT) site
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed; call make PYTHON=/path/to/python3.11" >&2; exit 1; }

@@ -164,6 +164,18 @@ def test_what_cannot_be_run_is_misuse(arguments: tuple[str, ...], says: str) -> 
     assert says in result.stderr
 
 
+@pytest.mark.parametrize("arguments", [("run", "F28"), ("campaign", "F28", "--no-endurance", "--jobs=1")])
+def test_without_pybullet_no_case_is_run(
+    arguments: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    refused = atalante(*arguments)
+    assert refused.exit_code == 1
+    assert "the emulated robot needs PyBullet; type: pip install 'atalante-hal[emulator]'" in refused.stderr
+    assert "crashed" not in refused.output
+
+
 def test_a_campaign_writes_its_report_and_fails_with_its_faults(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from atalante_dbc import Network
-from atalante_hal.robot import Robot
+from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.safety.events import Event
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import Controlword
@@ -119,25 +119,21 @@ def test_what_must_never_be_is_told(seen: Any, quantity: str, value: float, says
     assert verdict(seen(**{quantity: array})).failures == (says,)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(
-    ("quantity", "limit", "factor", "margin"),
-    [
-        ("torque", "torque_max", 1.0, 0.0),
-        ("position", "position_max", 1.0, 0.05),
-        ("position", "position_min", 1.0, -0.05),
-        ("velocity", "velocity_max", 1.2, 0.0),
-    ],
+    ("quantity", "factor", "overshoot"), [("torque", 1.0, 0.0), ("position", 1.0, 0.05), ("velocity", 1.2, 0.0)]
 )
-def test_a_run_fails_just_beyond_the_bound_of_each_quantity(
-    seen: Any, robot: Robot, quantity: str, limit: str, factor: float, margin: float
+def test_a_joint_may_go_to_its_bound_and_not_past_it(
+    seen: Any, robot: Robot, quantity: str, factor: float, overshoot: float, sign: float
 ) -> None:
-    for joint in range(12):
-        bound = factor * getattr(robot, limit)[joint] + margin
-        outward = -1.0 if limit == "position_min" else 1.0
-        for beyond in (-1e-6, 1e-6):
-            values = np.zeros((len(HELD), 12))
-            values[2, joint] = bound + outward * beyond * max(1.0, abs(bound))
-            assert bool(verdict(seen(**{quantity: values})).failures) is (beyond > 0.0), (joint, beyond)
+    limit = robot.position_min if quantity == "position" and sign < 0.0 else sign * getattr(robot, f"{quantity}_max")
+    bound = factor * limit + sign * overshoot
+    assert verdict(seen(**{quantity: np.tile(bound, (len(HELD), 1))})).passed
+    for joint, name in enumerate(JOINTS):
+        array = np.tile(bound, (len(HELD), 1))
+        array[2, joint] += sign * 1e-6
+        (failure,) = verdict(seen(**{quantity: array})).failures
+        assert failure.endswith(f": {name} in cycle 3")
 
 
 def test_a_check_of_the_case_is_asked(seen: Any) -> None:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
 
+from atalante_tools.session.body import ENGINE_PYTHON
+
 ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +46,22 @@ def test_the_wheel_has(wheel: list[str], path: str):
 def test_the_wheel_has_nothing_else_at_the_top(wheel: list[str]):
     top = {path.split("/")[0] for path in wheel}
     assert {name for name in top if not name.startswith("atalante_")} == set()
+
+
+def test_the_emulator_is_installed_on_the_python_versions_that_its_message_names():
+    (engine,) = PROJECT["optional-dependencies"]["emulator"]
+    marker = re.fullmatch(r"pybullet>=[\d.]+; python_version < '3\.(\d+)'", engine)
+    assert marker, engine
+    assert (3, int(marker[1]) - 1) == ENGINE_PYTHON
+
+
+@pytest.mark.parametrize("extra", sorted({"", *PROJECT["optional-dependencies"]}))
+def test_each_requirement_has_a_lower_bound(extra: str):
+    """A requirement without one is not tried by `make lowest`."""
+    requirements = PROJECT["optional-dependencies"][extra] if extra else PROJECT["dependencies"]
+    assert requirements
+    for requirement in requirements:
+        assert requirement.startswith("atalante-hal[") or re.match(r"[a-z0-9-]+>=\d", requirement), requirement
 
 
 def run(program: str, *path: Path) -> str:

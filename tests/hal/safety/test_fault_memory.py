@@ -145,3 +145,32 @@ def test_events_since_a_number_are_those_that_are_kept(number: int, cycles: list
     for cycle in range(6):
         log.append(Event(cycle, "READY", ""))
     assert [event.cycle for event in log.since(number)] == cycles
+
+
+def test_event_log_behaves_like_a_sequence_of_its_kept_events():
+    log = EventLog()
+    events = [Event(cycle, "READY", "", "info", value=cycle) for cycle in range(3)]
+    for event in events:
+        log.append(event)
+    assert len(log) == 3
+    assert [*log] == events
+    assert log[-1] is events[-1]
+    assert repr(log) == repr(events)
+
+
+@pytest.mark.parametrize(
+    ("confirmed", "pending", "worst"),
+    [
+        ([], [Dtc.NODE_TIMEOUT], []),
+        ([Dtc.E2E_REPEATED], [], []),
+        ([Dtc.HEARTBEAT_LOST, Dtc.E2E_REPEATED], [Dtc.DRIVE_FAULT], [Dtc.HEARTBEAT_LOST]),
+        ([Dtc.NODE_TIMEOUT, Dtc.ENC_JUMP, Dtc.IMU_STUCK], [], [Dtc.NODE_TIMEOUT, Dtc.ENC_JUMP]),
+    ],
+)
+def test_worst_codes_are_the_confirmed_ones_with_the_most_severe_reaction(
+    memory: FaultMemory, confirmed: list[Dtc], pending: list[Dtc], worst: list[Dtc]
+):
+    for dtc in (*confirmed, *pending):
+        memory.raise_dtc(1, dtc, "LEFT_SK", confirmed=dtc in confirmed)
+    memory.close_cycle(1)
+    assert memory.worst() == frozenset(worst)

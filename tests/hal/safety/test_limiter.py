@@ -108,9 +108,10 @@ shares = arrays(np.float64, 12, elements=st.floats(-1.0, 1.0))
 
 
 @given(shares, shares, shares, shares, arrays(np.float64, 12, elements=st.floats(0.1, 1.0)))
-def test_a_command_inside_every_limit_is_sent_as_it_was_asked(
+def test_a_command_inside_every_limit_at_once_is_sent_unchanged(
     torque: np.ndarray, step: np.ndarray, velocity: np.ndarray, position: np.ndarray, derated: np.ndarray
 ):
+    """Torque anywhere up to the derated limit; position, velocity and rate anywhere up to 99 % or more of theirs."""
     limiter = Limiter(ROBOT, PERIOD)
     limiter.derate(derated * ROBOT.torque_max)
     asked = torque * limiter.limit
@@ -120,8 +121,7 @@ def test_a_command_inside_every_limit_is_sent_as_it_was_asked(
     ahead = MIDDLE + 0.99 * position * half
     assert limiter.apply(asked, np.array([ahead - LOOK * speed, speed])) == FREE
     assert limiter.last.tobytes() == asked.tobytes()
-    assert limiter.cut.dtype == np.bool_
-    assert not limiter.cut.any()
+    assert limiter.cut.tolist() == [False] * 12
     assert limiter.saturated == 0
 
 

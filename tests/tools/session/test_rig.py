@@ -148,8 +148,22 @@ def test_a_missing_bus_is_rejected(network: Network, robot: Robot) -> None:
 def test_missing_pybullet_fails_with_the_installation_command(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pybullet", None)
     monkeypatch.delitem(sys.modules, "atalante_emulator.body", raising=False)
-    with pytest.raises(Failed, match=r"pip install 'atalante-hal\[emulator\]'"), open_body(robot):
+    with pytest.raises(Failed, match=r"pip install 'atalante-hal\[emulator\]' \(Python 3\.11\)$"), open_body(robot):
         raise AssertionError("opened")
+
+
+@pytest.mark.parametrize("python", [(3, 12), (3, 13), (4, 0)])
+def test_on_a_python_without_a_wheel_the_message_names_the_one_that_has_it(
+    robot: Robot, python: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    monkeypatch.setattr(sys, "version_info", (*python, 0))
+    with pytest.raises(Failed) as refused, open_body(robot):
+        raise AssertionError("opened")
+    assert str(refused.value) == (
+        "the emulated robot needs PyBullet; type: python3.11 -m pip install 'atalante-hal[emulator]'"
+        f" (PyBullet has no wheel for Python above 3.11, got {python[0]}.{python[1]})"
+    )
 
 
 # -- how a run ends --------------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ import click
 from atalante_tools.console.options import EMBEDDED, json_option
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.terminal import show_json
+from atalante_tools.session.body import engine_hint
 
 if TYPE_CHECKING:
     from atalante_tools.commands.machine import Interface, Machine
@@ -142,7 +143,8 @@ def _packages(machine: Machine, interface: str) -> Iterator[Check]:
         found = machine.package(name)
         needed = not extra or (name == "pybullet" and interface == EMBEDDED)
         text = f"{'installed' if found else 'not installed'}, for {purpose}"
-        yield Check(name, found, needed, text, f"pip install 'atalante-hal{extra}'")
+        fix = engine_hint() if name == "pybullet" else f"pip install 'atalante-hal{extra}'"
+        yield Check(name, found, needed, text, fix)
 
 
 def _socketcan(machine: Machine, needed: bool, channels: Sequence[str]) -> Iterator[Check]:

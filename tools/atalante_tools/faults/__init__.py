@@ -162,7 +162,10 @@ def _row(id_: str) -> Row:
 def _done(tasks: Sequence[Task], *, jobs: int = 1, dask: str = "") -> Iterator[Result]:
     """Yield the results in the order of completion, and show a progress bar."""
     from atalante_tools.faults.campaign import results
+    from atalante_tools.session.body import require_engine
 
+    if not dask:  # the workers of a cluster have an installation of their own
+        require_engine()
     progress, begun = Progress(), time.monotonic()
     try:
         for count, result in enumerate(results(tasks, jobs=jobs, dask=dask), 1):

@@ -11,7 +11,7 @@ import pinocchio
 
 from atalante_control.model import ExoskeletonParameters, Patient, links, pinocchio_model, urdf
 from atalante_hal.robot import Robot
-from atalante_tools.session.body import no_banner
+from atalante_tools.session.body import engine_hint, no_banner
 
 #: Number of random states in which two engines are compared, and largest difference relative to the largest entry.
 STATES, AGREEMENT = 100, 1e-6
@@ -68,11 +68,7 @@ def _engines(text: str, robot: Robot) -> ModelCheck:
     except ModuleNotFoundError as error:
         if error.name != "pybullet":
             raise
-        return ModelCheck(
-            "engines",
-            None,
-            "not compared, PyBullet is not installed: install it with `pip install 'atalante-hal[emulator]'`",
-        )
+        return ModelCheck("engines", None, f"not compared, PyBullet is not installed; type: {engine_hint()}")
     model, into, out_of = pinocchio_model(text)
     data = model.createData()
     rng = np.random.default_rng(0)

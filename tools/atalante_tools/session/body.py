@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from atalante_hal.robot import Robot
 from atalante_tools.console.outcome import Failed
@@ -17,14 +17,28 @@ if TYPE_CHECKING:
     from atalante_emulator.body import PyBulletBody
 
 
+#: Newest Python that the extra `emulator` installs PyBullet on; the package index has no wheel for a later one.
+ENGINE_PYTHON: Final = (3, 11)
+
+
+def engine_hint() -> str:
+    """Return the command that installs PyBullet, and the Python versions that it works on."""
+    python = sys.version_info[:2]
+    newest = "{}.{}".format(*ENGINE_PYTHON)
+    if python <= ENGINE_PYTHON:
+        return f"pip install 'atalante-hal[emulator]' (Python {newest})"
+    reason = f"PyBullet has no wheel for Python above {newest}, got {python[0]}.{python[1]}"
+    return f"python{newest} -m pip install 'atalante-hal[emulator]' ({reason})"
+
+
 def require_engine() -> None:
-    """Check that PyBullet is installed.
+    """Check that PyBullet is installed, without importing it.
 
     Raises:
-        Failed: If it is not installed; the message contains the installation command.
+        Failed: If it is not installed; the message names the extra and the Python versions that have it.
     """
     if find_spec("pybullet") is None:
-        raise Failed("the emulated robot needs PyBullet: type `pip install 'atalante-hal[emulator]'`")
+        raise Failed(f"the emulated robot needs PyBullet; type: {engine_hint()}")
 
 
 def describe(robot: Robot, exoskeleton: ExoskeletonParameters | None = None) -> str:
