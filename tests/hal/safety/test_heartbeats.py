@@ -9,7 +9,8 @@ from atalante_dbc import load
 from atalante_hal.robot import load_robot
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.fault_memory import FaultMemory
-from atalante_hal.safety.heartbeats import Heartbeats
+from atalante_hal.safety.heartbeats import BOOT_UP, Heartbeats
+from atalante_hal.wire.e2e import FULL
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_hal.wire.process_image import TransmitImage
 
@@ -72,7 +73,7 @@ def test_the_nodes_are_known_when_each_but_the_pendant_has_spoken(nodes: Nodes):
     nodes.hear(nodes.frame(last))
     assert nodes.heartbeats.known
     assert nodes.heartbeats.missing() == set()
-    assert not nodes.heartbeats.quiet, "the state machine has to be run: the robot may become READY"
+    assert nodes.heartbeats.quiet is False, "the state machine has to be run: the robot may become READY"
     assert nodes.judge() == {}
     assert nodes.heartbeats.quiet
     assert nodes.heartbeats.quiet
@@ -270,7 +271,7 @@ def test_a_sender_that_begins_anew_under_the_last_counter_is_taken_and_noted(wel
     row = well.tx.codec.rows["LEFT_SK_STATUS"]
     well.tx.resume(row, int(well.tx.frames["data"][row, 2]) - 1 & 0xFF)
     well.hear(well.frame("LEFT_SK", Uptime=9.0))
-    assert not well.heartbeats.quiet
+    assert well.heartbeats.quiet is False
     assert well.heartbeats.image.values[well.heartbeats.image.codec.index("LEFT_SK_STATUS", "Uptime")] == 9.0
     assert well.judge() == {("NODE_DUPLICATE", "LEFT_SK"): False}
     assert well.heartbeats.quiet
@@ -293,9 +294,36 @@ def test_two_senders_of_a_slow_message_are_confirmed_at_the_fifth_conflict(well:
         assert not well.heartbeats.quiet
         assert well.judge() == {("NODE_DUPLICATE", "HAPTICS"): pair > 4}
         assert well.heartbeats.quiet is (pair <= 4)
+    entry = well.memory.active[Dtc.NODE_DUPLICATE, "HAPTICS"]
+    assert entry.value == FULL
+    assert entry.text == "HAPTICS: two senders of one message, HAPTICS_STATE: switch one of them off"
     well.hear(well.frame("HAPTICS", "STATE"))
     assert well.judge() == {}
     assert well.heartbeats.quiet
+
+
+def test_two_senders_are_confirmed_beside_damaged_frames_of_another_node(well: Nodes):
+    row = well.tx.codec.rows["HAPTICS_STATE"]
+    for pair in range(1, 6):
+        damaged = well.frame("LEFT_SK")
+        damaged["data"][0, 5] ^= 1
+        true = well.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.25)
+        well.tx.resume(row, int(true["data"][0, 2]) - 1 & 0xFF)
+        well.hear(damaged, true, well.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.5))
+        assert well.judge()["NODE_DUPLICATE", "HAPTICS"] is (pair > 4)
+
+
+def test_one_sender_leaves_no_evidence_of_a_second(well: Nodes):
+    well.hear(well.frame("LEFT_SK"))
+    assert well.heartbeats.quiet is True
+
+
+def test_a_node_that_booted_is_listed_until_the_reader_clears_it(well: Nodes):
+    well.hear(well.frame("LEFT_SK"))
+    assert well.heartbeats.booted == set()
+    well.hear(well.frame("LEFT_SK", NodeState=BOOT_UP))
+    well.judge()
+    assert well.heartbeats.booted == {"LEFT_SK"}
 
 
 def test_a_cleared_emergency_is_known_for_the_cycle_in_which_it_was_cleared(well: Nodes):

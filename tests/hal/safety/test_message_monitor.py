@@ -10,7 +10,7 @@ import pytest
 from atalante_dbc import load
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.fault_memory import FaultMemory
-from atalante_hal.safety.message_monitor import MessageMonitor
+from atalante_hal.safety.message_monitor import MessageMonitor, rivals_of
 from atalante_hal.wire.e2e import COUNTER_BYTE, SETTLED, Check, crc, data_id_bytes
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
@@ -447,6 +447,19 @@ class TestTwoSenders:
         assert bench.active == {("E2E_SEQUENCE", "LEFT_SK"): False}
         bench.cycle(self.rival(KNEE, ahead=ahead))
         assert bench.active == {("E2E_SEQUENCE", "LEFT_SK"): False, ("NODE_DUPLICATE", "LEFT_SK"): True}
+
+    def test_a_rejected_frame_after_the_second_sender_is_reported_too(self, bench: Bench):
+        def change(frames: Frames) -> Frames:
+            frames = self.rival(KNEE, first=True)(frames)
+            frames["data"][1 + IMU, 5] ^= 1
+            return frames
+
+        bench.well().cycle(change)
+        assert bench.active == {("NODE_DUPLICATE", "LEFT_SK"): False, ("E2E_CRC", MESSAGES[IMU].sender): False}
+
+    def test_a_frame_accepted_after_a_loss_and_another_are_two_senders(self):
+        assert rivals_of([(1, Check.CONFLICT)], [Check.OK, Check.SOME_LOST]) == {1}
+        assert rivals_of([(1, Check.CONFLICT)], [Check.OK, Check.CONFLICT]) == set()
 
     def test_a_second_sender_beside_a_frame_out_of_range_is_noticed(self, bench: Bench):
         bench.well()

@@ -214,6 +214,16 @@ def test_a_sender_that_may_begin_anew_is_taken_under_the_last_counter_and_the_co
     assert rx.refused == [(0, Check.REPEATED)]
 
 
+def test_the_frame_that_is_accepted_after_a_loss_is_not_one_of_the_others():
+    tx, rx, buffer = pair()
+    deliver(tx, rx, buffer)
+    tx.seal()  # lost
+    true = tx.seal()[0].copy()
+    deliver_frames(rx, buffer, [true, rival(true, CYCLIC[0])])
+    assert rx.check[0] == Check.SOME_LOST
+    assert len(rx.beside(0)) == 1
+
+
 def test_the_other_frames_of_a_row_are_decoded_in_order_of_arrival():
     tx, rx, buffer = pair()
     row, mine = rx.codec.rows["PENDANT_STATE"], slice(None)
