@@ -70,8 +70,8 @@ class Sensors:
     attitude_change: float  # rad, change of the attitude error within a fraction of a second
     misalignment: float  # rad of additional tolerance for each rad the leg turns meanwhile
     quaternion_error: float  # error of the squared norm of a quaternion against 1
-    cell_free: float  # N, vertical: a force cell below it carries no load
-    cell_loaded: float  # N, vertical sum of three cells: above it the fourth cell must carry load
+    cell_free: float  # N, vertical force below which a cell carries no load
+    cell_loaded: float  # N, vertical force of three cells together, above which the fourth must carry load
 
 
 @dataclass(frozen=True)
@@ -80,9 +80,8 @@ class Thresholds:
 
     supply_low: float  # V at a drive; below it the battery is nearly empty
     supply_under: float  # V at a drive; below it the drives cannot hold much longer
-    derated_imbalance: (
-        float  # smallest ratio of a hot drive's torque limit to that of the same joint on the other leg to walk
-    )
+    #: Smallest ratio of a hot drive's remaining torque share to that of the other leg's drive at which the robot may walk.
+    derated_imbalance: float
     full_assist_ramp: float  # s, time in which FULL_ASSIST ramps the assistance factor from 0 to 1
     position_tolerance: float  # rad beyond a position limit from which a joint is out of its range
     idle_torque: float  # Nm that a drive may report while off, or beyond its limit while on

@@ -188,7 +188,9 @@ class Transceiver:
                 self._find(Dtc.FRAME_UNKNOWN, True, can_id, f"id 0x{can_id:X} is not a message to this HAL")
 
     def listen(self, seconds: float = LISTEN) -> None:
-        """Check that no other HAL sends on this bus, before the first frame is sent; other frames are dropped.
+        """Before this HAL sends its first frame, check that no other HAL sends on the bus.
+
+        All frames received meanwhile are dropped.
 
         Args:
             seconds: Time to listen [s].

@@ -45,11 +45,11 @@ UNREADABLE = (
 
 
 class LogUnreadable(BusError):  # noqa: N818
-    """Error of a log that is missing, empty, truncated, or in a format without CAN FD frames."""
+    """Error of a log that is missing, empty or truncated, or whose format cannot store CAN FD frames."""
 
 
 class ReplayBus:
-    """Replay of a log in a format of python-can's LogReader: .log (candump -L), .asc, .blf, .mf4, .trc, also with .gz.
+    """Replay of a log in a format of python-can's LogReader: .log (candump -L), .asc, .blf, .mf4, .trc, each also as .gz.
 
     Args:
         path: Log file.

@@ -101,14 +101,16 @@ class SafetyMonitor:
         self.start_wanted = 0
         self.enabling = False
         self.lowered: set[str] = set()
-        self._steady = False  # True if a perfect cycle would change nothing
+        #: True if `judge` may skip a cycle with fresh data, no fault, and the same pendant and drive values as before.
+        self._steady = False
         #: Faults that loop and controller reported since the last `judge`: code, confirmed, value, text.
         self._reports: list[tuple[Dtc, bool, float, str]] = []
         self._ending = False
         self._barred = False  # True if another HAL was detected in OFF or READY
         self._assistance_factor = state.assistance_factor  # assistance factor set by the operator
         self._leading = False  # True while the assistance factor ramps to 1 or back
-        self._finish: tuple[int | None, int] = None, 0  # step at the begin of FINISH_STEP, and its last cycle
+        #: Step when FINISH_STEP began, and cycle in which FINISH_STEP ends at the latest.
+        self._finish: tuple[int | None, int] = None, 0
         self._drives_judged = b""  # drive states and temperatures of the last evaluation
 
     def judge(self) -> None:

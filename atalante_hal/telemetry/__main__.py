@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 _INSTALL = "install it with `pip install 'atalante-hal[telemetry]'`"
 
 
-#: Longest time to end the Zenoh session [s]. With a stopped subscriber Zenoh needs 10 s; the files are closed before.
+#: Time limit for closing the Zenoh session [s]; SIGALRM ends the process after it. With a stopped subscriber Zenoh needs 10 s.
+#: The files are closed before.
 _SESSION_END = 1.0
 
 

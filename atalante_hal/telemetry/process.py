@@ -63,17 +63,17 @@ class TelemetryConfig:
     robot: str = "exo"  # name of the robot in the Zenoh keys atalante/<robot>/...
     publish: bool = True  # publish on Zenoh
     listen: str | None = None  # Zenoh endpoint; None: first free port from tcp/127.0.0.1:7447 on
-    stream_rate: int = 100  # Hz of robot time, published messages of each stream
-    loop_rate: int = 10  # Hz of robot time, loop statistics
+    stream_rate: int = 100  # Hz in robot time, publishing rate of each stream
+    loop_rate: int = 10  # Hz in robot time, rate of the messages with loop statistics
     recording: Path | None = None  # MCAP file; None: no recording
-    record_rate: int = 100  # Hz of robot time, recorded messages of each stream; 1000: every cycle
+    record_rate: int = 100  # Hz in robot time, recording rate of each stream; 1000: every cycle
     can_log: Path | None = None  # log of every CAN frame, format by suffix; None: no CAN log
     lock_step: bool = False  # True: virtual time, and the loop waits for recorder and CAN log
-    slots: int = 1024  # capacity of each ring in records, one a cycle
+    slots: int = 1024  # records, capacity of each ring, which gets about one record per cycle
     patience: float = 5.0  # s, longest wait of the loop for the recorder in lock-step
     certificate: Path | None = None  # TLS certificate, see `access.Access`
     private_key: Path | None = None  # key of the certificate, see `access.Access`
-    client_ca: Path | None = None  # authority of the subscribers' certificates, see `access.Access`
+    client_ca: Path | None = None  # authority that signs the subscriber certificates, see `access.Access`
     users: Path | None = None  # users and passwords, see `access.Access`
 
     def __post_init__(self) -> None:
@@ -134,7 +134,7 @@ class TelemetrySummary:
     recorded: int = 0  # messages
     frames_logged: int = 0
     lost: int = 0  # cycles that telemetry lost
-    frames_lost: int = 0  # records lost in the ring of CAN frames, about one a cycle
+    frames_lost: int = 0  # records of the CAN frame ring that were lost; the ring gets about one record per cycle
     restarts: int = 0  # restarts of the subprocess after it ended or hung
     notices: tuple[str, ...] = field(default=())  # faults of the session, one sentence each
     recording: Recording | None = None  # None: no recording was requested
@@ -177,7 +177,7 @@ class TelemetryProcess(Closing):
         self._recordings: list[str] = []  # names of the files begun so far
         self._last_endpoint: str | None = None  # last endpoint in use; None: nothing was published so far
         self._restarting: threading.Thread | None = None
-        self._progress = (0, 0.0)  # number of records read at the last progress, and its time [s]
+        self._progress = (0, 0.0)  # number of records read, and time [s], at the last progress
         meta = {
             "layout": layout.to_json(),
             "diagnostics": list(diagnostics),

@@ -40,7 +40,7 @@ _READ, _LOST, _READER_PID, _KEPT = range(16, 20)
 _HEADER_BYTES = 256
 
 _WRITER_BYTE, _READER_BYTE = 0, 1  # offsets of the bytes that writer and reader lock until their process ends
-_LOCK_TRIES = 50  # more than one, because a test by the other end holds the lock for some microseconds
+_LOCK_TRIES = 50  # several, because the other end locks the byte for some microseconds in `_held`
 
 _WAIT = 0.0002  # s, one sleep of a lossless writer
 NOTES_BYTES = 1 << 16

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Protocol
 
-#: Key of the events among the keys of the streams.
+#: Key of the messages that report events. All other keys are names of streams.
 EVENTS = "events"
 
 

@@ -189,7 +189,7 @@ def decode(words: Words, plan: Words, scales: Vector, codes: Words, values: Vect
 
 
 def read_codes(words: Words, plan: Words, codes: Words) -> bool:
-    """Read the raw codes of all signals, the first half of `decode`.
+    """Read the raw codes of all signals. This is the first step of `decode`.
 
     Args:
         words: frames as a flat array of 64-bit words, shape (rows * 9,).
@@ -220,7 +220,7 @@ def signed(raw: int, mask: int, largest: int) -> int:
 
 
 def scale(codes: Words, scales: Vector, values: Vector) -> None:
-    """Convert the raw codes of all signals to physical values, the second half of `decode`.
+    """Convert the raw codes of all signals to physical values. This is the second step of `decode`.
 
     Args:
         codes: raw codes, shape (size,).

@@ -214,7 +214,7 @@ def qualify(before: Qualification, *, good: bool, timed_out: bool = False) -> Qu
 
 
 def suspect(evidence: int, *, rival: bool) -> int:
-    """Return the evidence of two senders of one message after one more cycle, 0 to `FULL`.
+    """Update the evidence, 0 to `FULL`, that two nodes send the same message, by one cycle.
 
     Args:
         evidence: evidence after the previous cycle, 0 to `FULL`.

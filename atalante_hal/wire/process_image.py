@@ -42,11 +42,11 @@ from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES, WORDS, Frames, as
 
 #: Marker instead of a cycle tag: each sender uses its own counter.
 _NO_TAG = -1
-#: Values of `Check` as plain integers. Up to `_FRESH` the data is new.
+#: Values of `Check` as plain integers. A result <= `_FRESH` means new, usable data.
 _FRESH = _SOME_LOST = int(Check.SOME_LOST)
 _REPEATED, _CONFLICT, _WRONG_SEQUENCE = int(Check.REPEATED), int(Check.CONFLICT), int(Check.WRONG_SEQUENCE)
 _CRC, _LENGTH, _RANGE, _INVALID = int(Check.CRC), int(Check.LENGTH), int(Check.RANGE), int(Check.INVALID)
-#: Check results of frames that are damaged, or that repeat the accepted frame: they contain no new values.
+#: Values of `Check` for frames without new values: damaged frames and repeats of the accepted frame.
 _SAYS_NOTHING_NEW = frozenset({Check.CRC, Check.LENGTH, Check.REPEATED})
 #: Marker instead of a row: the frame is not a message of this process image.
 _FOREIGN = -1

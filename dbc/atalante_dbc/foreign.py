@@ -60,7 +60,7 @@ class Field:
 
     @property
     def first_bit(self) -> int:
-        """Return the index of the first bit in the direction of the byte order.
+        """Return the position of the start bit, counted in the signal's byte order.
 
         Intel counts from the least significant bit of byte 0, Motorola from the most significant bit of byte 0.
         """

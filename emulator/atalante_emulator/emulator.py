@@ -44,7 +44,7 @@ Vector = npt.NDArray[np.float64]
 _RECEIVE_BUDGET = 128
 #: Largest number of frames sent in a cycle: nineteen cyclic frames, some slow ones, emergencies and faults.
 _BATCH = 128
-#: Check results of a command frame that was received but must not be executed.
+#: Values of `Check` for a command frame that was received but must not be executed.
 _REFUSED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
 #: Longest wait [s] for the other SYNCs of a cycle once the first is there.
 _SYNC_SKEW = 200e-6
@@ -129,8 +129,8 @@ class Emulator:
         sent = [m for m in network.messages if m.sender in ours]
         cyclic = [m for bus in network.buses for m in sent if m.bus == bus and m.cycle_ms == 1]
         self._tx = TransmitImage(cyclic)
-        self._sealed = False  # whether the frames are sealed and wait for their SYNC
-        self._tag = 0  # alive counter of these frames: low byte of their cycle number
+        self._sealed = False  # True if the next frames have counter and CRC, and wait only for their SYNC
+        self._tag = 0  # alive counter of the sealed frames: low byte of their cycle number
         self._haptics_tx = TransmitImage([network.message("HAPTICS_STATE")])
         self._heartbeats = Heartbeats(network, [m for m in sent if m.name.endswith("_STATUS")])
         self._emergencies: list[Emergency] = []  # to be sent in this cycle
@@ -152,7 +152,7 @@ class Emulator:
             rows = [row for row, m in enumerate(cyclic) if m.bus == sync.bus]
             self._shares.append(self._tx.frames[rows[0] : rows[-1] + 1])
         self._whole = [self._tx.frames]
-        #: Index of the SYNC of each leg in the list of SYNCs.
+        #: Index of each leg's SYNC in the list of SYNCs.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
         self._answered = self._shares  # frames per SYNC of the last imperfect cycle
         batch = new_frames(_BATCH)

@@ -22,12 +22,12 @@ class Babble:
     bus: str
     can_id: int
     length: int  # bytes
-    load: float  # share of the bus time it requests, 0 to 1
-    taken: float = 0.0  # s, wire time it takes in this cycle
-    owed: float = 0.0  # s, wire time it took for a frame that is not complete yet
+    load: float  # share of the bus time that the sender requests, 0 to 1
+    taken: float = 0.0  # s, wire time that the sender gets in this cycle
+    owed: float = 0.0  # s, wire time that the sender got but that is too short for a whole frame
 
     def frames(self, network: Network) -> int:
-        """Return how many of its frames fit into a cycle; it yields only to smaller identifiers.
+        """Return how many frames of the sender fit into a cycle. Only smaller identifiers have priority over the sender.
 
         Args:
             network: messages and bit rates of the buses.
@@ -51,7 +51,7 @@ class Wire:
     def __init__(self, network: Network) -> None:
         self._network = network
         self._bus_of = {m.frame_id: m.bus for m in network.messages}
-        self._used: dict[str, float] = {}  # s, wire time of this cycle used by regular frames, by bus
+        self._used: dict[str, float] = {}  # s, wire time that regular frames used in this cycle, by bus
         self._babbles: Sequence[Babble] = ()
         self._from_hal: dict[int, Frames] = {}  # waiting frames of the HAL, by identifier
         self._from_nodes: dict[int, Frames] = {}  # waiting frames of the nodes, by identifier

@@ -68,8 +68,8 @@ class Encoders:
         )
         self._polarity = robot.polarity.tolist()
         self._period, self._every = period, every
-        # `judge_velocity` computes 2 * (mean reported velocity - mean encoder velocity). These are its coefficients for position
-        # and velocity of the later and of the earlier sample.
+        # `judge_velocity` computes 2 * (mean reported velocity - mean encoder velocity). `_of_later` and `_of_earlier` are the
+        # coefficients for position and velocity of the later and of the earlier sample.
         time = every * period
         self._of_later, self._of_earlier = np.array([[-2.0 / time, 1.0], [2.0 / time, 1.0]])
         self._earlier = np.zeros((2, len(JOINTS)))  # position [rad] and velocity [rad/s] of the last sample
@@ -151,7 +151,7 @@ class Encoders:
         return bool(self._wrong_findings)
 
     def _error_between(self, age: Cycles) -> tuple[Vector, list[bool]]:
-        """Return twice the velocity error of each joint, and which joints are compared.
+        """Return the doubled velocity error of each joint, and whether each joint is compared.
 
         Args:
             age: age of the values of each joint [cycles], shape (12,).

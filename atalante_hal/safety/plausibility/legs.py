@@ -41,7 +41,7 @@ _FORGOTTEN = 2e-5
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 _AXES = (("FH",), ("TH",), ("SH", "SK"))
-#: Index in `_AXES` of the axis of each of the first four joints of a leg.
+#: Axis of each of a leg's first four joints, as an index in `_AXES`.
 _AXIS_OF = (0, 1, 2, 2)
 _HIPS = tuple(JOINTS.index(f"{side}_FH") for side in SIDES)
 
@@ -80,7 +80,7 @@ class Legs:
         self._stuck: list[tuple[Finding, ...]] = [() for _ in SIDES]
 
     def judge_left(self, ages: Ages | None) -> bool:
-        """Check the left leg, and also the right leg if the reading of one of its encoders is constant.
+        """Check the left leg. Also check the right leg if one of the right encoders has a constant reading.
 
         Args:
             ages: ages of the sensor values; a leg with values that are too old is not compared. None if all values are of this
@@ -92,7 +92,7 @@ class Legs:
         return self._judge(0, ages)
 
     def judge_right(self, ages: Ages | None) -> bool:
-        """Check the right leg, and also the left leg if the reading of one of its encoders is constant.
+        """Check the right leg. Also check the left leg if one of the left encoders has a constant reading.
 
         Args:
             ages: ages of the sensor values; a leg with values that are too old is not compared. None if all values are of this

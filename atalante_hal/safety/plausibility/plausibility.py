@@ -1,7 +1,7 @@
 """Schedule of the plausibility checks in each cycle.
 
-    process image -> one slow check in turn (standstill, velocity, feet, legs, checks that cannot run) -> jump, range, IMUs ->
-    state
+    process image -> one slow check in turn (standstill, velocity, feet, legs, monitor of checks that lack data) -> jump, range,
+    IMUs -> state
 
 In a plausible cycle only the encoders and the IMUs are checked, and the slow checks take turns. The new values of a message that
 fails a check are rejected: the message keeps its previous values, and their age grows. Each check uses only the messages it
@@ -23,7 +23,8 @@ from atalante_hal.safety.plausibility.unchecked import Unchecked
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Intervals of the slow checks [cycles]: `SLOW` for standstill, velocity and checks that cannot run, `FEET` for the feet.
+#: Intervals of the slow checks [cycles]: `SLOW` for standstill, velocity and the monitor of checks that lack data, `FEET` for
+#: the feet.
 SLOW, FEET = 16, 4
 #: Period of the schedule [cycles]; each leg is checked once in it.
 _ROUND = 32

@@ -25,7 +25,7 @@ from atalante_control.model import Patient
 from atalante_hal.robot import Robot, load_robot
 
 FORMAT = "atalante-library/1"
-LEVELS_MIN = 3  # smallest number of levels of a parameter; with two, the fit errs by 10 degrees between them
+LEVELS_MIN = 3  # smallest number of levels of a parameter; with two levels, the fit is wrong by 10 degrees between them
 
 Index = tuple[int, ...]
 #: Function that solves one gait. It must be defined at module level, so that other processes can import it.
@@ -58,7 +58,7 @@ class Grid:
 
     @staticmethod
     def names() -> tuple[str, ...]:
-        """Return the names of the parameters, in the order of an index."""
+        """Return the names of the parameters, in the order in which an `Index` lists their levels."""
         return tuple(field.name for field in fields(Grid))
 
     def axes(self) -> tuple[tuple[float, ...], ...]:

@@ -78,7 +78,7 @@ def fan_out(
 
 @contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """Ignore Ctrl-C in this context, so that processes started in it inherit this; their parent ends them.
+    """Ignore Ctrl-C in this context. Processes started in it also ignore Ctrl-C, and their parent ends them.
 
     Blocking the signal is not sufficient, because the resource tracker of joblib unblocks it for the processes started later.
     """

@@ -60,7 +60,9 @@ class StepProblem:
     """
 
     def __init__(self, kind: Kind, robot: Robot, requirements: Requirements) -> None:
-        """Build the program. This takes some seconds, so it is done once; the functions of the program take most of it.
+        """Build the program.
+
+        The program and its functions take some seconds, so they are built only once. Most of the time is for the functions.
 
         Args:
             kind: kind of step, `periodic`, `start` or `stop`.
@@ -325,7 +327,7 @@ class StepProblem:
         return [Rows("pelvis attitude", "rad", 0.1, tilt, -limit, limit)]
 
     def _swing(self, q: Symbol, rate: Symbol) -> list[Rows]:
-        """Return the rows for the clearance of the four corners of the swing sole and for the corridor of its ankle."""
+        """Return the rows that keep the corners of the swing foot's sole above the ground, and its ankle in a corridor."""
         requirements = self.requirements
         foot = self.chain.frames(q, rate)[self.chain.swing_foot]
         ground = self.exoskeleton.sole_centre[1]

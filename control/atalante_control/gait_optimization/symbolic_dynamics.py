@@ -25,7 +25,7 @@ Symbol = Any  # casadi.SX
 
 _LEFT, _RIGHT = SIDES
 STANCE_FOOT, SWING_FOOT = f"{_RIGHT}_{LEG_LINKS['HA']}", f"{_LEFT}_{LEG_LINKS['HA']}"
-_NUMBERS = 13  # numbers of a body: mass, first moment (3), inertia about the origin (6), joint origin (3)
+_NUMBERS = 13  # parameters per body: mass, first moment (3), inertia about the origin (6), joint origin (3)
 
 
 @dataclass(frozen=True)

@@ -102,7 +102,8 @@ class JointCertificate:
     #: Disturbance bounds scaled to a margin of zero, Nm on the separate inertia; (0, 0): no bounds are admissible. Only a
     #: filter configured with these bounds holds them, not the filter of this certificate.
     u_ext_max: tuple[float, float]
-    torque: float  # Nm on the separate inertia, largest |u_b| along the step
+    #: Largest backup torque |u_b| over the step, disturbance included, in Nm on the separate inertia (see module).
+    torque: float
     torque_limit: float  # Nm on the separate inertia, torque limit less the reserve of the filter
     image_empty_at: float  # first phase without a safe state; infinity if every phase has one
     hand_over_max: float  # factor by which the hand-over box can grow until the margin is zero
@@ -290,7 +291,7 @@ def _from_rest(policy: BackupPolicy, forced: ForcedResponse, time: Vector) -> Fo
 
 
 def _smallest_ratio(room: Vector, taken: Vector) -> float:
-    """Return the smallest room / taken, at least 0; entries with taken = 0 count as infinity."""
+    """Return the smallest ratio `room / taken`, clipped below at 0. Entries without a positive `taken` count as infinity."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return max(0.0, float(np.where(taken > 0.0, room / taken, np.inf).min()))
 

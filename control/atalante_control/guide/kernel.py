@@ -1,4 +1,4 @@
-"""Compiled cycle of the virtual guide filter: `e, e' of a joint, tables of the step -> h -> lambda -> u_v`.
+"""Compiled cycle of the virtual guide filter: compute h, then lambda, then u_v of a joint from e, e' and the step tables.
 
 `GuideFilter` prepares the tables and runs `tick` compiled. The flow of the backup policy is linear as long as its torque is
 within the limit of the drive (`_linear`). Beyond the limit the rollout is computed cycle by cycle (`limited`): the torque is

@@ -27,34 +27,34 @@ class ExoskeletonParameters:
     are assumptions of this project. Thigh and shank are adjusted to the patient.
     """
 
-    thigh_length: float = 0.38  # m, SH to SK
-    shank_length: float = 0.408  # m, SK to SA
+    thigh_length: float = 0.38  # m, from SH to SK
+    shank_length: float = 0.408  # m, from SK to SA
 
     pelvis_mass: float = 16.5  # kg, pelvis and back
-    frontal_hip_mass: float = 3.7  # kg, of one side, like all masses below
+    frontal_hip_mass: float = 3.7  # kg, one side; the masses below are also of one side
     transverse_hip_mass: float = 4.4
     thigh_mass: float = 9.0
     shank_mass: float = 11.0
     ankle_mass: float = 1.7
     foot_mass: float = 3.2  # kg, including the force cells
 
-    fh_offset: Vector3 = (0.0, 0.089, 0.0)  # m, in the pelvis
-    th_offset: Vector3 = (-0.135, 0.169, 0.0)  # m, in the frontal hip
-    sh_offset: Vector3 = (0.135, 0.0, 0.0)  # m, in the transverse hip
+    fh_offset: Vector3 = (0.0, 0.089, 0.0)  # m, position of FH in the pelvis frame
+    th_offset: Vector3 = (-0.135, 0.169, 0.0)  # m, position of TH in the frame of the frontal hip
+    sh_offset: Vector3 = (0.135, 0.0, 0.0)  # m, position of SH in the frame of the transverse hip
     knee_lateral: float = 0.005  # m, SK outwards of SH
     ankle_lateral: float = -0.169  # m, SA outwards of SK
     toe_out: float = math.radians(8.0)  # rad, foot about the vertical
     ha_axis: Vector3 = (0.788, 0.0, 0.616)  # henke axis in the foot frame, normalised in the URDF
 
     sole_size: tuple[float, float] = (0.275, 0.119)  # m, length and width
-    sole_centre: tuple[float, float] = (0.06, -0.165)  # m, x and z from the ankle
-    cell_x: tuple[float, float] = (0.178, -0.064)  # m, front and rear force cells from the ankle
+    sole_centre: tuple[float, float] = (0.06, -0.165)  # m, x and z of the sole centre relative to the ankle
+    cell_x: tuple[float, float] = (0.178, -0.064)  # m, x of front and rear force cells relative to the ankle
     cell_y: float = 0.027  # m, lateral distance of the force cells from the middle of the foot
-    pad_radius: float = 0.005  # m, contact sphere under a cell, touching the sole plane
-    pad_mass: float = 0.0015  # kg, taken from the foot
+    pad_radius: float = 0.005  # m, radius of the contact sphere under each force cell; it touches the sole plane
+    pad_mass: float = 0.0015  # kg, mass of each contact sphere, subtracted from the foot
 
-    torso_imu: Vector3 = (-0.14, 0.0, 0.50)  # m, in the pelvis link
-    pelvis_imu: Vector3 = (-0.164, -0.015, 0.191)  # m, in the pelvis link
+    torso_imu: Vector3 = (-0.14, 0.0, 0.50)  # m, position in the pelvis link
+    pelvis_imu: Vector3 = (-0.164, -0.015, 0.191)  # m, position in the pelvis link
     tibia_imu: Vector3 = (
         -0.13,
         -0.074,

@@ -27,7 +27,11 @@ class WorkError(Exception):
 
 @dataclass(frozen=True)
 class Measurement:
-    """Median times of value and baseline [s]; None: not measured. `remarks` are sentences to log, such as the reason."""
+    """Result of a benchmark: its time and its baseline [s], each None if it was not measured.
+
+    A measured time is usually the median of many blocks. The baseline may also be a fixed limit. `remarks` are sentences to log,
+    such as the reason why a time is missing.
+    """
 
     value: float | None
     baseline: float | None

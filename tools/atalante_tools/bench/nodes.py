@@ -158,8 +158,8 @@ class Recording:
 
 
 class _Sealed(NamedTuple):
-    payloads: list[bytes]  # of each pose
-    checksums: npt.NDArray[np.uint16]  # shape (TURN, rows), by counter
+    payloads: list[bytes]  # all frames of each pose
+    checksums: npt.NDArray[np.uint16]  # CRC of each row for each counter, shape (TURN, rows)
 
 
 def _seal(image: TransmitImage, values: Vector) -> _Sealed:
@@ -204,7 +204,7 @@ def _walking(walk: Walk, image: TransmitImage) -> Vector:
 
 
 class RecordedBus:
-    """Bus (see `atalante_hal.bus.Bus`) whose nodes are the recording. Each SYNC plays the next cycle."""
+    """Bus of the HAL (see `atalante_hal.bus.Bus`) that answers each SYNC with the frames of the next recorded cycle."""
 
     def __init__(self, recording: Recording) -> None:
         self.name, self.dropped = "recording", 0

@@ -163,7 +163,7 @@ class BulkCodec:
         return column if field.offset == 0 else np.asarray(column + exact(int(field.offset)))
 
     def present(self, raw: Words, index: int) -> Mask | None:
-        """Return the frames with the field, shape (n,); None: all frames.
+        """Return the mask of the frames that contain the field, shape (n,), or None if all frames contain it.
 
         Args:
             raw: result of `extract`, shape (fields, n).
@@ -176,7 +176,7 @@ class BulkCodec:
         return mask
 
     def undefined(self, raw: Words, multiplexer: str) -> Mask:
-        """Return the frames whose multiplexer has a value without a layout in the DBC. Shape (n,).
+        """Return the mask of the frames whose multiplexer has a value without a layout in the DBC. Shape (n,).
 
         Args:
             raw: result of `extract`, shape (fields, n).

@@ -1,4 +1,4 @@
-"""`atalante demo`: the whole stack with the embedded robot, which walks in the air inside each guide shape."""
+"""`atalante demo`: an emulated robot walks in the air inside each guide shape, with HAL, controller, telemetry and recording."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ _REQUIREMENTS = {
 
 
 def requirements_of(tester: NodeTester) -> list[Requirement]:
-    """Return all requirements of the node under test: start-up and rest, its kind, then every frame received."""
+    """Return the requirements for the node under test, in test order: start-up and rest, kind of node, all received frames."""
     before, after = any_node.requirements(tester)
     special = _REQUIREMENTS[tester.node.kind](tester)
     # DRIVE-01 is about the state after start-up, so it comes before the first command.

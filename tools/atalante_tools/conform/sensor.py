@@ -19,10 +19,10 @@ GRAVITY: Final = 9.81  # m/s2
 #: Number of cycles over which a sensor is measured.
 _MEASURED: Final = 100
 NORM: Final = 1e-3  # largest deviation of a quaternion from unit length
-SPECIFIC_FORCE: Final = 0.3  # m/s2, largest deviation of the mean from gravity
+SPECIFIC_FORCE: Final = 0.3  # m/s2, largest deviation of the mean acceleration from gravity
 TILT: Final = math.radians(3.0)  # rad, largest angle between measured gravity and the vertical of the attitude
-RATE: Final = 0.05  # rad/s, largest deviation of the mean from the rate of the attitude
-UNLOADED: Final = 10.0  # N, largest mean of an axis of a cell
+RATE: Final = 0.05  # rad/s, largest deviation of the mean gyro rate from the rate of change of the attitude
+UNLOADED: Final = 10.0  # N, largest mean force on an axis of a cell
 
 _VECTOR: Final = ("X", "Y", "Z")
 _AT_REST: Final = f"mean of {_MEASURED} ms at rest"
@@ -123,7 +123,7 @@ def agrees_with_gravity(tester: NodeTester) -> Outcome:
 
 
 def agrees_with_attitude(tester: NodeTester) -> Outcome:
-    """Test IMU-04: the mean rate equals the change of the attitude.
+    """Test IMU-04: the mean gyro rate equals the rate of change of the attitude.
 
     An emulated robot without power sinks slowly, so the rate is compared with the attitude instead of zero.
     """

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 EMBEDDED: Final = "embedded"
-#: Interfaces of python-can that do not connect processes like a CAN bus -> the reason.
+#: Interfaces of python-can that cannot replace a CAN bus between processes, each with the reason.
 NO_WIRE: Final = {
     "virtual": "works inside one process only",
     "udp_multicast": "returns every sent frame to its sender, which a HAL mistakes for a second HAL",
@@ -71,7 +71,7 @@ class OutputFile(click.Path):
         return path
 
 
-#: A number from here on is a length in centimetres, a smaller one in metres: no person is 5 m tall, no step is under 5 cm.
+#: Numbers of at least 5 are centimetres, smaller ones metres. This is unambiguous: every length is at least 5 cm and below 5 m.
 _CENTIMETRES: Final = 5.0
 
 #: Default length [m] and duration [s] of a patient's step.
@@ -137,13 +137,15 @@ def patient_options(*, legs: bool) -> Callable[[_Command], _Command]:
                 "--thigh",
                 type=length,
                 metavar="M",
-                help="Distance from hip to knee, in m or cm.  [default: from the height (Winter)]",
+                help="Distance from hip to knee, in m or cm.  "
+                "[default: estimated from the height with Winter's anthropometric table]",
             ),
             click.option(
                 "--shank",
                 type=length,
                 metavar="M",
-                help="Distance from knee to ankle, in m or cm.  [default: from the height (Winter)]",
+                help="Distance from knee to ankle, in m or cm.  "
+                "[default: estimated from the height with Winter's anthropometric table]",
             ),
         ]
 

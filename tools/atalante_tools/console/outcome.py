@@ -48,8 +48,8 @@ class FaultLatched(Failed):
     exit_code = FAULT_LATCHED
 
 
-#: Library errors whose message is for the user: module, class, and the failure they become. The first match counts.
-#: They are listed by name to avoid imports: the module of a raised error is already loaded.
+#: Library errors whose message is shown to the user: module and class of the error, and the `Failed` class that replaces it.
+#: The first match counts. They are given by name, so that nothing is imported: the module of a raised error is already loaded.
 KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_hal.bus", "BusAbsent", NoDevice),
     ("atalante_hal.bus", "BusDown", NoDevice),
@@ -69,7 +69,7 @@ KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_tools.canlog.validate.project", "ProjectError", InvalidUsage),
 )
 
-#: A message with more further lines than this is shortened to its first line and the number of the others.
+#: Largest number of lines after the first. A longer message is shortened to its first line and the number of the others.
 MOST: Final = 2
 #: Error numbers of a disk that cannot be written: full, over quota, read-only, I/O error. They may come without a file name.
 DISK: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})

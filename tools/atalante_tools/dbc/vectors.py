@@ -32,7 +32,7 @@ HEADER: Final = Struct("<8sII")
 
 
 class Vectors:
-    """Random images of a build. The same seed gives the same sequence."""
+    """Generator of random images for the messages of a build. Equal seeds give equal sequences."""
 
     def __init__(self, build: Build, seed: int) -> None:
         self._build = build
@@ -57,7 +57,7 @@ class Vectors:
         self._order = self._stream_order()
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return the index of each byte of a stream image in the concatenated parts of `images`."""
+        """Return, for each byte of an image in the stream, its index in the parts that `images` concatenates."""
         build, codec = self._build, self._codec
         rows = len(build.messages)
         parts = (FRAME_BYTES * rows, FRAME_BYTES * rows, 8 * codec.size, 8 * codec.size, rows)

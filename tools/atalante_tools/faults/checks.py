@@ -61,7 +61,9 @@ def not_enabled_in_motion(seen: Observation) -> str | None:
 
 
 def drives_notice_two_senders(seen: Observation) -> str | None:
-    """Check that also a drive of the left leg reports two senders of commands, not only the HAL.
+    """Check that at least one drive of the left leg reports that two nodes send it commands.
+
+    A report by the HAL is not sufficient.
 
     Args:
         seen: observation of the run.

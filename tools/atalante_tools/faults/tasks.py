@@ -24,7 +24,7 @@ from atalante_tools.faults.verdict import WALKING, Expectation, Verdict, improve
 HORIZON: Final = 1000
 #: Cycles between the first and the second fault of a pair.
 APART: Final = 3
-#: Cases for the pairs, one of each kind of fault: ID and name of the case.
+#: Cases that are combined in pairs, one case for each kind of fault, as (row of the matrix, name of the case).
 REPRESENTATIVES: Final = (
     ("F03", "4 frames"),
     ("F04", "LEFT_SK"),
@@ -175,7 +175,7 @@ def run_task(task: Task) -> Result:
 
 
 def _walked(case: Case, cycles: int) -> int | None:
-    """Run a permanent fault for some cycles and return after how many the walk ended, None if it did not end."""
+    """Run a permanent fault for `cycles`. Return the number of cycles until the walk ended, or None if it did not end."""
     lasting = replace(case, happens=tuple(_lasting(one, cycles) for one in case.happens))
     seen = observe(lasting, cycles, recovery=False)
     for cycle in range(seen.first, seen.last + 1):
@@ -189,7 +189,7 @@ def _named(id_: str, name: str) -> Case:
 
 
 def _lasting(one: Happening, cycles: int) -> Happening:
-    """Return a permanent fault with a duration of `cycles`; return any other unchanged."""
+    """Return a permanent fault or action with its duration limited to `cycles`, and any other one unchanged."""
     if one.cycles is not None:
         return one
     if isinstance(one, Fault):

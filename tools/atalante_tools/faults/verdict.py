@@ -35,12 +35,12 @@ _HASTE: Final = 1.2
 
 @dataclass(frozen=True)
 class Expectation:
-    """Expected result of a case, with the values of its row where the case has none."""
+    """Expected result of a case. A value that the case does not set is taken from its row of the fault matrix."""
 
     state: SupervisorState
     dtc: str  # regular expression of the diagnostic code; empty: none expected
-    noticed: int  # bound of the diagnostic [cycles]
-    reacted: int  # bound of the reaction [cycles]
+    noticed: int  # cycles within which the diagnostic must be reported
+    reacted: int  # cycles within which the HAL must react
 
     @classmethod
     def of(cls, case: Case, row: Row) -> Expectation:
@@ -77,7 +77,7 @@ class Verdict:
     case: str
     state: str  # state of the HAL before the operator's START
     cycles: int | None  # cycles to the reaction, else to the diagnostic; None if there was neither
-    bound: int  # bound of `cycles`
+    bound: int  # largest allowed value of `cycles`
     dtc: str  # first matching diagnostic code that was reported
     failures: tuple[str, ...]  # one sentence each
 

@@ -51,14 +51,14 @@ _TEND_CYCLES = 250
 class Options:
     """Options of a trial."""
 
-    steps: int  # number of right-stance steps per shape
+    steps: int  # right-stance steps per guide shape
     xi: float  # assistance factor, 0 to 1
     seed: int  # seed of the sensor noise
     out: Path  # run folder
-    record_rate: int  # recording rate, Hz
-    can_log: Path | None  # file for all frames; None: frames are not logged
-    telemetry: Path | None  # telemetry file (endpoint, TLS, users); None: loopback only
-    subject: Subject | None = None  # subject of the gait network; None: the default gait for walking in the air
+    record_rate: int  # Hz, recording rate
+    can_log: Path | None  # log file for all CAN frames; None: no CAN log
+    telemetry: Path | None  # TOML file with endpoint, TLS certificate and users; None: publish on the loopback only
+    subject: Subject | None = None  # the gait network computes the gait of this subject; None: default gait
 
 
 @dataclass

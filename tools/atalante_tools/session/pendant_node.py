@@ -30,7 +30,7 @@ SILENT: Final = 10
 OPERATIONAL: Final = 5
 #: Firmware version reported in PENDANT_STATUS.
 FIRMWARE_VERSION: Final = 0x0100
-#: Check results of a frame with a valid CRC, whatever its counter: another pendant has sent it.
+#: Values of `Check` for a frame with a valid CRC, whether or not its counter is right. Another pendant has sent such a frame.
 _SPOKEN: Final = (Check.OK, Check.SOME_LOST, Check.REPEATED, Check.CONFLICT, Check.WRONG_SEQUENCE)
 
 
@@ -92,7 +92,7 @@ class PendantNode:
         self.refused = False
 
     def speak(self) -> None:
-        """Start to send: answer every SYNC from the next one on."""
+        """Begin to send: answer the next SYNC and every later one."""
         self._speaking = True
 
     @property

@@ -63,7 +63,7 @@ def open_line(network: Network, target: Target, *, emulated: bool) -> tuple[Bus,
     ours = join(network, open_buses(network, target))
     if not emulated:
         return ours, None
-    # A robot sends heartbeats also without SYNC.
+    # A robot sends heartbeats even without SYNC.
     scratch = new_frames(1)
     if ours.receive(scratch, _QUIET):
         ours.close()

@@ -196,7 +196,10 @@ def _record(cycles: int) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.
 def _repeat(
     frames: Frames, cycle: npt.NDArray[np.int64], sent: npt.NDArray[np.bool_], cycles: int, times: int
 ) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """Repeat the recording, with alive counters and CRCs of one continuous run. Shapes (n,) to (times * n,)."""
+    """Repeat the recording, with alive counters and CRCs of one continuous run.
+
+    The arrays have shape (n,), the results (times * n,).
+    """
     whole = new_frames(len(frames) * times)
     whole.view("<u8").reshape(times, -1)[:] = frames.view("<u8")
     octets = whole.view(np.uint8).reshape(-1, FRAME_BYTES)

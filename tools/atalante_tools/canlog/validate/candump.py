@@ -236,7 +236,10 @@ def _times(lines: _Lines, stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_
 def _number(
     word: npt.NDArray[np.uint64], digits: npt.NDArray[np.intp]
 ) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.bool_]]:
-    """Return the number in the last `digits` of eight characters, and whether they are all digits. Shapes (lines,)."""
+    """Return the number formed by the last `digits` of eight characters, and whether all those characters are digits.
+
+    Both results have shape (lines,).
+    """
     tail = _TAIL[digits]
     word = (word & tail) | (_ZEROS & ~tail)
     changes = np.flatnonzero(word[1:] != word[:-1]) + 1

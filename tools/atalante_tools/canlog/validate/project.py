@@ -59,17 +59,17 @@ class Project:
         return self.thresholds.get(rule, {}).get(name, RULE_OF[rule].thresholds[name])
 
     def number(self, rule: str, name: str) -> float:
-        """Return a threshold that is a number, in the unit of the rule."""
+        """Return a threshold whose value is a number, in the unit of the rule."""
         value = self.threshold(rule, name)
         assert isinstance(value, float)
         return value
 
     def text(self, rule: str, name: str) -> str:
-        """Return a threshold that is a name."""
+        """Return a threshold whose value is a name, e.g. of a signal, as text."""
         return str(self.threshold(rule, name))
 
     def names(self, rule: str, name: str) -> tuple[str, ...]:
-        """Return a threshold that is a list of names."""
+        """Return a threshold whose value is a list of names."""
         value = self.threshold(rule, name)
         assert isinstance(value, tuple)
         return value

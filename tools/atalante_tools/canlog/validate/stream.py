@@ -57,14 +57,14 @@ class Stream:
         carried[self.present] = column[self.stops - 1]
 
     def span(self, rows: range) -> slice:
-        """Return the slice of the frames of contiguous rows."""
+        """Return the slice that selects the frames of a range of rows."""
         first, end = self.present.searchsorted((rows.start, rows.stop)).tolist()
         if first == end:
             return slice(0, 0)
         return slice(int(self.starts[first]), int(self.stops[end - 1]))
 
     def of(self, row: int) -> slice:
-        """Return the slice of the frames of one row."""
+        """Return the slice that selects the frames of one row."""
         return self.span(range(row, row + 1))
 
     def bounds(self, family: Family) -> list[tuple[int, int, int]]:

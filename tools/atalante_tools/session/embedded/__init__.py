@@ -106,7 +106,7 @@ class EmbeddedRobot(Closing):
         pipe = self._child.stdin
         assert pipe is not None
         self._begun = True
-        # If the child has ended, `meet` raises the reason.
+        # If the child has already ended, ignore the broken pipe: `meet` below raises `BusDown` with the reason.
         with suppress(BrokenPipeError), pipe:
             pickle.dump(order, pipe)
         try:
