@@ -314,7 +314,7 @@ def test_two_senders_are_confirmed_beside_damaged_frames_of_another_node(well: N
 
 
 def test_one_sender_leaves_no_evidence_of_a_second(well: Nodes):
-    well.hear(well.frame("LEFT_SK"))
+    well.hear(well.frame("LEFT_SK"), well.frame("HAPTICS", "STATE"))  # the first frame of HAPTICS_STATE
     assert well.heartbeats.quiet is True
 
 
