@@ -61,7 +61,9 @@ def test_each_requirement_has_a_lower_bound(extra: str):
     requirements = PROJECT["optional-dependencies"][extra] if extra else PROJECT["dependencies"]
     assert requirements
     for requirement in requirements:
-        assert requirement.startswith("atalante-hal[") or re.match(r"[a-z0-9-]+>=\d", requirement), requirement
+        assert requirement.startswith("atalante-hal[") or re.match(r"[a-z0-9-]+(\[[a-z,]+\])?>=\d", requirement), (
+            requirement
+        )
 
 
 def run(program: str, *path: Path) -> str:
