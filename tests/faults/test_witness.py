@@ -94,6 +94,21 @@ def test_a_torque_a_limit_a_step_and_a_torque_while_stopped_are_found(hal: Hal, 
     ]
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_step_may_be_the_rate_of_its_joint_over_one_cycle(hal: Hal, robot: Robot, sign: float) -> None:
+    step = sign * robot.torque_rate_max * 1e-3
+    hal.send(1)
+    hal.torque[:] = step
+    hal.send(2)
+    assert hal.commands().outside(robot) == []
+    hal.torque[:] = 3.0 * step
+    hal.send(3)
+    assert hal.commands().outside(robot) == [
+        f"a torque step beyond the joint's rate was sent to {side}_{JOINTS[0].split('_')[1]} in cycle 3"
+        for side in ("left", "right")
+    ]
+
+
 def test_a_step_over_a_cycle_without_a_frame_is_no_step(hal: Hal, robot: Robot) -> None:
     hal.send(1)
     hal.torque[KNEE] = 100.0
