@@ -82,7 +82,7 @@ class TestF54ConfigInvalid:
                 table[key] = value
 
         said = refusal_of(robot_with(tmp_path / "robot.toml", joint, change))
-        assert f"joints.{joint}.{key} is " in said
+        assert f"joints.{joint}.{key} must be " in said
 
     @anywhere
     @given(
@@ -99,7 +99,7 @@ class TestF54ConfigInvalid:
                 lambda table: table.update({key: [value, old[1]] if isinstance(old, list) else value}),
             )
         )
-        assert f"joints.{joint}.{key} is " in said
+        assert f"joints.{joint}.{key} must be " in said
 
     @pytest.mark.parametrize("joint", LEG_JOINTS)
     @pytest.mark.parametrize("key", KEYS)
@@ -117,7 +117,7 @@ class TestF54ConfigInvalid:
     def test_f54_degrees_are_not_radians(self, tmp_path: Path, joint: str, key: str) -> None:
         value = np.degrees(ROBOT["joints"][joint][key]).tolist()
         said = refusal_of(robot_with(tmp_path / "robot.toml", joint, lambda t: t.update({key: value})))
-        assert re.search(rf"joints\.{joint}\.{key} is .* \(rad", said)
+        assert re.search(rf"joints\.{joint}\.{key} must be .* \(rad", said)
 
     @anywhere
     @given(st.sampled_from(LEG_JOINTS), st.floats(0.1, 400.0))

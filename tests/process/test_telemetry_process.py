@@ -366,7 +366,7 @@ class TestRefusals:
 
     @pytest.mark.parametrize("robot", ["", "a/b", "**", "a b", "@x"])
     def test_a_name_that_is_no_chunk_of_a_key(self, robot: str) -> None:
-        with pytest.raises(TelemetryError, match="use letters"):
+        with pytest.raises(TelemetryError, match="must be a name of letters, digits"):
             TelemetryConfig(robot=robot)
 
     def test_a_log_format_that_loses_frames(self, layout: Layout, tmp_path: Path) -> None:

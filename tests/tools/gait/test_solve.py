@@ -104,7 +104,7 @@ def test_infeasible_gait_gives_one_sentence(monkeypatch: pytest.MonkeyPatch) -> 
     [
         ([], "--mass and --height"),
         (["--mass", "75"], "--mass and --height"),
-        ([*PATIENT, "--step-length", "3"], "step length is from 0.05 to 0.4 m"),
+        ([*PATIENT, "--step-length", "3"], "step length must be 0.05 to 0.4 m, got 3 m"),
         ([*PATIENT, "--step-duration", "0.8005"], "whole number of milliseconds"),
         ([*PATIENT, "--kind", "hop"], "periodic"),
     ],

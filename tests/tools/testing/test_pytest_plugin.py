@@ -85,7 +85,7 @@ def test_a_test_that_fails_says_why_the_robot_is_not_where_it_should_be(run):
         """
     )
     result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["*not ACTIVE after 300 cycles but OFF*missing nodes: IMU_TORSO*"])
+    result.stdout.fnmatch_lines(["*must be ACTIVE within 300 cycles, got OFF*missing nodes: IMU_TORSO*"])
 
 
 # -- CAN logs ----------------------------------------------------------------------------------------------------------
