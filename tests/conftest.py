@@ -172,7 +172,7 @@ class FilterBus(WrappedBus):
 
 
 @dataclass
-class Rig:
+class HoldRig:
     """HAL and emulator in one process; `cycle` runs one cycle of a stiff position hold."""
 
     hal: Hal
@@ -250,7 +250,7 @@ class _Tap:
 
 
 @pytest.fixture
-def make_rig(network: atalante_dbc.Network, robot: Robot, urdf_text: str) -> Iterator[Callable[..., Rig]]:
+def make_rig(network: atalante_dbc.Network, robot: Robot, urdf_text: str) -> Iterator[Callable[..., HoldRig]]:
     bodies: list[PyBulletBody] = []
 
     def make(
@@ -260,7 +260,7 @@ def make_rig(network: atalante_dbc.Network, robot: Robot, urdf_text: str) -> Ite
         starts: bool = True,
         hal_network: atalante_dbc.Network = network,
         **options: Any,
-    ) -> Rig:
+    ) -> HoldRig:
         ours, theirs = lockstep_pair()
         body = PyBulletBody(urdf_text)
         bodies.append(body)
@@ -270,7 +270,7 @@ def make_rig(network: atalante_dbc.Network, robot: Robot, urdf_text: str) -> Ite
         bus = FilterBus(ours)
         sent: list[Frames] = []
         hal = Hal(hal_network, robot, bus, tap=_Tap(sent), **options)
-        return Rig(hal, emulator, bus, operator, sent)
+        return HoldRig(hal, emulator, bus, operator, sent)
 
     yield make
     for body in bodies:
@@ -278,5 +278,5 @@ def make_rig(network: atalante_dbc.Network, robot: Robot, urdf_text: str) -> Ite
 
 
 @pytest.fixture
-def rig(make_rig: Callable[..., Rig]) -> Rig:
+def rig(make_rig: Callable[..., HoldRig]) -> HoldRig:
     return make_rig()

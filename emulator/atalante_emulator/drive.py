@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from atalante_emulator import emergency
 from atalante_emulator.body import PERIOD
-from atalante_emulator.emergency import Emergency, Errors, Reaction, reaction_to
+from atalante_emulator.emergency import Emergency, Errors, FaultReaction, reaction_to
 from atalante_emulator.encoder import Encoders
 from atalante_emulator.motor import MotorParameters, Motors
 from atalante_hal.compiled import compiled
@@ -239,10 +239,10 @@ class Drives:
         self.errors.begin(drive, code, stands=stands)
         state = self.state[drive]
         match reaction_to(code):
-            case Reaction.LOWER if state not in _FAULTY:
+            case FaultReaction.LOWER if state not in _FAULTY:
                 self._enter(drive, DriveState.FAULT_REACTION_ACTIVE)
                 self.latched[drive] = False
-            case Reaction.HOLD if state in _POWERED:
+            case FaultReaction.HOLD if state in _POWERED:
                 if state is not DriveState.QUICK_STOP_ACTIVE:
                     self._enter(drive, DriveState.QUICK_STOP_ACTIVE)
                 self.latched[drive] = True

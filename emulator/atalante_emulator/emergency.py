@@ -30,7 +30,7 @@ _GENERIC: Final = 0x01
 _OVER, _FORGOTTEN = 2, 3
 
 
-class Reaction(Enum):
+class FaultReaction(Enum):
     """Local reaction of a drive to an error."""
 
     NONE = "continues"
@@ -38,7 +38,7 @@ class Reaction(Enum):
     LOWER = "switches its power stage off, and the brake lets the joint sink"
 
 
-def reaction_to(code: int) -> Reaction:
+def reaction_to(code: int) -> FaultReaction:
     """Return the reaction of a drive to an error.
 
     A drive holds its joint if it can. It cannot with a current, temperature or encoder error, or without voltage.
@@ -47,10 +47,10 @@ def reaction_to(code: int) -> Reaction:
         code: emergency error code.
     """
     if code in (COMMAND_LOST, COMMAND_REFUSED):
-        return Reaction.NONE
+        return FaultReaction.NONE
     if code == NO_VOLTAGE or code >> 12 in (0x2, 0x4, 0x7):
-        return Reaction.LOWER
-    return Reaction.HOLD
+        return FaultReaction.LOWER
+    return FaultReaction.HOLD
 
 
 def register_of(codes: Sequence[int]) -> int:

@@ -23,7 +23,7 @@ BOTH = (True, True)
 
 
 @dataclass
-class Bench:
+class DriveBench:
     """Drives on a bench: somebody else turns the joints."""
 
     parameters: DriveParameters = field(default_factory=DriveParameters)
@@ -49,16 +49,16 @@ class Bench:
 
 
 @pytest.fixture
-def bench() -> Bench:
-    return Bench()
+def bench() -> DriveBench:
+    return DriveBench()
 
 
-def states(bench: Bench) -> set[DriveState]:
+def states(bench: DriveBench) -> set[DriveState]:
     assert bench.signals.state.tolist() == bench.drives.state
     return set(bench.drives.state)
 
 
-def test_cia402_walk_up_one_state_a_cycle_and_down(bench: Bench) -> None:
+def test_cia402_walk_up_one_state_a_cycle_and_down(bench: DriveBench) -> None:
     seen = [states(bench)]
     for word in (
         Controlword.SHUTDOWN,
@@ -79,7 +79,7 @@ def test_cia402_walk_up_one_state_a_cycle_and_down(bench: Bench) -> None:
     ]
 
 
-def test_a_drive_obeys_its_own_controlword(bench: Bench) -> None:
+def test_a_drive_obeys_its_own_controlword(bench: DriveBench) -> None:
     bench.enable()
     bench.word[4] = Controlword.QUICK_STOP
     bench.cycle()
@@ -89,14 +89,14 @@ def test_a_drive_obeys_its_own_controlword(bench: Bench) -> None:
 
 
 def test_without_operation_enabled_there_is_no_torque() -> None:
-    bench = Bench(SMOOTH)
+    bench = DriveBench(SMOOTH)
     bench.target[:] = 50.0
     for word in (Controlword.DISABLE_VOLTAGE, Controlword.SHUTDOWN, Controlword.SWITCH_ON):
         bench.word[:] = word
         assert not bench.cycle().any()
 
 
-def test_drives_without_power_rub_and_brake(bench: Bench) -> None:
+def test_drives_without_power_rub_and_brake(bench: DriveBench) -> None:
     bench.velocity[:] = 1.0
     p = bench.parameters.motor
     expected = -(np.array(p.coulomb * 2) * math.tanh(1.0 / p.friction_speed) + np.array(p.viscous * 2))
@@ -105,14 +105,14 @@ def test_drives_without_power_rub_and_brake(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("speed", [-3.0, -0.01, 0.0, 0.002, 1.5])
-def test_friction_takes_power_and_never_gives_it(bench: Bench, speed: float) -> None:
+def test_friction_takes_power_and_never_gives_it(bench: DriveBench, speed: float) -> None:
     bench.velocity[:] = speed
     power = bench.cycle() * speed
     assert (power < 0).all() if speed else not power.any()
 
 
 def test_torque_follows_as_a_first_order_lag() -> None:
-    bench = Bench(SMOOTH)
+    bench = DriveBench(SMOOTH)
     bench.enable()
     bench.target[:] = 20.0
     for n in range(1, 6):
@@ -124,7 +124,7 @@ def test_torque_follows_as_a_first_order_lag() -> None:
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_torque_stays_inside_both_limits(sign: float) -> None:
-    bench = Bench(SMOOTH)
+    bench = DriveBench(SMOOTH)
     bench.enable()
     bench.target[:] = sign * 1e4
     bench.limit[:6] = 15.0
@@ -134,7 +134,7 @@ def test_torque_stays_inside_both_limits(sign: float) -> None:
     np.testing.assert_allclose(sign * torque, np.r_[np.full(6, 15.0), ROBOT.torque_max[6:]], rtol=1e-6)
 
 
-def test_watchdog_trips_at_exactly_the_fifth_cycle_without_command(bench: Bench) -> None:
+def test_watchdog_trips_at_exactly_the_fifth_cycle_without_command(bench: DriveBench) -> None:
     bench.enable()
     for _ in range(WATCHDOG - 1):
         bench.cycle((False, False))
@@ -149,8 +149,8 @@ def test_watchdog_trips_at_exactly_the_fifth_cycle_without_command(bench: Bench)
     assert bench.drives.emergencies == [Emergency(node, 0x11, 0x8250) for node in NODES]
 
 
-def test_lost_commands_below_the_watchdog_repeat_the_last(bench: Bench) -> None:
-    bench = Bench(SMOOTH)
+def test_lost_commands_below_the_watchdog_repeat_the_last(bench: DriveBench) -> None:
+    bench = DriveBench(SMOOTH)
     bench.enable()
     bench.target[:] = 12.0
     for _ in range(10):
@@ -159,7 +159,7 @@ def test_lost_commands_below_the_watchdog_repeat_the_last(bench: Bench) -> None:
         np.testing.assert_allclose(bench.cycle((False, False)), 12.0, rtol=1e-6)
 
 
-def test_a_silent_leg_holds_alone(bench: Bench) -> None:
+def test_a_silent_leg_holds_alone(bench: DriveBench) -> None:
     bench.enable()
     for _ in range(WATCHDOG):
         bench.cycle((True, False))
@@ -167,14 +167,14 @@ def test_a_silent_leg_holds_alone(bench: Bench) -> None:
     assert set(bench.drives.state[6:]) == {DriveState.QUICK_STOP_ACTIVE}
 
 
-def test_watchdog_leaves_drives_alone_that_are_not_enabled(bench: Bench) -> None:
+def test_watchdog_leaves_drives_alone_that_are_not_enabled(bench: DriveBench) -> None:
     for _ in range(3 * WATCHDOG):
         bench.cycle((False, False))
     assert states(bench) == {DriveState.SWITCH_ON_DISABLED}
     assert not bench.drives.emergencies
 
 
-def test_latch_needs_quick_stop_before_enable(bench: Bench) -> None:
+def test_latch_needs_quick_stop_before_enable(bench: DriveBench) -> None:
     bench.enable()
     for _ in range(WATCHDOG):
         bench.cycle((False, False))
@@ -193,7 +193,7 @@ def test_latch_needs_quick_stop_before_enable(bench: Bench) -> None:
 @pytest.mark.parametrize("polarity", [1.0, -1.0])
 def test_hold_pulls_back_to_where_it_stopped(polarity: float) -> None:
     robot = dataclasses.replace(ROBOT, polarity=np.full(12, polarity))
-    bench = Bench(SMOOTH, robot)
+    bench = DriveBench(SMOOTH, robot)
     bench.position[:] = 0.1
     bench.enable()
     bench.word[:] = Controlword.QUICK_STOP
@@ -213,7 +213,7 @@ def test_hold_pulls_back_to_where_it_stopped(polarity: float) -> None:
 
 
 def test_holds_where_it_stopped_and_not_where_it_was_enabled() -> None:
-    bench = Bench(SMOOTH)
+    bench = DriveBench(SMOOTH)
     bench.enable()
     bench.position[:] = 0.2
     bench.cycle()
@@ -224,12 +224,12 @@ def test_holds_where_it_stopped_and_not_where_it_was_enabled() -> None:
 
 
 def test_before_the_first_command_there_is_none() -> None:
-    bench = Bench(SMOOTH)
+    bench = DriveBench(SMOOTH)
     bench.drives.sample(bench.position)
     assert bench.drives.drive(bench.velocity) == [0.0] * 12
 
 
-def test_the_encoders_are_what_the_frames_say(bench: Bench) -> None:
+def test_the_encoders_are_what_the_frames_say(bench: DriveBench) -> None:
     bench.cycle()
     bench.position[:] = 0.05
     bench.cycle()
@@ -238,7 +238,7 @@ def test_the_encoders_are_what_the_frames_say(bench: Bench) -> None:
 
 
 def test_hold_damps_motion() -> None:
-    bench = Bench(SMOOTH)
+    bench = DriveBench(SMOOTH)
     bench.enable()
     bench.word[:] = Controlword.QUICK_STOP
     bench.cycle()
@@ -250,7 +250,7 @@ def test_hold_damps_motion() -> None:
     np.testing.assert_allclose(stretched, -speed * ROBOT.hold_kd, rtol=0.1)
 
 
-def test_torque_noise_is_seeded_and_of_the_stated_size(bench: Bench) -> None:
+def test_torque_noise_is_seeded_and_of_the_stated_size(bench: DriveBench) -> None:
     first, again, other = np.zeros((3, 500, 12))
     bench.drives.draw_noise(np.random.default_rng(1), first)
     bench.drives.draw_noise(np.random.default_rng(1), again)
@@ -264,7 +264,7 @@ class TestHeat:
 
     @pytest.mark.exhaustive
     def test_winding_temperature_follows_the_closed_form(self) -> None:
-        bench = Bench(SMOOTH)
+        bench = DriveBench(SMOOTH)
         bench.enable()
         torque = 0.3 * ROBOT.torque_max
         bench.target[:] = torque
@@ -277,7 +277,7 @@ class TestHeat:
 
     @pytest.mark.parametrize("degrees", [20.0, 89.0, 90.4, 91.0, 100.2, 115.0, 119.9])
     def test_the_torque_limit_is_the_curve_at_the_temperature_that_is_told(self, degrees: float) -> None:
-        bench = Bench(SMOOTH)
+        bench = DriveBench(SMOOTH)
         bench.enable()
         bench.target[:] = 1e4
         bench.drives.heat(3, degrees)
@@ -288,7 +288,7 @@ class TestHeat:
         np.testing.assert_allclose(torque, ROBOT.torque_limit(told), rtol=1e-6)
 
     def test_a_hot_drive_holds_with_what_it_has_left(self) -> None:
-        bench = Bench(SMOOTH)
+        bench = DriveBench(SMOOTH)
         bench.enable()
         bench.drives.heat(3, 118.0)
         bench.word[:] = Controlword.QUICK_STOP
@@ -300,7 +300,7 @@ class TestHeat:
         assert torque[2] == pytest.approx(ROBOT.torque_max[2])
 
     def test_all_of_them_hot(self) -> None:
-        bench = Bench(SMOOTH)
+        bench = DriveBench(SMOOTH)
         bench.enable()
         bench.target[:] = 1e4
         for drive in range(12):
@@ -310,7 +310,7 @@ class TestHeat:
         np.testing.assert_allclose(torque, ROBOT.torque_limit(np.full(12, 110.0)), rtol=1e-6)
 
     def test_a_drive_that_has_cooled_gives_all_again(self) -> None:
-        bench = Bench(SMOOTH)
+        bench = DriveBench(SMOOTH)
         bench.enable()
         bench.target[:] = 1e4
         bench.drives.heat(3, 110.0)
@@ -321,7 +321,7 @@ class TestHeat:
         np.testing.assert_allclose(torque, ROBOT.torque_max, rtol=1e-6)
 
     def test_what_is_heated_by_torque_is_noticed_by_the_slow_turn(self) -> None:
-        bench = Bench(DriveParameters(dataclasses.replace(SMOOTH_MOTOR, thermal_time=1.0, heating=600.0)))
+        bench = DriveBench(DriveParameters(dataclasses.replace(SMOOTH_MOTOR, thermal_time=1.0, heating=600.0)))
         bench.enable()
         bench.target[3] = 0.5 * ROBOT.torque_max[3]
         seen = []
@@ -334,7 +334,7 @@ class TestHeat:
         assert bench.drives.emergencies == [Emergency("LEFT_SK", 0x09, 0x4310)]
 
     def test_a_trip_lowers_the_joint_and_the_others_go_on(self) -> None:
-        bench = Bench(SMOOTH)
+        bench = DriveBench(SMOOTH)
         bench.enable()
         bench.target[:] = 30.0
         bench.drives.heat(3, 120.0)
@@ -348,7 +348,7 @@ class TestHeat:
         assert bench.signals.torque[3] == pytest.approx(0.0, abs=1e-6)
 
     def test_fault_when_the_joint_has_come_to_rest(self) -> None:
-        bench = Bench(SMOOTH)
+        bench = DriveBench(SMOOTH)
         bench.enable()
         bench.drives.heat(3, 120.0)
         for _ in range(3 * SLOW_CYCLES):
@@ -363,7 +363,7 @@ class TestHeat:
 
     def test_a_joint_at_the_speed_of_rest_still_moves(self) -> None:
         counts = ROBOT.gear[3] * COUNTS / (2.0 * math.pi)
-        bench = Bench(dataclasses.replace(SMOOTH, rest_speed=4.0 / (counts * PERIOD)))
+        bench = DriveBench(dataclasses.replace(SMOOTH, rest_speed=4.0 / (counts * PERIOD)))
         bench.enable()
         bench.drives.heat(3, 120.0)
         for moved, state in ((4, DriveState.FAULT_REACTION_ACTIVE), (3, DriveState.FAULT)):
@@ -373,7 +373,7 @@ class TestHeat:
             assert bench.drives.state[3] is state
 
     def test_a_fault_cannot_be_reset_while_the_drive_is_hot(self) -> None:
-        bench = Bench(SMOOTH)
+        bench = DriveBench(SMOOTH)
         bench.enable()
         bench.drives.heat(3, 125.0)
         for _ in range(SLOW_CYCLES):
@@ -394,7 +394,7 @@ class TestErrors:
     """What a drive does by itself about each class of error."""
 
     @pytest.mark.parametrize("code", [0x2310, 0x2110, 0x3222, 0x4110, 0x4310, 0x7305, 0x7121])
-    def test_a_drive_that_cannot_hold_lowers(self, bench: Bench, code: int) -> None:
+    def test_a_drive_that_cannot_hold_lowers(self, bench: DriveBench, code: int) -> None:
         bench.enable()
         bench.drives.fail(7, code)
         assert bench.drives.state[7] is DriveState.FAULT_REACTION_ACTIVE
@@ -402,19 +402,19 @@ class TestErrors:
         assert [e.code for e in bench.drives.emergencies] == [code]
 
     @pytest.mark.parametrize("code", [0x1000, 0x3210, 0x3220, 0x6100, 0x8130, 0x8150, 0x8250, 0xFF00])
-    def test_a_drive_that_can_hold_holds(self, bench: Bench, code: int) -> None:
+    def test_a_drive_that_can_hold_holds(self, bench: DriveBench, code: int) -> None:
         bench.enable()
         bench.drives.fail(7, code)
         assert bench.drives.state[7] is DriveState.QUICK_STOP_ACTIVE
         assert [d for d in range(12) if bench.drives.latched[d]] == [7]
 
     @pytest.mark.parametrize("code", [0x3220, 0x8250])
-    def test_a_drive_without_power_has_nothing_to_hold(self, bench: Bench, code: int) -> None:
+    def test_a_drive_without_power_has_nothing_to_hold(self, bench: DriveBench, code: int) -> None:
         bench.drives.fail(7, code)
         assert bench.drives.state[7] is DriveState.SWITCH_ON_DISABLED
         assert not bench.drives.latched[7]
 
-    def test_a_hold_that_was_commanded_becomes_the_drives_own_where_it_is(self, bench: Bench) -> None:
+    def test_a_hold_that_was_commanded_becomes_the_drives_own_where_it_is(self, bench: DriveBench) -> None:
         bench.position[:] = 0.1
         bench.enable()
         bench.word[:] = Controlword.QUICK_STOP
@@ -427,7 +427,7 @@ class TestErrors:
         assert bench.drives.latched[7] is False  # acknowledged by the QUICK_STOP that goes on
         np.testing.assert_allclose(torque, -0.01 * ROBOT.hold_kp, rtol=0.02)
 
-    def test_a_latched_hold_that_cannot_go_on_is_a_fault_and_no_hold(self, bench: Bench) -> None:
+    def test_a_latched_hold_that_cannot_go_on_is_a_fault_and_no_hold(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.fail(7, 0x8250)
         bench.drives.fail(7, 0x7305)
@@ -435,7 +435,7 @@ class TestErrors:
         assert bench.drives.latched[7] is False
         assert bench.signals.state[7] == DriveState.FAULT_REACTION_ACTIVE
 
-    def test_disabling_a_latched_hold_acknowledges_it(self, bench: Bench) -> None:
+    def test_disabling_a_latched_hold_acknowledges_it(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.fail(7, 0x8250)
         bench.word[7] = Controlword.DISABLE_VOLTAGE
@@ -443,7 +443,7 @@ class TestErrors:
         assert (bench.drives.state[7], bench.drives.latched[7]) == (DriveState.SWITCH_ON_DISABLED, False)
         assert [e.code for e in bench.drives.emergencies] == [0x8250, 0]
 
-    def test_every_other_command_leaves_a_latched_hold_and_its_error(self, bench: Bench) -> None:
+    def test_every_other_command_leaves_a_latched_hold_and_its_error(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.fail(7, 0x8250)
         for word in (
@@ -457,7 +457,7 @@ class TestErrors:
             assert (bench.drives.state[7], bench.drives.latched[7]) == (DriveState.QUICK_STOP_ACTIVE, True)
         assert [e.code for e in bench.drives.emergencies] == [0x8250]
 
-    def test_a_fault_reset_acknowledges_all_that_is_over(self, bench: Bench) -> None:
+    def test_a_fault_reset_acknowledges_all_that_is_over(self, bench: DriveBench) -> None:
         bench.drives.fail(7, 0x2310)
         bench.drives.fail(7, 0x4310)
         bench.drives.leave(7, DriveState.FAULT)
@@ -466,7 +466,7 @@ class TestErrors:
         assert bench.drives.state[7] is DriveState.SWITCH_ON_DISABLED
         assert [e.code for e in bench.drives.emergencies] == [0x2310, 0x4310, 0]
 
-    def test_the_end_of_an_error_is_not_its_acknowledgement(self, bench: Bench) -> None:
+    def test_the_end_of_an_error_is_not_its_acknowledgement(self, bench: DriveBench) -> None:
         bench.drives.fail(7, 0x2310, stands=True)
         for _ in range(SLOW_CYCLES):
             bench.cycle()
@@ -475,7 +475,7 @@ class TestErrors:
         assert bench.drives.state[7] is DriveState.FAULT
         assert [e.code for e in bench.drives.emergencies] == [0x2310]
 
-    def test_commands_of_a_leg_that_are_not_fresh_acknowledge_nothing(self, bench: Bench) -> None:
+    def test_commands_of_a_leg_that_are_not_fresh_acknowledge_nothing(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.fail(7, 0x8250)
         bench.drives.fail(1, 0x8250)
@@ -496,13 +496,13 @@ class TestErrors:
         drives.fail(0, 0x4310)
         assert outbox == [Emergency("LEFT_FH", 0x09, 0x4310)]
 
-    def test_an_error_in_a_fault_changes_nothing(self, bench: Bench) -> None:
+    def test_an_error_in_a_fault_changes_nothing(self, bench: DriveBench) -> None:
         bench.drives.fail(7, 0x4310)
         bench.drives.leave(7, DriveState.FAULT)
         bench.drives.fail(7, 0x2310)
         assert bench.drives.state[7] is DriveState.FAULT
 
-    def test_an_error_that_stands_cannot_be_acknowledged(self, bench: Bench) -> None:
+    def test_an_error_that_stands_cannot_be_acknowledged(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.fail(7, 0x3220, stands=True)
         bench.word[:] = Controlword.QUICK_STOP
@@ -515,7 +515,7 @@ class TestErrors:
         assert not bench.drives.latched[7]
         assert bench.drives.emergencies == [Emergency("RIGHT_TH", 0x05, 0x3220), Emergency("RIGHT_TH", 0, 0)]
 
-    def test_a_drive_with_an_error_that_stands_can_be_lowered_and_not_enabled(self, bench: Bench) -> None:
+    def test_a_drive_with_an_error_that_stands_can_be_lowered_and_not_enabled(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.fail(7, 0x3220, stands=True)
         bench.word[7] = Controlword.DISABLE_VOLTAGE
@@ -530,14 +530,14 @@ class TestErrors:
         bench.cycle()
         assert bench.drives.state[7] is DriveState.OPERATION_ENABLED
 
-    def test_nobody_leaves_a_fault_reaction(self, bench: Bench) -> None:
+    def test_nobody_leaves_a_fault_reaction(self, bench: DriveBench) -> None:
         bench.drives.fail(7, 0x2310)
         for word in Controlword:
             bench.word[:] = word
             bench.cycle()
         assert bench.drives.state[7] is DriveState.FAULT_REACTION_ACTIVE
 
-    def test_a_reset_drive_has_forgotten_everything(self, bench: Bench) -> None:
+    def test_a_reset_drive_has_forgotten_everything(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.fail(7, 0x3220, stands=True)
         bench.drives.reset(7)
@@ -545,13 +545,13 @@ class TestErrors:
         assert not bench.drives.errors.stand(7)
         assert [e.code for e in bench.drives.emergencies] == [0x3220]
 
-    def test_leaving_unasked_is_told_by_the_state_alone(self, bench: Bench) -> None:
+    def test_leaving_unasked_is_told_by_the_state_alone(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.leave(7, DriveState.SWITCHED_ON)
         assert bench.signals.state[7] == DriveState.SWITCHED_ON
         assert not bench.drives.emergencies
 
-    def test_notices_go_on_and_are_told_by_the_whole_leg(self, bench: Bench) -> None:
+    def test_notices_go_on_and_are_told_by_the_whole_leg(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.notice(1, emergency.COMMAND_LOST)
         assert states(bench) == {DriveState.OPERATION_ENABLED}
@@ -562,7 +562,7 @@ class TestErrors:
 
 
 class TestSync:
-    def test_holds_at_exactly_the_fifth_cycle_without_sync(self, bench: Bench) -> None:
+    def test_holds_at_exactly_the_fifth_cycle_without_sync(self, bench: DriveBench) -> None:
         bench.enable()
         for cycle in range(100, 100 + WATCHDOG - 1):
             bench.drives.miss_sync(1, cycle)
@@ -572,7 +572,7 @@ class TestSync:
         assert set(bench.drives.state[6:]) == {DriveState.QUICK_STOP_ACTIVE}
         assert bench.drives.emergencies == [Emergency(node, 0x11, 0x8130) for node in NODES[6:]]
 
-    def test_the_first_cycle_counts_as_any_other(self, bench: Bench) -> None:
+    def test_the_first_cycle_counts_as_any_other(self, bench: DriveBench) -> None:
         bench.enable()
         for cycle in range(WATCHDOG - 1):
             bench.drives.miss_sync(0, cycle)
@@ -580,13 +580,13 @@ class TestSync:
         bench.drives.miss_sync(0, WATCHDOG - 1)
         assert set(bench.drives.state[:6]) == {DriveState.QUICK_STOP_ACTIVE}
 
-    def test_only_cycles_in_a_row_count(self, bench: Bench) -> None:
+    def test_only_cycles_in_a_row_count(self, bench: DriveBench) -> None:
         bench.enable()
         for cycle in (1, 2, 3, 4, 6, 7, 8, 9, 11):
             bench.drives.miss_sync(0, cycle)
         assert states(bench) == {DriveState.OPERATION_ENABLED}
 
-    def test_a_sync_that_came_late_was_not_missed(self, bench: Bench) -> None:
+    def test_a_sync_that_came_late_was_not_missed(self, bench: DriveBench) -> None:
         bench.enable()
         for cycle in range(20):
             bench.drives.miss_sync(0, cycle)
@@ -610,7 +610,7 @@ class TestSupply:
             (19.9, DriveState.FAULT_REACTION_ACTIVE, [0x3220, 0x3222]),
         ],
     )
-    def test_thresholds(self, bench: Bench, volts: float, state: DriveState, told: list[int]) -> None:
+    def test_thresholds(self, bench: DriveBench, volts: float, state: DriveState, told: list[int]) -> None:
         bench.enable()
         for _ in range(3):
             bench.drives.supply(2, volts)
@@ -619,7 +619,7 @@ class TestSupply:
         assert bench.drives.voltage == [48.0, 48.0, volts] + [48.0] * 9
 
     @pytest.mark.parametrize("volts", [30.0, 10.0])
-    def test_nothing_is_acknowledged_while_the_voltage_is_low(self, bench: Bench, volts: float) -> None:
+    def test_nothing_is_acknowledged_while_the_voltage_is_low(self, bench: DriveBench, volts: float) -> None:
         bench.enable()
         bench.drives.supply(2, volts)
         for _ in range(2 * SLOW_CYCLES):
@@ -629,7 +629,7 @@ class TestSupply:
         assert bench.drives.latched[2] is (volts >= 20.0)
         assert [e.code for e in bench.drives.emergencies][-1] != 0
 
-    def test_the_hold_stays_when_the_voltage_is_back(self, bench: Bench) -> None:
+    def test_the_hold_stays_when_the_voltage_is_back(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.supply(2, 30.0)
         bench.drives.supply(2, 48.0)

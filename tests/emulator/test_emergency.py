@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from atalante_emulator.emergency import Emergency, Errors, Reaction, reaction_to, register_of
+from atalante_emulator.emergency import Emergency, Errors, FaultReaction, reaction_to, register_of
 
 
 @pytest.fixture
@@ -20,11 +20,11 @@ def test_every_code_has_a_reaction_by_its_class() -> None:
     for code in range(1, 0x10000):
         reaction = reaction_to(code)
         if code in (0x8110, 0x8200):
-            assert reaction is Reaction.NONE
+            assert reaction is FaultReaction.NONE
         elif code >> 12 in lowers or code == 0x3222:
-            assert reaction is Reaction.LOWER
+            assert reaction is FaultReaction.LOWER
         else:
-            assert reaction is Reaction.HOLD
+            assert reaction is FaultReaction.HOLD
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from atalante_hal.robot import Robot
 LSB = 2.0 * math.pi / COUNTS  # rad at the motor
 
 
-class Bench:
+class EncoderBench:
     def __init__(self, robot: Robot, bandwidth: float = 80.0) -> None:
         self.position, self.velocity = np.zeros((2, 12))
         self.encoders = Encoders(robot, bandwidth, self.position, self.velocity)
@@ -22,7 +22,7 @@ class Bench:
 @pytest.mark.parametrize("polarity", [1.0, -1.0])
 def test_quantised_at_the_motor(robot: Robot, polarity: float) -> None:
     robot = dataclasses.replace(robot, polarity=np.full(12, polarity))
-    bench, rng = Bench(robot), np.random.default_rng(2)
+    bench, rng = EncoderBench(robot), np.random.default_rng(2)
     for _ in range(100):
         joints = rng.uniform(robot.position_min, robot.position_max)
         bench.encoders.sample(joints)
@@ -34,7 +34,7 @@ def test_quantised_at_the_motor(robot: Robot, polarity: float) -> None:
 
 @pytest.mark.parametrize("bandwidth", [40.0, 80.0])
 def test_velocity_estimate_is_a_low_pass_of_the_encoder(robot: Robot, bandwidth: float) -> None:
-    bench, speed, position = Bench(robot, bandwidth), 1.0, np.zeros(12)
+    bench, speed, position = EncoderBench(robot, bandwidth), 1.0, np.zeros(12)
     bench.encoders.sample(position)
     assert not bench.velocity.any()
     for n in range(1, 40):
@@ -46,7 +46,7 @@ def test_velocity_estimate_is_a_low_pass_of_the_encoder(robot: Robot, bandwidth:
 
 @pytest.mark.parametrize("polarity", [1.0, -1.0])
 def test_the_bare_speed_is_not_late(robot: Robot, polarity: float) -> None:
-    bench = Bench(dataclasses.replace(robot, polarity=np.full(12, polarity)))
+    bench = EncoderBench(dataclasses.replace(robot, polarity=np.full(12, polarity)))
     for position in (0.1, 0.1, 0.102):
         bench.encoders.sample(np.full(12, position))
     np.testing.assert_allclose(bench.encoders.speed, 2.0, atol=1.01 * LSB / robot.gear.min() / PERIOD)
@@ -54,7 +54,7 @@ def test_the_bare_speed_is_not_late(robot: Robot, polarity: float) -> None:
 
 
 def test_a_joint_that_stands_somewhere_at_switch_on_does_not_seem_to_jump(robot: Robot) -> None:
-    bench = Bench(robot)
+    bench = EncoderBench(robot)
     bench.encoders.sample(np.full(12, 0.3))
     assert not bench.velocity.any()
     assert not bench.encoders.speed.any()

@@ -14,11 +14,11 @@ from atalante_hal.safety.events import Event
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import Controlword
 from atalante_hal.wire.process_image import TransmitImage
+from atalante_tools.faults.command_check import Commands, SentFrames
 from atalante_tools.faults.matrix import Row
 from atalante_tools.faults.observation import Observation
 from atalante_tools.faults.scenario import Case
 from atalante_tools.faults.verdict import Expectation, Verdict, judge
-from atalante_tools.faults.witness import Commands, Witness
 
 S = SupervisorState
 FIRST, PRESSED = 11, 41
@@ -39,18 +39,18 @@ def seen(network: Network, robot: Robot) -> Any:
         **arrays: Any,
     ) -> Observation:
         """A robot in these states, whose HOLD frames begin in cycle `held` or with the state."""
-        witness = Witness()
+        sent = SentFrames()
         tx = TransmitImage([network.message(f"COMMAND_{side}_LEG") for side in ("LEFT", "RIGHT")])
         for cycle, state in enumerate(states, 1):
             holds = state >= S.HOLD or (held is not None and held <= cycle < PRESSED)
             tx.values[tx.codec.slice("Controlword")] = Controlword.QUICK_STOP if holds else Controlword.ENABLE_OPERATION
-            witness.cycle = cycle
-            witness.sent(tx.seal())
+            sent.cycle = cycle
+            sent.sent(tx.seal())
         joints = np.zeros((len(states), 12))
         rows = dict.fromkeys(("drive_state", "torque", "position", "velocity", "temperature"), joints)
         return Observation(
             network=network, robot=robot, first=FIRST, over=None, pressed=pressed, states=tuple(states), events=tuple(events),
-            commands=Commands(network, *witness.frames()), age=np.zeros((len(states), 18), np.int64),
+            commands=Commands(network, *sent.frames()), age=np.zeros((len(states), 18), np.int64),
             guide_exit=np.zeros(len(states)), messages=(), **{**rows, **arrays},
         )  # fmt: skip
 

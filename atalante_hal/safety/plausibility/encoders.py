@@ -39,7 +39,7 @@ class Lost(NamedTuple):
     expected: float  # expected position without the jump [rad]
 
 
-class Encoders:
+class EncoderChecks:
     """Checks of the twelve encoders.
 
     Args:

@@ -20,7 +20,7 @@ SWING_CYCLES = 20
 LIFTED_CYCLES = 100
 
 
-class Feet:
+class FootChecks:
     """Checks of the two feet.
 
     Args:

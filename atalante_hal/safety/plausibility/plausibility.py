@@ -13,8 +13,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from atalante_hal.robot import Robot, Vector
-from atalante_hal.safety.plausibility.encoders import Encoders
-from atalante_hal.safety.plausibility.feet import Feet
+from atalante_hal.safety.plausibility.encoders import EncoderChecks
+from atalante_hal.safety.plausibility.feet import FootChecks
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Finding, Rows, signals_of
 from atalante_hal.safety.plausibility.imus import Imus
 from atalante_hal.safety.plausibility.legs import Legs
@@ -48,11 +48,11 @@ class Plausibility:
         codec = image.codec
         now = signals_of(codec, image.values)
         self._force = now.force
-        self._encoders = Encoders(robot, now, signals_of(codec, image.values_before), period, SLOW)
+        self._encoders = EncoderChecks(robot, now, signals_of(codec, image.values_before), period, SLOW)
         self._imus = Imus(robot, codec, now)
         self._stillness = Stillness(robot, image, now, SLOW)
         self._legs = Legs(robot, now, self._stillness.standing, period)
-        self._feet = Feet(robot, now, FEET)
+        self._feet = FootChecks(robot, now, FEET)
         self._rows = Rows(codec)
         self._unchecked = Unchecked(self._rows, image.check, SLOW)
         self._joint_rows, self._imu_rows = self._rows.joint.tolist(), self._rows.imu.tolist()

@@ -26,7 +26,7 @@ UNCHECKED_CYCLES = 128
 _COMPARED = 4
 
 
-class _Check(NamedTuple):
+class _SensorCheck(NamedTuple):
     dtc: Dtc
     node: str
     rows: list[int]  # rows of the process image that the check needs
@@ -85,19 +85,19 @@ class Unchecked:
         return self._findings
 
 
-def _checks(rows: Rows) -> Iterator[_Check]:
+def _checks(rows: Rows) -> Iterator[_SensorCheck]:
     """Yield the checks that need several values; a check of a single value runs whenever the value arrives."""
     joints, imus, feet = rows.joint.tolist(), rows.imu.tolist(), rows.foot.tolist()
     for joint, row in enumerate(joints):
-        yield _Check(Dtc.ENC_VELOCITY, JOINT_NODES[joint], [row], f"the velocity of {JOINTS[joint]}")
+        yield _SensorCheck(Dtc.ENC_VELOCITY, JOINT_NODES[joint], [row], f"the velocity of {JOINTS[joint]}")
     for leg, side in enumerate(SIDES):
         hip = leg * len(LEG_JOINTS)
         needed = [*joints[hip : hip + _COMPARED], imus[IMUS.index("pelvis")], imus[IMUS.index(f"{side}_tibia")]]
-        yield _Check(Dtc.ENC_DRIFT, JOINT_NODES[hip], needed, f"what encoders and IMUs say of the {side} leg")
+        yield _SensorCheck(Dtc.ENC_DRIFT, JOINT_NODES[hip], needed, f"what encoders and IMUs say of the {side} leg")
     for foot, row in enumerate(feet):
-        yield _Check(Dtc.FOOT_CELL, FOOT_NODES[foot], [row], f"the force cells of the {FEET[foot]} foot")
+        yield _SensorCheck(Dtc.FOOT_CELL, FOOT_NODES[foot], [row], f"the force cells of the {FEET[foot]} foot")
 
 
-def _unchecked(check: _Check, cycles: int) -> Finding:
+def _unchecked(check: _SensorCheck, cycles: int) -> Finding:
     text = f"{check.what} could not be checked for {cycles} cycles"
     return Finding(check.dtc, check.node, float(cycles), cycles >= UNCHECKED_CYCLES, text)

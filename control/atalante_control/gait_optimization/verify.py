@@ -29,7 +29,7 @@ _SLIDING = 1.0  # Ns, accepted impulse beyond friction at the impact; it changes
 _SINKING = 1e-3  # m, accepted depth of the leaving foot at the start of its swing
 
 
-class Check(NamedTuple):
+class GaitCheck(NamedTuple):
     """Check of a gait: the largest value found, and its limit."""
 
     name: str
@@ -68,7 +68,7 @@ class Verifier:
         self._left, self._right, self._pelvis = (model.getFrameId(name) for name in (_LEFT, _RIGHT, BASE_LINK))
         self.weight = pinocchio.computeTotalMass(model) * 9.81  # N
 
-    def verify(self, gait: Gait, kind: str = "periodic") -> tuple[Check, ...]:
+    def verify(self, gait: Gait, kind: str = "periodic") -> tuple[GaitCheck, ...]:
         """Run all checks of a right-stance step.
 
         Args:
@@ -125,16 +125,16 @@ class Verifier:
         after = outcome[: model.nv]
         return after[place], outcome[model.nv :], leaving @ after
 
-    def _joints(self, motion: _Motion) -> list[Check]:
+    def _joints(self, motion: _Motion) -> list[GaitCheck]:
         robot = self._robot
         beyond = np.maximum(robot.position_min - motion.q, motion.q - robot.position_max)
         speed = np.abs(motion.qd) / robot.velocity_max
         return [
-            Check("beyond the joint limits", float(beyond.max()), 0.0, "rad"),
-            Check("speed over its limit", float(speed.max()), 1.0, ""),
+            GaitCheck("beyond the joint limits", float(beyond.max()), 0.0, "rad"),
+            GaitCheck("speed over its limit", float(speed.max()), 1.0, ""),
         ]
 
-    def _loads(self, motion: _Motion) -> list[Check]:
+    def _loads(self, motion: _Motion) -> list[GaitCheck]:
         loads = [self.loads(*state) for state in zip(*motion, strict=True)]
         torque = np.array([row[0] for row in loads])
         wrench = np.array([row[1] for row in loads])
@@ -144,20 +144,22 @@ class Verifier:
         vertical = force[:, 2]
         slip = np.hypot(force[:, 0], force[:, 1]) / vertical
         return [
-            Check("torque over its limit", float((np.abs(torque) / self._robot.torque_max).max()), 1.0, ""),
-            Check("weight off the ground", float(1.0 - vertical.min() / self.weight), 0.5, ""),
-            Check("friction needed", float(slip.max()), 0.5, ""),
-            Check(
+            GaitCheck("torque over its limit", float((np.abs(torque) / self._robot.torque_max).max()), 1.0, ""),
+            GaitCheck("weight off the ground", float(1.0 - vertical.min() / self.weight), 0.5, ""),
+            GaitCheck("friction needed", float(slip.max()), 0.5, ""),
+            GaitCheck(
                 "centre of pressure along the sole",
                 float(np.abs(moment[:, 1] / vertical).max()),
                 exo.sole_size[0] / 2,
                 "m",
             ),
-            Check("centre of pressure across the sole", float(np.abs(moment[:, 0] / vertical).max()), exo.cell_y, "m"),
-            Check("yaw moment over force", float(np.abs(moment[:, 2] / vertical).max()), 0.05, "m"),
+            GaitCheck(
+                "centre of pressure across the sole", float(np.abs(moment[:, 0] / vertical).max()), exo.cell_y, "m"
+            ),
+            GaitCheck("yaw moment over force", float(np.abs(moment[:, 2] / vertical).max()), 0.05, "m"),
         ]
 
-    def _swing(self, motion: _Motion) -> list[Check]:
+    def _swing(self, motion: _Motion) -> list[GaitCheck]:
         heights, apart, tilt = [], [], []
         forward = self._forward()
         for q in motion.q:
@@ -167,12 +169,12 @@ class Verifier:
             apart.append((forward.T @ swing.translation)[1])
             tilt.append(np.abs(pinocchio.log3(forward.T @ pelvis.rotation)).max())
         return [
-            Check("swing sole in the ground", float(-np.min(heights)), _SINKING, "m"),
-            Check("ankles closer than the feet are wide", self._foot_width() - min(apart), 0.0, "m"),
-            Check("pelvis off upright and forward", max(tilt), math.radians(8.0), "rad"),
+            GaitCheck("swing sole in the ground", float(-np.min(heights)), _SINKING, "m"),
+            GaitCheck("ankles closer than the feet are wide", self._foot_width() - min(apart), 0.0, "m"),
+            GaitCheck("pelvis off upright and forward", max(tilt), math.radians(8.0), "rad"),
         ]
 
-    def _cycle(self, motion: _Motion) -> list[Check]:
+    def _cycle(self, motion: _Motion) -> list[GaitCheck]:
         """Return the checks of a periodic step: landing pose, periodicity, impact map."""
         after, impulse, leaving = self.impact(motion.q[-1], motion.qd[-1])
         mirrored_q, mirrored_qd = SIGN * motion.q[0][SWAP], SIGN * motion.qd[0][SWAP]
@@ -181,29 +183,29 @@ class Verifier:
         sinking = -min(leaving[2] + np.cross(leaving[3:], corner)[2] for corner in self._corners())
         return [
             *self._landing(motion.q[-1]),
-            Check("joint angles not periodic", float(np.abs(motion.q[-1] - mirrored_q).max()), _EXACT, "rad"),
-            Check("joint speeds off the impact map", float(np.abs(after - mirrored_qd).max()), _EXACT, "rad/s"),
-            Check("impulse of the impact downwards", float(-impulse[2]), 0.0, "Ns"),
-            Check("impulse beyond friction at the impact", sliding, _SLIDING, "Ns"),
-            Check("sinking speed of the foot that leaves", float(sinking), 0.01 + _EXACT, "m/s"),
+            GaitCheck("joint angles not periodic", float(np.abs(motion.q[-1] - mirrored_q).max()), _EXACT, "rad"),
+            GaitCheck("joint speeds off the impact map", float(np.abs(after - mirrored_qd).max()), _EXACT, "rad/s"),
+            GaitCheck("impulse of the impact downwards", float(-impulse[2]), 0.0, "Ns"),
+            GaitCheck("impulse beyond friction at the impact", sliding, _SLIDING, "Ns"),
+            GaitCheck("sinking speed of the foot that leaves", float(sinking), 0.01 + _EXACT, "m/s"),
         ]
 
-    def _rest(self, motion: _Motion, kind: str) -> list[Check]:
+    def _rest(self, motion: _Motion, kind: str) -> list[GaitCheck]:
         end = 0 if kind == "start" else -1
         return [
             *self._landing(motion.q[end]),
-            Check("speed at rest", float(np.abs(motion.qd[end]).max()), _EXACT, "rad/s"),
-            Check("acceleration at rest", float(np.abs(motion.qdd[end]).max()), 1e-3, "rad/s2"),
+            GaitCheck("speed at rest", float(np.abs(motion.qd[end]).max()), _EXACT, "rad/s"),
+            GaitCheck("acceleration at rest", float(np.abs(motion.qdd[end]).max()), 1e-3, "rad/s2"),
         ]
 
-    def _landing(self, q: Vector) -> list[Check]:
+    def _landing(self, q: Vector) -> list[GaitCheck]:
         """Return the checks that the left foot is flat on the ground and is the mirror image of the right foot."""
         stance, swing, _ = self._poses(q)
         relative = stance.actInv(swing)
         turned = self._forward() @ self._forward()
         return [
-            Check("landing sole over the ground", abs(float(relative.translation[2])), _EXACT, "m"),
-            Check(
+            GaitCheck("landing sole over the ground", abs(float(relative.translation[2])), _EXACT, "m"),
+            GaitCheck(
                 "landing foot turned", float(np.abs(pinocchio.log3(turned.T @ relative.rotation)).max()), _EXACT, "rad"
             ),
         ]

@@ -53,7 +53,7 @@ class Sink:
 
 
 @dataclass
-class Bench:
+class ServiceBench:
     """Both ends of the rings, and the service between them and its sinks."""
 
     layout: Layout
@@ -81,7 +81,7 @@ def layout(network: atalante_dbc.Network, robot: Robot) -> Layout:
 
 
 @contextmanager
-def bench(layout: Layout, *sinks: tuple[Sink, int], slots: int = 4096, loop_every: int = 100) -> Iterator[Bench]:
+def bench(layout: Layout, *sinks: tuple[Sink, int], slots: int = 4096, loop_every: int = 100) -> Iterator[ServiceBench]:
     meta = {"start_ns": 1000}
     with (
         RingWriter(layout.size * 8, slots, meta=meta) as records,
@@ -98,7 +98,7 @@ def bench(layout: Layout, *sinks: tuple[Sink, int], slots: int = 4096, loop_ever
             loop_every=loop_every,
             can_log=None,
         )
-        yield Bench(layout, records, events, service)
+        yield ServiceBench(layout, records, events, service)
 
 
 class TestRates:

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from atalante_tools.cli import cli
 from atalante_tools.commands import machine as machine_module
-from atalante_tools.commands.doctor import Check, examine
+from atalante_tools.commands.doctor import CheckResult, examine
 from atalante_tools.commands.machine import Interface, ThisMachine
 
 GOOD = Interface("vcan0", virtual=True, up=True, mtu=72, queue=1000)
@@ -50,7 +50,7 @@ class AnyMachine:
         return name not in self.lacks
 
 
-def missing(machine: AnyMachine, interface: str, *channels: str) -> dict[str, Check]:
+def missing(machine: AnyMachine, interface: str, *channels: str) -> dict[str, CheckResult]:
     return {check.name: check for check in examine(machine, interface, channels) if not check.ok}
 
 

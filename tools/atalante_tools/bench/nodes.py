@@ -247,7 +247,7 @@ class RecordedBus:
 
 
 @dataclass
-class RecordedRig:
+class RecordedHal:
     """HAL in ACTIVE on recorded nodes."""
 
     hal: Hal
@@ -255,7 +255,7 @@ class RecordedRig:
     recording: Recording
 
 
-def active_rig() -> RecordedRig:
+def active_hal() -> RecordedHal:
     """Build a HAL on recorded nodes and bring it to ACTIVE.
 
     Raises:
@@ -271,7 +271,7 @@ def active_rig() -> RecordedRig:
     require(
         state is SupervisorState.ACTIVE, f"the HAL on recorded nodes must be in ACTIVE, got {state.name}: {hal.reason}"
     )
-    return RecordedRig(hal, bus, recording)
+    return RecordedHal(hal, bus, recording)
 
 
 class FilterOnly:

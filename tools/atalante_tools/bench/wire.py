@@ -15,7 +15,7 @@ from atalante_hal.wire.codec import Codec
 from atalante_hal.wire.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes, intact, protected_spans
 from atalante_tools.bench.generated_c import COMPILER, GeneratedC, available
 from atalante_tools.bench.measure import Effort, Measurement, require, timed
-from atalante_tools.bench.nodes import FilterOnly, RecordedRig, Recording, active_rig, walk
+from atalante_tools.bench.nodes import FilterOnly, RecordedHal, Recording, active_hal, walk
 
 #: Number of cycles of a block; the pattern of slow messages repeats after ten cycles.
 _BLOCK: Final = 10
@@ -160,8 +160,8 @@ def ring_write(effort: Effort) -> Measurement:
     return measured
 
 
-def _hal() -> tuple[RecordedRig, Callable[[], object]]:
-    rig, controller = active_rig(), FilterOnly(walk())
+def _hal() -> tuple[RecordedHal, Callable[[], object]]:
+    rig, controller = active_hal(), FilterOnly(walk())
     read, write, update = rig.hal.read, rig.hal.write, controller.update
 
     def cycle() -> None:
@@ -172,7 +172,7 @@ def _hal() -> tuple[RecordedRig, Callable[[], object]]:
     return rig, cycle
 
 
-def _check_hal(rig: RecordedRig) -> None:
+def _check_hal(rig: RecordedHal) -> None:
     hal = rig.hal
     state = hal.state
     require(
@@ -183,7 +183,7 @@ def _check_hal(rig: RecordedRig) -> None:
     require(walk().guide.stepped == 0, "the filter must not saturate during the benchmark")
 
 
-def _check_same_state(rig: RecordedRig, theirs: object) -> None:
+def _check_same_state(rig: RecordedHal, theirs: object) -> None:
     """Require equal state of both HALs at the same pose of the recording.
 
     Raises:

@@ -1,6 +1,6 @@
 """`atalante doctor`: checks whether this machine is ready for a bus, and prints the commands that make it ready.
 
-Machine (commands/machine.py) -> examine -> Check -> one line each, exit code
+Machine (commands/machine.py) -> examine -> CheckResult -> one line each, exit code
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ PROGRAMS: Final = {
 
 
 @dataclass(frozen=True)
-class Check:
+class CheckResult:
     """Result of one check. `--json` prints these fields."""
 
     name: str
@@ -108,7 +108,7 @@ def channels_of(interface: str, channel: str) -> list[str]:
     return list(dict.fromkeys(parse_channel_map(channel, atalante_dbc.load().buses).values()))
 
 
-def line(check: Check) -> str:
+def line(check: CheckResult) -> str:
     """Return the text of a check for the terminal, with the fix on a second line.
 
     Args:
@@ -119,7 +119,7 @@ def line(check: Check) -> str:
     return f"{mark}  {check.name}: {check.text}{fix}"
 
 
-def examine(machine: Machine, interface: str, channels: Sequence[str]) -> Iterator[Check]:
+def examine(machine: Machine, interface: str, channels: Sequence[str]) -> Iterator[CheckResult]:
     """Yield the results of all checks.
 
     Args:
@@ -135,75 +135,75 @@ def examine(machine: Machine, interface: str, channels: Sequence[str]) -> Iterat
     for name, (purpose, package) in PROGRAMS.items():
         found = machine.program(name)
         text = f"{'installed' if found else 'not installed'}, for {purpose}"
-        yield Check(name, found, False, text, f"apt install {package}")
+        yield CheckResult(name, found, False, text, f"apt install {package}")
 
 
-def _packages(machine: Machine, interface: str) -> Iterator[Check]:
+def _packages(machine: Machine, interface: str) -> Iterator[CheckResult]:
     for name, (purpose, extra) in PACKAGES.items():
         found = machine.package(name)
         needed = not extra or (name == "pybullet" and interface == EMBEDDED)
         text = f"{'installed' if found else 'not installed'}, for {purpose}"
         fix = engine_hint() if name == "pybullet" else f"pip install 'atalante-hal{extra}'"
-        yield Check(name, found, needed, text, fix)
+        yield CheckResult(name, found, needed, text, fix)
 
 
-def _socketcan(machine: Machine, needed: bool, channels: Sequence[str]) -> Iterator[Check]:
+def _socketcan(machine: Machine, needed: bool, channels: Sequence[str]) -> Iterator[CheckResult]:
     error = machine.can_socket()
     supported = error is None
     boot = "modprobe can-raw; without that module, use `make test-vcan`, which boots a kernel that has it"
     text = "the kernel has SocketCAN" if supported else f"no SocketCAN ({error})"
-    yield Check("AF_CAN", supported, needed, text, boot)
+    yield CheckResult("AF_CAN", supported, needed, text, boot)
     loaded = supported and machine.vcan()
     wants_virtual = any(channel.startswith("vcan") for channel in channels)
     text = "virtual CAN interfaces can be created" if loaded else "the vcan module is not loaded"
-    yield Check("vcan", loaded, needed and wants_virtual, text, "modprobe vcan")
+    yield CheckResult("vcan", loaded, needed and wants_virtual, text, "modprobe vcan")
     present = {interface.name: interface for interface in machine.interfaces()} if supported else {}
     for name in dict.fromkeys([*channels, *present]) if needed or not channels else present:
         yield _interface(name, present.get(name), needed and name in channels)
     if not present and not channels:
-        yield Check("interfaces", False, needed, "there is no CAN interface", _create("vcan0"))
+        yield CheckResult("interfaces", False, needed, "there is no CAN interface", _create("vcan0"))
 
 
-def _interface(name: str, interface: Interface | None, needed: bool) -> Check:
+def _interface(name: str, interface: Interface | None, needed: bool) -> CheckResult:
     if interface is None:
-        return Check(name, False, needed, "this interface does not exist", _create(name))
+        return CheckResult(name, False, needed, "this interface does not exist", _create(name))
     size = f"mtu {FD_MTU}" if interface.virtual else "type can bitrate 1000000 dbitrate 5000000 fd on"
     if interface.mtu < FD_MTU:
         text, fix = f"classic CAN only (mtu {interface.mtu})", f"ip link set {name} down; ip link set {name} up {size}"
         if interface.virtual:
             fix = f"ip link set {name} down; ip link set {name} {size} up"
-        return Check(name, False, needed, text, fix)
+        return CheckResult(name, False, needed, text, fix)
     if not interface.up:
-        return Check(name, False, needed, "the interface is down", f"ip link set {name} up")
+        return CheckResult(name, False, needed, "the interface is down", f"ip link set {name} up")
     if interface.queue < QUEUE:
         # A short queue overflows only when the receiver is slow for some cycles, so this is no error.
         text = f"CAN FD, up, but its transmit queue holds only {interface.queue} frames"
-        return Check(name, False, False, text, f"ip link set {name} txqueuelen {QUEUE}")
-    return Check(name, True, needed, f"CAN FD, up, txqueuelen {interface.queue}")
+        return CheckResult(name, False, False, text, f"ip link set {name} txqueuelen {QUEUE}")
+    return CheckResult(name, True, needed, f"CAN FD, up, txqueuelen {interface.queue}")
 
 
 def _create(name: str) -> str:
     return f"ip link add {name} type vcan && ip link set {name} mtu {FD_MTU} txqueuelen {QUEUE} up"
 
 
-def _python_can(interface: str) -> Check:
+def _python_can(interface: str) -> CheckResult:
     import can
 
     known = interface in can.VALID_INTERFACES
     text = f"python-can {'supports' if known else 'does not support'} {interface}"
-    return Check("python-can", known, True, text, f"choose one of {', '.join(sorted(can.VALID_INTERFACES))}")
+    return CheckResult("python-can", known, True, text, f"choose one of {', '.join(sorted(can.VALID_INTERFACES))}")
 
 
-def _realtime(machine: Machine) -> Iterator[Check]:
+def _realtime(machine: Machine) -> Iterator[CheckResult]:
     priority, memory = machine.realtime_priority(), machine.locked_memory()
-    yield Check(
+    yield CheckResult(
         "real-time priority",
         priority >= PRIORITY,
         False,
         f"SCHED_FIFO up to {priority}" if priority else "no SCHED_FIFO: cycles may be late on the wall clock",
         f"echo '@realtime - rtprio {PRIORITY}' >> {LIMITS}; usermod -aG realtime $USER; log in again",
     )
-    yield Check(
+    yield CheckResult(
         "locked memory",
         memory is None,
         False,

@@ -11,7 +11,7 @@ from atalante_dbc import Network
 from atalante_hal.robot import Robot
 from atalante_hal.safety.events import Event
 from atalante_hal.types import SupervisorState
-from atalante_tools.faults.witness import Commands
+from atalante_tools.faults.command_check import Commands
 
 Vector = npt.NDArray[np.float64]
 

@@ -25,10 +25,10 @@ from atalante_hal.loop import run
 from atalante_hal.robot import Robot, load_robot
 from atalante_hal.types import State, SupervisorState
 from atalante_tools.console.options import EMBEDDED, Target
+from atalante_tools.faults.command_check import Commands, SentFrames
 from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, Moment
 from atalante_tools.faults.observation import Observation
 from atalante_tools.faults.scenario import Case, Host, Press
-from atalante_tools.faults.witness import Commands, Witness
 from atalante_tools.session.rig import Rig, open_hal
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ class _Run:
                 self.presses[moment + one.start].append(one.kind)
         self._faults = [one.starting(moment - 1 + one.start) for one in case.happens if isinstance(one, Fault)]
         self._moment = Moment([one for one in case.happens if isinstance(one, Host)], moment)
-        self._witness = Witness()
+        self._sent = SentFrames()
         self._seen: list[_Seen] = []
         self._events: list[Event] = []  # without the HOLD at the end of the loop
         self._counted = 0  # events of the HAL that were copied to `_events` or dropped
@@ -151,7 +151,7 @@ class _Run:
             operator=operator,
             assistance_factor=ASSISTANCE,
             controller_fields=controller.telemetry_fields,
-            tap=self._witness,
+            tap=self._sent,
             faults=self._faults,
         ) as rig:
             hal = rig.hal
@@ -178,7 +178,7 @@ class _Run:
 
     def _before(self, cycle: int, operator: Operator) -> None:
         """Prepare the next cycle: set its number and execute the actions of the operator."""
-        self._moment.cycle = self._witness.cycle = cycle
+        self._moment.cycle = self._sent.cycle = cycle
         for press in self.presses.get(cycle, ()):
             getattr(operator, press)()
 
@@ -189,7 +189,7 @@ class _Run:
             pressed: cycle of the operator's START after the fault. None if there was none.
         """
         shared, ends = stage(), self._case.ends
-        cycles, frames = self._witness.frames()
+        cycles, frames = self._sent.frames()
         keep = cycles <= len(self.states)
         columns = zip(*self._seen, strict=True)
         return Observation(

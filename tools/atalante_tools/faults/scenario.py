@@ -53,7 +53,7 @@ class Press:
 
 Happening = Fault | Host | Press
 #: Additional check of a run; returns one sentence if it fails, else None.
-Check = Callable[["Observation"], str | None]
+ObservationCheck = Callable[["Observation"], str | None]
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Case:
     recovers: bool = True  # whether the operator's START after the fault must lead to ACTIVE
     watched: int = 60  # cycles observed after the end of the fault, or after the bound of a permanent fault
     seed: int = 0  # seed of the emulator
-    checks: tuple[Check, ...] = ()  # additional checks
+    checks: tuple[ObservationCheck, ...] = ()  # additional checks
 
     @property
     def ends(self) -> int | None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from atalante_control.gait.subject import Subject
     from atalante_control.gait_optimization.result import SolvedGait
     from atalante_control.gait_optimization.step_problem import Kind
-    from atalante_control.gait_optimization.verify import Check
+    from atalante_control.gait_optimization.verify import GaitCheck
 
 
 @click.command(short_help="Optimise the gait of a patient.")
@@ -132,7 +132,7 @@ def _residuals(solved: SolvedGait) -> str:
     return table([["constraint", "violated by", "unit"], *rows])
 
 
-def _verification(checks: tuple[Check, ...]) -> str:
+def _verification(checks: tuple[GaitCheck, ...]) -> str:
     rows = [[c.name, f"{c.value:.3g}", f"{c.limit:.3g}", c.unit, "ok" if c.holds else "FAIL"] for c in checks]
     return table([["by Pinocchio", "value", "limit", "unit", ""], *rows])
 

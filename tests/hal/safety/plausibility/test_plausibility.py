@@ -19,8 +19,8 @@ from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, load_robot
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility import Finding, Plausibility
-from atalante_hal.safety.plausibility.encoders import Encoders
-from atalante_hal.safety.plausibility.feet import Feet
+from atalante_hal.safety.plausibility.encoders import EncoderChecks
+from atalante_hal.safety.plausibility.feet import FootChecks
 from atalante_hal.safety.plausibility.finding import Ages, Signals, measured, signals_of
 from atalante_hal.safety.plausibility.imus import Imus
 from atalante_hal.safety.plausibility.legs import Legs, _Contradiction, _forgotten, hip_angles
@@ -476,9 +476,9 @@ class TestEncodersAlone:
     noise = 3.0 * ROBOT.encoder_noise * ROBOT.gear
 
     @staticmethod
-    def encoders() -> tuple[Encoders, Signals]:
+    def encoders() -> tuple[EncoderChecks, Signals]:
         now = signals()
-        return Encoders(ROBOT, now, signals(), PERIOD, 16), now
+        return EncoderChecks(ROBOT, now, signals(), PERIOD, 16), now
 
     def test_at_first_nothing_is_known(self):
         encoders, _ = self.encoders()
@@ -1318,7 +1318,7 @@ class Plates:
 
     def __init__(self) -> None:
         self.now = signals_of(CODEC, np.zeros(CODEC.size))
-        self.feet = Feet(ROBOT, self.now, 1)
+        self.feet = FootChecks(ROBOT, self.now, 1)
 
     def judge(self, left: list[float], right: list[float], heard: tuple[bool, bool] = (True, True)) -> bool:
         self.now.force[:, :, 2] = left, right
@@ -1467,20 +1467,20 @@ def test_which_check_is_made_in_which_cycle(monkeypatch: pytest.MonkeyPatch):
     made: list[str] = []
     for owner, name in (
         (Stillness, "sample"),
-        (Encoders, "judge_velocity"),
+        (EncoderChecks, "judge_velocity"),
         (Legs, "judge_left"),
         (Legs, "judge_right"),
-        (Feet, "judge"),
+        (FootChecks, "judge"),
         (Unchecked, "judge"),
     ):
         monkeypatch.setattr(owner, name, lambda *_, name=f"{owner.__name__}.{name}": bool(made.append(name)))
     image = ReceiveImage(MESSAGES, np.zeros(CODEC.size))
     checks = Plausibility(ROBOT, image, PERIOD)
     assert checks.findings == ()
-    expected = {0: "Stillness.sample", 2: "Encoders.judge_velocity", 4: "Unchecked.judge"}
+    expected = {0: "Stillness.sample", 2: "EncoderChecks.judge_velocity", 4: "Unchecked.judge"}
     expected |= {cycle + 16: name for cycle, name in expected.items()}
     expected |= {8: "Legs.judge_left", 24: "Legs.judge_right"}
-    expected |= dict.fromkeys(range(1, 32, 4), "Feet.judge")
+    expected |= dict.fromkeys(range(1, 32, 4), "FootChecks.judge")
     for cycle in range(64):
         assert checks.check() == ()
         assert made == ([expected[cycle % 32]] if cycle % 32 in expected else [])

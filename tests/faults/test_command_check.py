@@ -12,7 +12,7 @@ from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.wire.cia402 import Controlword
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import TransmitImage
-from atalante_tools.faults.witness import Commands, Witness
+from atalante_tools.faults.command_check import Commands, SentFrames
 
 KNEE = JOINTS.index("left_SK")
 HIP = JOINTS.index("right_SH")
@@ -27,15 +27,15 @@ class Hal:
         self.torque, self.word, self.limit = (
             self.tx.values[codec.slice(name)] for name in ("TargetTorque", "Controlword", "MaxTorque")
         )
-        self.witness = Witness()
+        self.recorded = SentFrames()
         self.network = network
 
     def send(self, cycle: int) -> None:
-        self.witness.cycle = cycle
-        self.witness.sent(self.tx.seal())
+        self.recorded.cycle = cycle
+        self.recorded.sent(self.tx.seal())
 
     def commands(self) -> Commands:
-        return Commands(self.network, *self.witness.frames())
+        return Commands(self.network, *self.recorded.frames())
 
 
 @pytest.fixture
@@ -117,5 +117,5 @@ def test_a_step_over_a_cycle_without_a_frame_is_no_step(hal: Hal, robot: Robot) 
 
 
 def test_another_nodes_identifier_is_found(hal: Hal, network: Network, robot: Robot) -> None:
-    hal.witness.sent(TransmitImage([network.message("LEFT_SK_STATE")]).seal())
+    hal.recorded.sent(TransmitImage([network.message("LEFT_SK_STATE")]).seal())
     assert hal.commands().outside(robot) == ["the HAL must send only its own identifiers, got 0x184"]

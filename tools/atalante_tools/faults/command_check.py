@@ -21,7 +21,7 @@ _RESOLUTION: Final = 0.0125
 _PERIOD: Final = 1e-3  # s
 
 
-class Witness:
+class SentFrames:
     """`FrameTap` that records the frames the HAL sends, with their cycles."""
 
     def __init__(self) -> None:
