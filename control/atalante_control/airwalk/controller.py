@@ -29,7 +29,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from atalante_control.airwalk.kernel import STEP, hand_over, run
 from atalante_control.airwalk.telemetry import TELEMETRY, AirwalkStatistics
@@ -48,9 +47,8 @@ from atalante_control.joint.pid import AIR_GAINS, LEFT, RIGHT, Pid, PidGains
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, MOTORS, Robot
-from atalante_hal.types import Command, State
+from atalante_hal.types import Command, State, Vector
 
-Vector = npt.NDArray[np.float64]
 Pair = tuple[float, float]
 
 _LEG = len(LEG_JOINTS)

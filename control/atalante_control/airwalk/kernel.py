@@ -18,8 +18,8 @@ from atalante_control.joint.haptics import levels
 from atalante_control.joint.idealization import merge
 from atalante_control.joint.pid import control
 from atalante_hal.robot import IMUS, LEG_JOINTS, SIDES
+from atalante_hal.types import Vector
 
-Vector = npt.NDArray[np.float64]
 Table = npt.NDArray[np.void]
 
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")

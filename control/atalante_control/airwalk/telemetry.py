@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.robot import JOINTS
+from atalante_hal.types import Vector
 
-Vector = npt.NDArray[np.float64]
 Pair = tuple[float, float]
 
 #: Telemetry of a cycle; angles in rad, pairs are SH and SK of the swing leg.

@@ -22,8 +22,7 @@ from atalante_control.gait.array_file import ArrayFileError, read_arrays, write_
 from atalante_control.gait.gait import DEGREE, SIGN, SWAP, Gait
 from atalante_control.gait.subject import Subject
 from atalante_hal.robot import JOINTS, Robot
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import Vector
 
 FORMAT = "atalante-gait-network/2"
 DEFAULT_NETWORK = Path(__file__).parents[1] / "gaits" / "network.npz"

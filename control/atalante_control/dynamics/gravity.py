@@ -14,14 +14,12 @@ import numpy as np
 import numpy.typing as npt
 import pinocchio
 
-from atalante_control.model import ArticulatedModel
+from atalante_control.model import GRAVITY, ArticulatedModel
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS
+from atalante_hal.types import Vector
 
-Vector = npt.NDArray[np.float64]
 Vector3 = tuple[float, float, float]
-
-_GRAVITY = 9.81  # m/s2
 
 #: Record of a link in the frame of the joint that moves it: constants, then the values of a pose.
 LINK = np.dtype(
@@ -104,8 +102,8 @@ def hold(links: npt.NDArray[np.void], position: Vector, w: float, x: float, y: f
         torque: u_g, shape (12,) [Nm], overwritten.
     """
     down = links[0]["down"]
-    down[0], down[1] = -_GRAVITY * 2.0 * (x * z - w * y), -_GRAVITY * 2.0 * (y * z + w * x)
-    down[2] = -_GRAVITY * (1.0 - 2.0 * (x * x + y * y))
+    down[0], down[1] = -GRAVITY * 2.0 * (x * z - w * y), -GRAVITY * 2.0 * (y * z + w * x)
+    down[2] = -GRAVITY * (1.0 - 2.0 * (x * x + y * y))
     for i in range(1, len(links)):
         link = links[i]
         angle, turn, rotation = position[link["joint"]], link["turn"], link["rotation"]

@@ -17,15 +17,13 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pinocchio
 
 from atalante_control.dynamics.gravity import Gravity
 from atalante_control.gait.gait import bezier, control_points, motion
 from atalante_control.model import LEG_LINKS, ExoskeletonParameters, Patient, pinocchio_model, urdf
 from atalante_hal.robot import SIDES, Robot
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import Vector
 
 #: Links of the stance foot and the swing foot in the right-stance step of a `Gait`.
 STANCE_FOOT, SWING_FOOT = (f"{side}_{LEG_LINKS['HA']}" for side in reversed(SIDES))

@@ -9,15 +9,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pinocchio
 
 from atalante_control.dynamics.gravity import Gravity
 from atalante_control.gait.gait import Gait, check_gait, control_points, motion
 from atalante_control.model import ArticulatedModel, ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import JOINTS, Robot
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import Vector
 
 _SAMPLES = 33  # number of phases at which the eight control points are fitted
 _SAGITTAL_ANKLES = np.array([float(joint.endswith("_SA")) for joint in JOINTS])

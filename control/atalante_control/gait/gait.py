@@ -18,11 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from atalante_hal.robot import JOINTS, LEG_JOINTS, MIRROR_SIGN, SIDES, Robot
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import Vector
 
 FORMAT = "atalante-gait/1"
 DEGREE = 7

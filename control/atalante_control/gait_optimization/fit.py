@@ -20,7 +20,6 @@ from importlib.metadata import version
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.neural_network import MLPRegressor
 
@@ -28,8 +27,7 @@ from atalante_control.dynamics.gait_network import GaitNetwork, Layer, periodici
 from atalante_control.gait.gait import DEGREE, Gait, bezier, derivative
 from atalante_control.gait_optimization.library import Grid
 from atalante_hal.robot import JOINTS
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import Vector
 
 HIDDEN = (64, 64)
 ITERATIONS = 3000  # largest number of L-BFGS iterations in a round

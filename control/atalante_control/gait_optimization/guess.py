@@ -9,13 +9,11 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from atalante_control.gait.subject import Subject
 from atalante_control.gait_optimization.step_problem import StepProblem
 from atalante_hal.robot import JOINTS
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import Vector
 
 _BEND = 0.96  # height of the pelvis above the ankle, fraction of the straight leg
 _WIDTH, _SWAY, _LIFT = (

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pinocchio
 
 from atalante_control.dynamics.stance import stance_dynamics
@@ -19,8 +18,7 @@ from atalante_control.gait.gait import Gait, GaitError, check_gait
 from atalante_control.gait.subject import Subject
 from atalante_control.model import Patient
 from atalante_hal.robot import Robot
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import Vector
 
 
 class Deviation(NamedTuple):

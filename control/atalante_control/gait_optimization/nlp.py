@@ -14,7 +14,8 @@ import casadi
 import numpy as np
 import numpy.typing as npt
 
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import Vector
+
 Places = npt.NDArray[np.intp]
 Symbol = Any  # casadi.SX or casadi.MX
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import casadi
 import numpy as np
-import numpy.typing as npt
 
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import Vector
+
 #: Function called at each iteration with its number and the largest violation in the scale of the program.
 Progress = Callable[[int, float], None]
 

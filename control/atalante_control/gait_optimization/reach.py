@@ -11,12 +11,10 @@ from typing import Any
 
 import casadi
 import numpy as np
-import numpy.typing as npt
 
 from atalante_control.gait_optimization.step_problem import StepProblem
 from atalante_hal.robot import JOINTS
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import Vector
 
 _TOLERANCE = math.radians(0.5)  # rad, violation that is accepted, because the optimiser can choose another pose
 _NEAR = 1e-6  # weight of the distance to the middle of the ranges, relative to the violation

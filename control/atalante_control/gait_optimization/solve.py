@@ -16,7 +16,6 @@ from typing import Any
 
 import casadi
 import numpy as np
-import numpy.typing as npt
 
 from atalante_control.dynamics.stance import stance_dynamics
 from atalante_control.gait.gait import Gait
@@ -30,8 +29,6 @@ from atalante_control.gait_optimization.requirements import Requirements
 from atalante_control.gait_optimization.result import SOLVED, Residual, SolvedGait
 from atalante_control.gait_optimization.step_problem import TRANSITION, Kind, StepProblem
 from atalante_hal.robot import ROBOT_FILE, load_robot
-
-Vector = npt.NDArray[np.float64]
 
 RESIDUAL = 1e-6  # largest violation of each constraint in a solved gait, in its SI unit
 _OPTIONS: dict[str, Any] = {

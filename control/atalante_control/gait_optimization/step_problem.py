@@ -17,23 +17,21 @@ from typing import Any, Literal
 
 import casadi
 import numpy as np
-import numpy.typing as npt
 
 from atalante_control.gait.gait import DEGREE, SIGN, SWAP, Gait, bezier, derivative
 from atalante_control.gait_optimization.nlp import NonlinearProgram, Places, Rows
 from atalante_control.gait_optimization.requirements import Requirements
 from atalante_control.gait_optimization.result import Residual
 from atalante_control.gait_optimization.symbolic_dynamics import Chain
-from atalante_control.model import ExoskeletonParameters, Patient, links
+from atalante_control.model import GRAVITY, ExoskeletonParameters, Patient, links
 from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.types import Vector
 
-Vector = npt.NDArray[np.float64]
 Symbol = Any  # casadi.SX
 Kind = Literal["periodic", "start", "stop"]
 KINDS: tuple[Kind, ...] = ("periodic", "start", "stop")
 TRANSITION = 1.2  # s, of start and stop steps
 
-GRAVITY = 9.81  # m/s2
 _N = len(JOINTS)
 _POINTS = _N * (DEGREE + 1)  # unknowns before the nodes: control points, joint after joint
 _NODE = 4 * _N + 6  # unknowns of a node: q, dq/ds, d2q/ds2, torque, ground force, ground moment

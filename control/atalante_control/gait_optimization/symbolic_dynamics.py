@@ -15,12 +15,11 @@ from typing import Any
 
 import casadi
 import numpy as np
-import numpy.typing as npt
 
 from atalante_control.model import BASE_LINK, LEG_LINKS, Inertia, Link, Vector3
 from atalante_hal.robot import JOINTS, SIDES
+from atalante_hal.types import Vector
 
-Vector = npt.NDArray[np.float64]
 Symbol = Any  # casadi.SX
 
 _LEFT, _RIGHT = SIDES

@@ -12,14 +12,12 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pinocchio
 
 from atalante_control.gait.gait import SIGN, SWAP, Gait
-from atalante_control.model import BASE_LINK, LEG_LINKS, ExoskeletonParameters, Patient, pinocchio_model, urdf
+from atalante_control.model import BASE_LINK, GRAVITY, LEG_LINKS, ExoskeletonParameters, Patient, pinocchio_model, urdf
 from atalante_hal.robot import SIDES, Robot
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import Vector
 
 _LEFT, _RIGHT = (f"{side}_{LEG_LINKS['HA']}" for side in SIDES)
 _SAMPLES = 201  # number of samples of a step
@@ -66,7 +64,7 @@ class Verifier:
         model = self._articulated.model
         self._data: Any = model.createData()
         self._left, self._right, self._pelvis = (model.getFrameId(name) for name in (_LEFT, _RIGHT, BASE_LINK))
-        self.weight = pinocchio.computeTotalMass(model) * 9.81  # N
+        self.weight = pinocchio.computeTotalMass(model) * GRAVITY  # N
 
     def verify(self, gait: Gait, kind: str = "periodic") -> tuple[GaitCheck, ...]:
         """Run all checks of a right-stance step.

@@ -21,12 +21,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from atalante_control.gait.gait import derivative, power_basis
 from atalante_control.gait.recentering import Deadbeat
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import Vector
 
 
 @dataclass(frozen=True)

@@ -47,14 +47,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from atalante_control.gait.gait import bezier
 from atalante_control.guide.backup_policy import BackupPolicy, ForcedResponse
 from atalante_control.guide.filter import GuideFilter
 from atalante_control.joint.idealization import AssistedInertia
+from atalante_hal.types import Vector
 
-Vector = npt.NDArray[np.float64]
 Pair = tuple[float, float]
 
 _JOINTS = ("SH", "SK")

@@ -25,8 +25,8 @@ from atalante_control.guide.backup_policy import BackupPolicy, ForcedResponse, f
 from atalante_control.guide.kernel import BOUND, JOINT, P, errors_ahead, tick
 from atalante_control.guide.shapes import GuideShape
 from atalante_hal.compiled import compiled
+from atalante_hal.types import Vector
 
-Vector = npt.NDArray[np.float64]
 Pair = tuple[float, float]
 
 

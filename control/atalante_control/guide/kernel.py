@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_control.gait.gait import PERIOD
+from atalante_hal.types import Vector
 
-Vector = npt.NDArray[np.float64]
 Pair = tuple[float, float]
 
 #: Record of a joint: constants, values of the step and results of the last tick.

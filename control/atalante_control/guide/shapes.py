@@ -11,9 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import Vector
 
 PINCH_WIDTH = math.radians(1.0)  # rad, smallest half-width of the shape `pinched`
 SNAP_WIDTH = math.radians(0.1)  # rad, smallest half-width of the shape `snap`

@@ -21,9 +21,8 @@ from atalante_control.gait.gait import PERIOD
 from atalante_control.gait.recentering import Deadbeat
 from atalante_control.model import ArticulatedModel, ExoskeletonParameters, imu_link
 from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, SIDES, Robot
-from atalante_hal.types import State
+from atalante_hal.types import State, Vector
 
-Vector = npt.NDArray[np.float64]
 Pair = tuple[float, float]
 Quaternion = tuple[float, float, float, float]
 Vector3 = tuple[float, float, float]

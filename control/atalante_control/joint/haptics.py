@@ -9,12 +9,8 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-import numpy.typing as npt
-
 from atalante_hal.robot import MOTORS
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import Vector
 
 #: Index of the front motor of thigh and shank, for the left and the right leg. The next index is the back motor.
 _FRONT = tuple(

@@ -22,8 +22,8 @@ import pinocchio
 
 from atalante_control.model import ArticulatedModel
 from atalante_hal.robot import JOINTS, LEG_JOINTS
+from atalante_hal.types import Vector
 
-Vector = npt.NDArray[np.float64]
 Pair = tuple[float, float]
 
 _ASSISTED = (LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"))

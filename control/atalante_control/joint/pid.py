@@ -11,13 +11,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from atalante_control.gait.gait import PERIOD
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, LEG_JOINTS
+from atalante_hal.types import Vector
 
-Vector = npt.NDArray[np.float64]
 PerJoint = tuple[float, float, float, float, float, float]  # FH, TH, SH, SK, SA, HA
 
 LEFT, RIGHT = 0, 1

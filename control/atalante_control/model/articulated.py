@@ -10,6 +10,8 @@ import pinocchio
 
 from atalante_hal.robot import JOINTS
 
+GRAVITY = 9.81  # m/s2, magnitude of the gravitational acceleration; the default of Pinocchio
+
 
 class ArticulatedModel(NamedTuple):
     """Pinocchio model with the indices of `JOINTS` in its vectors."""
@@ -20,7 +22,7 @@ class ArticulatedModel(NamedTuple):
 
 
 def pinocchio_model(urdf_text: str, fixed_base: bool = True) -> ArticulatedModel:
-    """Build the Pinocchio model of a URDF from `urdf`, with gravity 9.81 m/s2 downwards.
+    """Build the Pinocchio model of a URDF from `urdf`, with gravity (`GRAVITY`) downwards.
 
     The joint order of Pinocchio can differ from `JOINTS`, so index its vectors only with `ArticulatedModel.q` and `.v`.
 

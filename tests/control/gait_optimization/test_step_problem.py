@@ -11,8 +11,8 @@ from atalante_control.gait.subject import Subject
 from atalante_control.gait_optimization.guess import guess
 from atalante_control.gait_optimization.nlp import Functions
 from atalante_control.gait_optimization.requirements import Requirements
-from atalante_control.gait_optimization.step_problem import GRAVITY, KINDS, StepProblem
-from atalante_control.model import Patient
+from atalante_control.gait_optimization.step_problem import KINDS, StepProblem
+from atalante_control.model import GRAVITY, Patient
 from atalante_hal.robot import JOINTS, load_robot
 
 ROBOT, REQUIREMENTS = load_robot(), Requirements()
