@@ -90,8 +90,12 @@ def _callees(function: FunctionType) -> Iterator[tuple[str, FunctionType]]:
 
 
 def _made_from(function: FunctionType) -> Iterator[bytes]:
-    """Yield the bytes on which the machine code of a function depends: code, constants, globals and callees."""
+    """Yield the bytes on which the machine code of a function depends: code, constants, records, globals and callees."""
     yield function.__qualname__.encode()
+    for name, annotation in function.__annotations__.items():
+        record = function.__globals__.get(annotation, annotation) if isinstance(annotation, str) else annotation
+        if fields := getattr(record, "_fields", None):  # a NamedTuple: the machine code finds its fields by position
+            yield f"{name}: {fields!r}".encode()
     yield function.__code__.co_code + repr(_constants(function.__code__)).encode()
     for name in dict.fromkeys(_names(function.__code__)):
         value = function.__globals__.get(name)

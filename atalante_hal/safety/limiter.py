@@ -33,6 +33,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -53,6 +54,21 @@ class Limited:
     clamped: bool  # the torque of at least one joint was cut
 
 
+class JointLimits(NamedTuple):
+    """Constant limits of all joints, for the compiled function `limit`.
+
+    The `Limiter` owns `step`; the `Robot` owns the other arrays.
+    """
+
+    step: Vector  # (12,) maximum change of the torque in one cycle [Nm]
+    position_min: Vector  # (12,) lowest position [rad]
+    position_max: Vector  # (12,) highest position [rad]
+    velocity_max: Vector  # (12,) highest velocity [rad/s]
+    look_ahead: float  # prediction time of the position [s]
+    position_margin: float  # distance beyond a position limit at which the torque is zero [rad]
+    velocity_margin: float  # excess over the highest velocity at which the torque is zero [rad/s]
+
+
 class Limiter:
     """Torque limiter of all joints, applied once per cycle.
 
@@ -67,10 +83,16 @@ class Limiter:
 
     def __init__(self, robot: Robot, period: float) -> None:
         self._torque_max = robot.torque_max
-        self._step = robot.torque_rate_max * period
-        self._envelope = np.array([robot.position_min, robot.position_max, robot.velocity_max])
         envelope = robot.envelope
-        self._margins = envelope.look_ahead, envelope.position_margin, envelope.velocity_margin
+        self._limits = JointLimits(
+            step=robot.torque_rate_max * period,
+            position_min=robot.position_min,
+            position_max=robot.position_max,
+            velocity_max=robot.velocity_max,
+            look_ahead=envelope.look_ahead,
+            position_margin=envelope.position_margin,
+            velocity_margin=envelope.velocity_margin,
+        )
         self.limit: Vector = robot.torque_max.copy()
         self.last: Vector = np.zeros(_COUNT)
         self.cut: npt.NDArray[np.bool_] = np.zeros(_COUNT, np.bool_)
@@ -92,8 +114,7 @@ class Limiter:
         """
         self._asked[:] = torque
         self._motion[:] = motion
-        inputs = self._asked, self._motion, self.last, self.limit, self._step, self._envelope
-        done = self._apply(*inputs, *self._margins, self.cut)
+        done = self._apply(self._asked, self._motion, self._limits, self.limit, self.last, self.cut)
         if done == _NOT_FINITE:
             return Limited(finite=False, clamped=False)
         self.saturated = self.saturated + 1 if done == _CUT else 0
@@ -125,13 +146,9 @@ _LIMITED = {_AS_ASKED: Limited(finite=True, clamped=False), _CUT: Limited(finite
 def limit(
     asked: Vector,
     motion: Vector,
-    last: Vector,
+    limits: JointLimits,
     torque_limit: Vector,
-    step: Vector,
-    envelope: Vector,
-    look_ahead: float,
-    position_margin: float,
-    velocity_margin: float,
+    last: Vector,
     cut: npt.NDArray[np.bool_],
 ) -> int:
     """Limit the torque of all joints by torque limit, envelope and rate, as described in the module docstring.
@@ -139,13 +156,9 @@ def limit(
     Args:
         asked: requested torque, shape (12,) [Nm].
         motion: position [rad] and velocity [rad/s], shape (2, 12).
+        limits: constant limits of the joints.
+        torque_limit: present torque limit, shape (12,) [Nm].
         last: torque sent in the last cycle, shape (12,) [Nm]; overwritten with the torque to be sent in this cycle.
-        torque_limit: torque limit, shape (12,) [Nm].
-        step: maximum change of the torque in one cycle, shape (12,) [Nm].
-        envelope: lowest position [rad], highest position [rad] and highest velocity [rad/s], shape (3, 12).
-        look_ahead: prediction time of the position [s].
-        position_margin: distance beyond a position limit at which the torque is zero [rad].
-        velocity_margin: excess over the highest velocity at which the torque is zero [rad/s].
         cut: True for each joint whose torque differs from the requested torque, shape (12,); overwritten.
 
     Returns:
@@ -156,17 +169,15 @@ def limit(
             return _NOT_FINITE
     done = _AS_ASKED
     for joint in range(len(asked)):
-        velocity, ahead = motion[1, joint], motion[0, joint] + look_ahead * motion[1, joint]
-        too_high, too_low = (
-            (ahead - envelope[1, joint]) / position_margin,
-            (envelope[0, joint] - ahead) / position_margin,
-        )
-        too_fast_up = (velocity - envelope[2, joint]) / velocity_margin
-        too_fast_down = (-velocity - envelope[2, joint]) / velocity_margin
+        velocity, ahead = motion[1, joint], motion[0, joint] + limits.look_ahead * motion[1, joint]
+        too_high = (ahead - limits.position_max[joint]) / limits.position_margin
+        too_low = (limits.position_min[joint] - ahead) / limits.position_margin
+        too_fast_up = (velocity - limits.velocity_max[joint]) / limits.velocity_margin
+        too_fast_down = (-velocity - limits.velocity_max[joint]) / limits.velocity_margin
         up = torque_limit[joint] * share(max(too_high, too_fast_up))
         down = torque_limit[joint] * share(max(too_low, too_fast_down))
         # If the limit falls below the torque of the last cycle, the torque approaches it at the rate limit.
-        lowest, highest = last[joint] - step[joint], last[joint] + step[joint]
+        lowest, highest = last[joint] - limits.step[joint], last[joint] + limits.step[joint]
         sent = min(max(asked[joint], within(-down, lowest, highest)), within(up, lowest, highest))
         cut[joint] = sent != asked[joint]
         if cut[joint]:

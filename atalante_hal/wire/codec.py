@@ -7,6 +7,7 @@ the payload. So a signal is decoded with one word, one shift, one mask, one addi
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +20,7 @@ Vector = npt.NDArray[np.float64]
 Words = npt.NDArray[np.int64]
 
 #: Rows of the plan, with one column per signal: payload word, shift, mask, largest code, range of codes, invalid code.
-WORD, PLACE, MASK, LARGEST, LOW, HIGH, INVALID = range(7)
+WORD, SHIFT, MASK, LARGEST, LOW, HIGH, INVALID = range(7)
 #: Rows of the scales, with one column per signal: value = (code + base) * factor + offset.
 BASE, FACTOR, OFFSET = range(3)
 #: Marker instead of an invalid code or a signal index: there is none.
@@ -29,6 +30,20 @@ INSIDE, OUTSIDE, SAYS_INVALID = range(3)
 #: Adding this number to a float64 and subtracting it again rounds the float to an integer.
 _ROUND = 1.5 * 2.0**52
 _LONGEST = 51  # largest signal length in bits that this rounding supports
+
+
+class SignalTable(NamedTuple):
+    """Coding of all signals of a codec, in the order of the decoded values, for the compiled functions of this module.
+
+    The codec owns the arrays. All are constant except `codes`, which every decoding and encoding overwrites.
+    """
+
+    plan: Words  # (7, size) position in the frames, mask and range of each signal; rows WORD to INVALID
+    scales: Vector  # (3, size) base, factor and offset of each signal; rows BASE to OFFSET
+    codes: Words  # (size,) raw code of each signal in the last decoding or encoding
+    words: Words  # (words with a signal,) indices of the 64-bit words that contain a signal
+    by_row: Words  # (size,) signal indices sorted by row: those of row r are by_row[row_begins[r] : row_begins[r + 1]]
+    row_begins: Words  # (rows + 1,) begin of each row in `by_row`
 
 
 def group_of(signal: str) -> str:
@@ -75,17 +90,18 @@ class Codec:
             code = s.offset / s.factor
             exact = code == round(code) and round(code) * s.factor == s.offset
             scales.append((code, s.factor, 0.0) if exact else (0.0, s.factor, s.offset))
-        #: Plan and scales of the compiled loops below, shapes (7, size) and (3, size).
-        self.plan: Words = np.array(plan, np.int64).T.copy()
-        self.scales: Vector = np.array(scales).T.copy()
-        #: Indices of the 64-bit words that contain a signal.
-        self.words: Words = np.unique(self.plan[WORD])
-        #: Raw code of each signal in the last `decode` or `encode`, shape (size,).
-        self.codes = np.zeros(self.size, np.int64)
+        plan_array: Words = np.array(plan, np.int64).T.copy()
+        by_row: Words = np.argsort(self.row_of, kind="stable").astype(np.int64)
+        #: Arrays that the compiled functions decode and encode with.
+        self.table = SignalTable(
+            plan=plan_array,
+            scales=np.array(scales).T.copy(),
+            codes=np.zeros(self.size, np.int64),
+            words=np.unique(plan_array[WORD]),
+            by_row=by_row,
+            row_begins=np.searchsorted(self.row_of[by_row], np.arange(len(self.messages) + 1)),
+        )
         self._decode, self._encode = compiled(decode), compiled(encode)
-        #: Signal indices of row r in the decoded values: signals_by_row[row_begins[r] : row_begins[r + 1]].
-        self.signals_by_row: Words = np.argsort(self.row_of, kind="stable").astype(np.int64)
-        self.row_begins: Words = np.searchsorted(self.row_of[self.signals_by_row], np.arange(len(self.messages) + 1))
 
     def index(self, message: str, signal: str) -> int:
         """Return the index of one signal in the decoded values.
@@ -134,11 +150,12 @@ class Codec:
         Returns:
             Whether every signal is inside its DBC range; an invalid code is outside.
         """
-        return self._decode(frames.view(np.int64), self.plan, self.scales, self.codes, out)
+        return self._decode(frames.view(np.int64), self.table, out)
 
     def rows_outside(self) -> list[int]:
         """Return the rows that had a signal outside its range in the last `decode`."""
-        outside = (self.codes < self.plan[LOW]) | (self.codes > self.plan[HIGH])
+        codes, plan = self.table.codes, self.table.plan
+        outside = (codes < plan[LOW]) | (codes > plan[HIGH])
         return sorted(set(self.row_of[outside].tolist()))
 
     def encode(self, values: Vector, frames: Frames) -> None:
@@ -153,8 +170,7 @@ class Codec:
         Raises:
             ValueError: If the value of a signal without an invalid code is NaN.
         """
-        words = frames.view(np.int64)
-        self.require_code(self._encode(values, self.plan, self.scales, self.words, self.codes, words))
+        self.require_code(self._encode(values, self.table, frames.view(np.int64)))
 
     def require_code(self, nameless: int) -> None:
         """Raise an error if the function `encode` returned the index of a signal that it could not encode.
@@ -170,40 +186,38 @@ class Codec:
             raise ValueError(f"{message.name}.{signal.name} is NaN and has no invalid code in the DBC")
 
 
-def decode(words: Words, plan: Words, scales: Vector, codes: Words, values: Vector) -> bool:
+def decode(words: Words, table: SignalTable, values: Vector) -> bool:
     """Decode raw codes and physical values of all signals.
 
     Args:
         words: frames as a flat array of 64-bit words, shape (rows * 9,).
-        plan: decoding plan of the codec, shape (7, size).
-        scales: scales of the codec, shape (3, size).
-        codes: output for the raw codes, shape (size,).
+        table: signals of the codec; `codes` is overwritten.
         values: output for the physical values, shape (size,), in DBC units.
 
     Returns:
         Whether every code is in its range.
     """
-    inside = read_codes(words, plan, codes)
-    scale(codes, scales, values)
+    inside = read_codes(words, table)
+    scale(table, values)
     return inside
 
 
-def read_codes(words: Words, plan: Words, codes: Words) -> bool:
+def read_codes(words: Words, table: SignalTable) -> bool:
     """Read the raw codes of all signals. This is the first step of `decode`.
 
     Args:
         words: frames as a flat array of 64-bit words, shape (rows * 9,).
-        plan: decoding plan of the codec, shape (7, size).
-        codes: output for the raw codes, shape (size,).
+        table: signals of the codec; `codes` is overwritten.
 
     Returns:
         Whether every code is in its range.
     """
-    word, place, mask, largest = plan[WORD], plan[PLACE], plan[MASK], plan[LARGEST]
+    plan, codes = table.plan, table.codes
+    word, shift, mask, largest = plan[WORD], plan[SHIFT], plan[MASK], plan[LARGEST]
     low, high = plan[LOW], plan[HIGH]
     inside = True
     for i in range(len(codes)):
-        code = codes[i] = signed(words[word[i]] >> place[i] & mask[i], mask[i], largest[i])
+        code = codes[i] = signed(words[word[i]] >> shift[i] & mask[i], mask[i], largest[i])
         inside &= low[i] <= code <= high[i]
     return inside
 
@@ -219,36 +233,36 @@ def signed(raw: int, mask: int, largest: int) -> int:
     return raw - mask - 1 if raw > largest else raw
 
 
-def scale(codes: Words, scales: Vector, values: Vector) -> None:
+def scale(table: SignalTable, values: Vector) -> None:
     """Convert the raw codes of all signals to physical values. This is the second step of `decode`.
 
     Args:
-        codes: raw codes, shape (size,).
-        scales: scales of the codec, shape (3, size).
+        table: signals of the codec, with their raw codes.
         values: output for the physical values, shape (size,), in DBC units.
     """
+    codes, scales = table.codes, table.scales
     base, factor, offset = scales[BASE], scales[FACTOR], scales[OFFSET]
     for i in range(len(codes)):
         values[i] = (codes[i] + base[i]) * factor[i] + offset[i]
 
 
-def read_row(words: Words, behind: int, signals: Words, plan: Words, codes: Words) -> int:
+def read_row(words: Words, offset: int, row: int, table: SignalTable) -> int:
     """Read the raw codes of one frame, as `read_codes` does for all frames.
 
     Args:
         words: frames as a flat array of 64-bit words.
-        behind: offset of the frame from its row in the plan [words].
-        signals: indices of the signals of the row in the decoded values.
-        plan: decoding plan of the codec, shape (7, size).
-        codes: output for the raw codes, shape (size,); only those of the row are written.
+        offset: offset of the frame from its row in the plan [words].
+        row: row of the message of the frame.
+        table: signals of the codec; the entries of the row in `codes` are overwritten.
 
     Returns:
         `INSIDE` if all codes are in range, `SAYS_INVALID` if a code is out of range and a signal has its invalid code, otherwise
         `OUTSIDE`.
     """
+    plan, codes = table.plan, table.codes
     inside, invalid = True, False
-    for i in signals:
-        raw = words[plan[WORD, i] + behind] >> plan[PLACE, i] & plan[MASK, i]
+    for i in table.by_row[table.row_begins[row] : table.row_begins[row + 1]]:
+        raw = words[plan[WORD, i] + offset] >> plan[SHIFT, i] & plan[MASK, i]
         invalid |= raw == plan[INVALID, i]
         code = codes[i] = signed(raw, plan[MASK, i], plan[LARGEST, i])
         inside &= plan[LOW, i] <= code <= plan[HIGH, i]
@@ -257,36 +271,35 @@ def read_row(words: Words, behind: int, signals: Words, plan: Words, codes: Word
     return SAYS_INVALID if invalid else OUTSIDE
 
 
-def scale_row(codes: Words, signals: Words, scales: Vector, values: Vector) -> None:
-    """Convert the raw codes of selected signals to physical values, as `scale` does for all signals.
+def scale_row(row: int, table: SignalTable, values: Vector) -> None:
+    """Convert the raw codes of one row to physical values, as `scale` does for all signals.
 
     Args:
-        codes: raw codes, shape (size,).
-        signals: indices of the signals in the decoded values.
-        scales: scales of the codec, shape (3, size).
-        values: output for the physical values, shape (size,), in DBC units; only those of `signals` are written.
+        row: row of the message.
+        table: signals of the codec, with the raw codes of the row.
+        values: output for the physical values, shape (size,), in DBC units; only those of the row are written.
     """
-    for i in signals:
+    codes, scales = table.codes, table.scales
+    for i in table.by_row[table.row_begins[row] : table.row_begins[row + 1]]:
         values[i] = (codes[i] + scales[BASE, i]) * scales[FACTOR, i] + scales[OFFSET, i]
 
 
-def encode(values: Vector, plan: Words, scales: Vector, targets: Words, codes: Words, words: Words) -> int:
+def encode(values: Vector, table: SignalTable, words: Words) -> int:
     """Encode physical values into the payload words.
 
     A value outside its range is encoded as the nearest valid code, and NaN as the invalid code of its signal.
 
     Args:
         values: physical values, shape (size,), in DBC units.
-        plan: decoding plan of the codec, shape (7, size).
-        scales: scales of the codec, shape (3, size).
-        targets: indices of the words that contain a signal; their other bits become 0.
-        codes: output for the raw codes, shape (size,).
-        words: frames as a flat array of 64-bit words, shape (rows * 9,); overwritten.
+        table: signals of the codec; `codes` is overwritten.
+        words: frames as a flat array of 64-bit words, shape (rows * 9,). The words that contain a signal are overwritten; their
+            bits without a signal become 0.
 
     Returns:
         `NO_CODE` if all values were encoded; otherwise the index of a signal that is NaN and has no invalid code. In that case no
         word is written.
     """
+    plan, scales, codes = table.plan, table.scales, table.codes
     base, factor, offset = scales[BASE], scales[FACTOR], scales[OFFSET]
     low, high, invalid = plan[LOW], plan[HIGH], plan[INVALID]
     for i in range(len(codes)):
@@ -302,9 +315,9 @@ def encode(values: Vector, plan: Words, scales: Vector, targets: Words, codes: W
             return i
         else:
             codes[i] = invalid[i]
-    for target in targets:
-        words[target] = 0
-    word, place, mask = plan[WORD], plan[PLACE], plan[MASK]
+    for i in table.words:
+        words[i] = 0
+    word, shift, mask = plan[WORD], plan[SHIFT], plan[MASK]
     for i in range(len(codes)):
-        words[word[i]] |= (codes[i] & mask[i]) << place[i]
+        words[word[i]] |= (codes[i] & mask[i]) << shift[i]
     return NO_CODE

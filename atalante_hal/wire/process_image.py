@@ -8,6 +8,7 @@ and signal ranges are correct. Otherwise the message keeps its values, its age g
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +20,7 @@ from atalante_hal.wire.codec import (
     NO_CODE,
     SAYS_INVALID,
     Codec,
+    SignalTable,
     Vector,
     Words,
     encode,
@@ -58,6 +60,29 @@ LATEST = 16
 _HALF_TURN = 128
 
 
+class E2EState(NamedTuple):
+    """E2E check of the rows of a process image: the expected format of each row, and the state of its frame sequence.
+
+    The `ReceiveImage` owns the arrays. `headers` and `spans` are constant; the others change with every accepted frame.
+    """
+
+    headers: Words  # (rows,) header word of the message: identifier, length and flags
+    spans: Words  # (rows, 3) begin and end of the payload [bytes] and Data ID, see `e2e.protected_spans`
+    expected: Words  # (rows,) expected counter of the next frame; `NOTHING` before the first frame
+    silent: Words  # (rows,) cycles since the expected counter last changed
+    kept: Octets  # (rows * 72,) last frame with correct format, CRC and sequence
+
+
+class RowStatus(NamedTuple):
+    """Result of the check of each row of a process image in this cycle.
+
+    The arrays are those of the `ReceiveImage`.
+    """
+
+    age: Words  # (rows,) age of the values [cycles]
+    check: Octets  # (rows,) value of `Check`
+
+
 class ReceiveImage:
     """Process image of received messages, with the values of all signals, and check result and age of each row.
 
@@ -87,15 +112,16 @@ class ReceiveImage:
         self._restarts = restarts
         #: Last frame of each row with correct format, CRC and sequence, shape (rows,).
         self.frames = self.codec.template()
-        self._kept: Octets = self.frames.view(np.uint8)
-        self._headers: Words = as_words(self.frames)[:, 0].astype(np.int64)
-        self._expected_headers = self._headers.tobytes()
+        self._e2e = E2EState(
+            headers=as_words(self.frames)[:, 0].astype(np.int64),
+            spans=protected_spans(self.codec.messages),
+            expected=np.full(count, NOTHING),
+            silent=np.zeros(count, np.int64),
+            kept=self.frames.view(np.uint8),
+        )
+        self._status = RowStatus(self.age, self.check)
+        self._expected_headers = self._e2e.headers.tobytes()
         self.frame_ids = {message.frame_id: row for row, message in enumerate(self.codec.messages)}
-        self._spans = protected_spans(self.codec.messages)
-        #: Expected counter of the next frame of each row, shape (rows,).
-        self._expected: Words = np.full(count, NOTHING)
-        #: Cycles since the expected counter of each row last changed, shape (rows,).
-        self._silent: Words = np.zeros(count, np.int64)
         #: Values before the last `accept`, shape (codec.size,).
         self.values_before = self.values.copy()
         self._age_before: npt.NDArray[np.int64] = self.age.copy()
@@ -118,7 +144,7 @@ class ReceiveImage:
         """
         self.all_fresh = False
         self.age += elapsed
-        self._silent += elapsed
+        self._e2e.silent[:] += elapsed
         self.check.fill(Check.NO_DATA)
         self.refused = []
 
@@ -133,7 +159,7 @@ class ReceiveImage:
         Returns:
             Indices in `frames` of the frames that are not messages of this process image.
         """
-        rows = len(self._headers)
+        rows = len(self.check)
         row_of = self.frame_ids
         self._was_fresh = self.all_fresh
         if not self._was_fresh:
@@ -172,7 +198,7 @@ class ReceiveImage:
             frames: receive buffer.
             count: number of received frames at the start of the buffer.
         """
-        return count >= len(self._headers) and self._received_in(frames).headers.tobytes() == self._expected_headers
+        return count >= len(self.check) and self._received_in(frames).headers.tobytes() == self._expected_headers
 
     def expected_ids(self) -> set[int]:
         """Return the identifiers of the messages that have not timed out, by the timeout in the DBC."""
@@ -181,7 +207,7 @@ class ReceiveImage:
 
     def _received_in(self, frames: Frames) -> _Received:
         if self._received.frames is not frames:
-            self._received = _Received(frames, len(self._headers))
+            self._received = _Received(frames, len(self.check))
         return self._received
 
     def _accept(self, received: _Received, tag: int | None) -> bool:
@@ -194,25 +220,15 @@ class ReceiveImage:
         Returns:
             Whether the cycle was perfect; if not, nothing is changed.
         """
+        cycle_tag = _NO_TAG if tag is None else tag
         if not self._accept_exact(
-            received.words,
-            received.octets,
-            self._headers,
-            self._spans,
-            self._expected,
-            _NO_TAG if tag is None else tag,
-            self.codec.plan,
-            self.codec.scales,
-            self.codec.codes,
-            self.values,
-            self.values_before,
-            self._kept,
+            received.words, self._e2e, cycle_tag, self.codec.table, self.values, self.values_before
         ):
             return False
         self._offered = None
         if not self.all_fresh:
             self.age.fill(0)
-            self._silent.fill(0)
+            self._e2e.silent.fill(0)
             self.check.fill(Check.OK)
             self.refused = []
             self.all_fresh = True
@@ -231,26 +247,15 @@ class ReceiveImage:
         """
         self.values_before[:] = self.values
         found: Words = np.full((count, 2), _FOREIGN)
-        codec = self.codec
         self._accept_frames(
             frames.view(np.int64),
-            frames.view(np.uint8),
             found,
-            self._headers,
-            self._spans,
-            self._expected,
-            self._silent,
+            self._e2e,
             _NO_TAG if tag is None else tag,
             self._restarts,
-            codec.plan,
-            codec.scales,
-            codec.signals_by_row,
-            codec.row_begins,
-            codec.codes,
+            self.codec.table,
             self.values,
-            self.age,
-            self.check,
-            self._kept,
+            self._status,
         )
         self._offered = frames, found
         foreign = []
@@ -285,11 +290,12 @@ class ReceiveImage:
             if place != committed and check not in _SAYS_NOTHING_NEW
         ]
 
-    def _decoded(self, frames: Frames, place: int, row: int) -> Vector:
-        codec, codes, values = self.codec, np.zeros_like(self.codec.codes), self.values.copy()
-        signals = codec.signals_by_row[codec.row_begins[row] : codec.row_begins[row + 1]]
-        read_row(frames.view(np.int64), (place - row) * WORDS, signals, codec.plan, codes)
-        scale_row(codes, signals, codec.scales, values)
+    def _decoded(self, frames: Frames, index: int, row: int) -> Vector:
+        """Return a copy of `values` with the signals of a row taken from frame `index` of the receive buffer."""
+        table = self.codec.table._replace(codes=np.zeros_like(self.codec.table.codes))
+        values = self.values.copy()
+        read_row(frames.view(np.int64), (index - row) * WORDS, row, table)
+        scale_row(row, table, values)
         return values
 
 
@@ -305,51 +311,34 @@ class _Received:
         self.frames = frames
         head = frames[:rows]
         self.words: Words = head.view(np.int64)
-        self.octets: Octets = head.view(np.uint8)
         self.headers = as_words(head)[:, 0]
 
 
 def accept_exact(
-    words: Words,
-    octets: Octets,
-    headers: Words,
-    spans: Words,
-    expected: Words,
-    tag: int,
-    plan: Words,
-    scales: Vector,
-    codes: Words,
-    values: Vector,
-    values_before: Vector,
-    kept: Octets,
+    words: Words, e2e: E2EState, tag: int, table: SignalTable, values: Vector, values_before: Vector
 ) -> bool:
     """Commit all rows if the frames are exactly the expected messages: in order, intact, in sequence, in range and of this cycle.
 
     Args:
         words: received frames as a flat array of 64-bit words, shape (rows * 9,).
-        octets: received frames as a flat array of bytes, shape (rows * 72,).
-        headers: header word of each message, shape (rows,).
-        spans: result of `e2e.protected_spans`, shape (rows, 3).
-        expected: expected counter of each row, shape (rows,); advanced by 1.
+        e2e: expected format and sequence of each row; the expected counters are advanced by 1, and the frames are kept.
         tag: counter that all frames must have, or `_NO_TAG`.
-        plan: decoding plan of the codec, shape (7, size).
-        scales: scales of the codec, shape (3, size).
-        codes: output for the raw codes, shape (size,).
+        table: signals of the codec; `codes` is overwritten.
         values: decoded values, shape (size,), in DBC units; overwritten with the new values.
         values_before: output for the previous values, shape (size,).
-        kept: last accepted frames as bytes, shape (rows * 72,); overwritten.
 
     Returns:
-        Whether the frames were committed; if not, nothing is changed except `codes`.
+        Whether the frames were committed; if not, nothing is changed except `table.codes`.
     """
+    octets, headers, expected = words.view(np.uint8), e2e.headers, e2e.expected
     for row in range(len(headers)):
         if words[row * WORDS] != headers[row] or (tag != _NO_TAG and expected[row] != tag):
             return False
-    if not (intact(octets, spans, expected) and read_codes(words, plan, codes)):
+    if not (intact(octets, e2e.spans, expected) and read_codes(words, table)):
         return False
     values_before[:] = values
-    scale(codes, scales, values)
-    kept[:] = octets
+    scale(table, values)
+    e2e.kept[:] = octets
     for row in range(len(headers)):
         expected[row] = expected[row] + 1 & 0xFF
     return True
@@ -357,64 +346,44 @@ def accept_exact(
 
 def accept_frames(
     words: Words,
-    octets: Octets,
     found: Words,
-    headers: Words,
-    spans: Words,
-    expected: Words,
-    silent: Words,
+    e2e: E2EState,
     tag: int,
     restarts: bool,
-    plan: Words,
-    scales: Vector,
-    signals_by_row: Words,
-    row_begins: Words,
-    codes: Words,
+    table: SignalTable,
     values: Vector,
-    age: Words,
-    check: Octets,
-    kept: Octets,
+    status: RowStatus,
 ) -> None:
     """Check frames one by one in order of arrival, and commit the good ones.
 
     Args:
         words: received frames as a flat array of 64-bit words, shape (at least count * 9,).
-        octets: received frames as a flat array of bytes, shape (at least count * 72,).
         found: output for the row of each frame, or `_FOREIGN`, and its `Check`, shape (count, 2).
-        headers: header word of each message, shape (rows,).
-        spans: result of `e2e.protected_spans`, shape (rows, 3).
-        expected: expected counter of each row, or `NOTHING`, shape (rows,); updated.
-        silent: cycles since the expected counter of each row last changed, shape (rows,); updated.
+        e2e: expected format and sequence of each row; the sequence is updated with each accepted frame.
         tag: expected counter of all frames in this cycle, or `_NO_TAG`.
         restarts: True if a sender may restart at any counter.
-        plan: decoding plan of the codec, shape (7, size).
-        scales: scales of the codec, shape (3, size).
-        signals_by_row: signal indices sorted by row, shape (size,).
-        row_begins: begin of each row in `signals_by_row`, shape (rows + 1,).
-        codes: raw codes, shape (size,); updated.
+        table: signals of the codec; `codes` is updated.
         values: decoded values, shape (size,), in DBC units; updated.
-        age: age of each row [cycles], shape (rows,); updated.
-        check: `Check` of each row, shape (rows,); updated.
-        kept: last accepted frames as bytes, shape (rows * 72,); updated.
+        status: age and check result of each row; updated.
     """
-    for place in range(len(found)):
-        first = place * WORDS
-        row = row_of(words[first], headers)
-        found[place, 0] = row
+    octets, age, check = words.view(np.uint8), status.age, status.check
+    for index in range(len(found)):
+        first = index * WORDS
+        row = row_of(words[first], e2e.headers)
+        found[index, 0] = row
         if row == _FOREIGN:
             continue
-        behind = (place - row) * FRAME_BYTES
-        result = judge_frame(words, octets, row, behind, headers, spans, expected, silent, tag, restarts, kept)
+        offset = (index - row) * FRAME_BYTES
+        result = judge_frame(words, row, offset, e2e, tag, restarts)
         new = result <= _FRESH or (restarts and result == _CONFLICT)
-        signals = signals_by_row[row_begins[row] : row_begins[row + 1]]
         if new:
-            said = read_row(words, first - row * WORDS, signals, plan, codes)
-            if said != INSIDE:
-                new, result = False, _INVALID if said == SAYS_INVALID else _RANGE
-        found[place, 1] = result
+            coding = read_row(words, first - row * WORDS, row, table)
+            if coding != INSIDE:
+                new, result = False, _INVALID if coding == SAYS_INVALID else _RANGE
+        found[index, 1] = result
         if new:
-            scale_row(codes, signals, scales, values)
-            counter = int(octets[spans[row, 0] + behind + COUNTER_BYTE])
+            scale_row(row, table, values)
+            counter = int(octets[e2e.spans[row, 0] + offset + COUNTER_BYTE])
             age[row] = 0 if tag == _NO_TAG else tag - counter & 0xFF
             check[row] = min(result, _SOME_LOST)
         elif check[row] > _FRESH:
@@ -434,40 +403,25 @@ def row_of(header: int, headers: Words) -> int:
     return _FOREIGN
 
 
-def judge_frame(
-    words: Words,
-    octets: Octets,
-    row: int,
-    behind: int,
-    headers: Words,
-    spans: Words,
-    expected: Words,
-    silent: Words,
-    tag: int,
-    restarts: bool,
-    kept: Octets,
-) -> int:
+def judge_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int, restarts: bool) -> int:
     """Check format, CRC and counter of a frame.
 
-    If the counter is accepted, the expected counter is updated and the frame is copied to `kept`.
+    If the counter is accepted, the expected counter is updated and the frame is kept.
 
     Args:
         words: received frames as a flat array of 64-bit words.
-        octets: received frames as a flat array of bytes.
         row: row of the message of the frame.
-        behind: offset of the frame from its row in the frame array [bytes].
-        headers: header word of each message, shape (rows,).
-        spans: result of `e2e.protected_spans`, shape (rows, 3).
-        expected: expected counter of each row, or `NOTHING`, shape (rows,); updated.
-        silent: cycles since the expected counter of each row last changed, shape (rows,); updated.
+        offset: offset of the frame from its row in the frame array [bytes].
+        e2e: expected format and sequence of each row; the sequence is updated if the counter is accepted.
         tag: expected counter of all frames in this cycle, or `_NO_TAG`.
         restarts: True if a sender may restart at any counter.
-        kept: last accepted frames as bytes, shape (rows * 72,); updated.
 
     Returns:
         Value of `Check` as a plain integer.
     """
-    begin, end, data_id = spans[row, 0] + behind, spans[row, 1] + behind, spans[row, 2]
+    octets, headers, spans = words.view(np.uint8), e2e.headers, e2e.spans
+    expected, silent, kept = e2e.expected, e2e.silent, e2e.kept
+    begin, end, data_id = spans[row, 0] + offset, spans[row, 1] + offset, spans[row, 2]
     if words[(begin - HEADER_BYTES) // 8] != headers[row]:
         return _LENGTH
     crc = checksum(octets, begin, end, data_id)
@@ -495,7 +449,7 @@ def judge_frame(
             return _WRONG_SEQUENCE
     expected[row], silent[row] = counter + 1 & 0xFF, 0
     head = row * FRAME_BYTES
-    kept[head : head + FRAME_BYTES] = octets[head + behind : head + behind + FRAME_BYTES]
+    kept[head : head + FRAME_BYTES] = octets[head + offset : head + offset + FRAME_BYTES]
     return _SOME_LOST if result == _WRONG_SEQUENCE and restarts else result
 
 
@@ -534,20 +488,10 @@ class TransmitImage:
             ValueError: If the value of a signal without an invalid code is NaN.
         """
         codec = self.codec
-        nameless = self._seal(
-            self.values,
-            codec.plan,
-            codec.scales,
-            codec.words,
-            codec.codes,
-            self._words,
-            self._octets,
-            self._spans,
-            self._counters,
-            _NO_TAG if counter is None else counter,
-        )
-        if nameless != NO_CODE:
-            codec.require_code(nameless)
+        tag = _NO_TAG if counter is None else counter
+        unencodable = self._seal(self.values, codec.table, self._words, self._spans, self._counters, tag)
+        if unencodable != NO_CODE:
+            codec.require_code(unencodable)
         return self.frames
 
     @property
@@ -598,28 +542,13 @@ class TransmitImage:
         self._counters[row] = counter
 
 
-def seal(
-    values: Vector,
-    plan: Words,
-    scales: Vector,
-    targets: Words,
-    codes: Words,
-    words: Words,
-    octets: Octets,
-    spans: Words,
-    counters: Words,
-    counter: int,
-) -> int:
+def seal(values: Vector, table: SignalTable, words: Words, spans: Words, counters: Words, counter: int) -> int:
     """Encode the values and protect every row with counter and CRC.
 
     Args:
         values: physical values, shape (size,), in DBC units.
-        plan: decoding plan of the codec, shape (7, size).
-        scales: scales of the codec, shape (3, size).
-        targets: indices of the words that contain a signal.
-        codes: output for the raw codes, shape (size,).
+        table: signals of the codec; `codes` is overwritten.
         words: frames as a flat array of 64-bit words, shape (rows * 9,); overwritten.
-        octets: the same frames as a flat array of bytes, shape (rows * 72,); overwritten.
         spans: result of `e2e.protected_spans`, shape (rows, 3).
         counters: last counter of each row, shape (rows,); updated.
         counter: new counter of every row, or `_NO_TAG` for the last counter of each row plus 1.
@@ -627,9 +556,9 @@ def seal(
     Returns:
         `NO_CODE`, or the index of a signal that could not be encoded, as from `codec.encode`. In that case no frame is changed.
     """
-    nameless = encode(values, plan, scales, targets, codes, words)
-    if nameless == NO_CODE:
+    unencodable = encode(values, table, words)
+    if unencodable == NO_CODE:
         for row in range(len(counters)):
             counters[row] = counters[row] + 1 & 0xFF if counter == _NO_TAG else counter
-        protect(octets, spans, counters)
-    return nameless
+        protect(words.view(np.uint8), spans, counters)
+    return unencodable

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import FunctionType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -101,6 +101,28 @@ def test_the_cache_notices_every_change(changed: FunctionType, monkeypatch: pyte
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert module._folder(total) != module._folder(changed)  # type: ignore[arg-type]
     assert module._folder(total) == module._folder(_changed(total))  # type: ignore[arg-type]
+
+
+class _Bounds(NamedTuple):
+    low: float
+    high: float
+
+
+class _Reversed(NamedTuple):
+    high: float
+    low: float
+
+
+def _span(bounds: _Bounds) -> float:
+    return bounds.high - bounds.low
+
+
+def test_the_cache_notices_another_order_of_record_fields(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    reordered = _changed(_span, _Bounds=_Reversed)
+    reordered.__annotations__ = _span.__annotations__
+    assert module._folder(_span) != module._folder(reordered)  # type: ignore[arg-type]
+    assert compiled(_span)(_Bounds(1.0, 3.0)) == 2.0
 
 
 def test_tells_what_takes_long(

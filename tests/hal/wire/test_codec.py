@@ -173,9 +173,8 @@ def test_unknown_names_are_answered_with_the_valid_ones():
         codec.slice("Angle")
 
 
-def read_one(codec: Codec, row: int, frames, behind: int = 0) -> int:
-    signals = codec.signals_by_row[codec.row_begins[row] : codec.row_begins[row + 1]]
-    return read_row(frames.view(np.int64), behind, signals, codec.plan, codec.codes)
+def read_one(codec: Codec, row: int, frames, offset: int = 0) -> int:
+    return read_row(frames.view(np.int64), offset, row, codec.table)
 
 
 def test_an_invalid_code_is_told_from_a_value_outside_its_range():
@@ -199,17 +198,16 @@ def test_a_row_alone_is_decoded_like_all_of_them_and_nothing_else_is_touched():
     frames, whole = codec.template(), np.zeros(codec.size)
     codec.encode(rng.uniform(low, high), frames)
     assert codec.decode(frames, whole)
-    codes = codec.codes.copy()
+    codes = codec.table.codes.copy()
     shuffled = rng.permutation(len(MESSAGES))
     alone = frames[shuffled].copy()
     for place, row in enumerate(shuffled.tolist()):
-        codec.codes.fill(-7)
+        codec.table.codes.fill(-7)
         values = np.full(codec.size, np.nan)
-        signals = codec.signals_by_row[codec.row_begins[row] : codec.row_begins[row + 1]]
         assert read_one(codec, row, alone, (place - row) * WORDS) == INSIDE
-        scale_row(codec.codes, signals, codec.scales, values)
+        scale_row(row, codec.table, values)
         mine = codec.row_of == row
         assert np.array_equal(values[mine], whole[mine])
-        assert np.array_equal(codec.codes[mine], codes[mine])
+        assert np.array_equal(codec.table.codes[mine], codes[mine])
         assert np.isnan(values[~mine]).all()
-        assert (codec.codes[~mine] == -7).all()
+        assert (codec.table.codes[~mine] == -7).all()
