@@ -12,8 +12,9 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
@@ -97,6 +98,7 @@ def _made_from(function: FunctionType) -> Iterator[bytes]:
         if fields := getattr(record, "_fields", None):  # a NamedTuple: the machine code finds its fields by position
             yield f"{name}: {fields!r}".encode()
     yield function.__code__.co_code + repr(_constants(function.__code__)).encode()
+    yield from _records(function.__annotations__, function.__globals__)
     for name in dict.fromkeys(_names(function.__code__)):
         value = function.__globals__.get(name)
         if isinstance(value, FunctionType):
@@ -105,6 +107,15 @@ def _made_from(function: FunctionType) -> Iterator[bytes]:
             yield value.tobytes()
         elif name in function.__globals__ and not isinstance(value, ModuleType | type):
             yield f"{name}={value!r}".encode()
+
+
+def _records(annotations: Mapping[str, Any], names: Mapping[str, Any]) -> Iterator[bytes]:
+    """Yield the fields of every `NamedTuple` in the annotations; numba's cache compares its name and types only."""
+    for name in dict.fromkeys(re.findall(r"\w+", " ".join(map(str, annotations.values())))):
+        record = names.get(name)
+        if isinstance(record, type) and issubclass(record, tuple) and hasattr(record, "_fields"):
+            yield f"{record.__qualname__}{record._fields}".encode()
+            yield from _records(record.__annotations__, vars(sys.modules[record.__module__]))
 
 
 def _constants(code: CodeType) -> tuple[Any, ...]:

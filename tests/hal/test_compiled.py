@@ -159,6 +159,42 @@ def test_a_second_process_finds_it_in_the_cache(tmp_path: Path) -> None:
     assert hits == ["0", "1"]
 
 
+RECORD = """
+from typing import NamedTuple
+import numpy as np
+class Inner(NamedTuple):
+    {fields}: float
+class Outer(NamedTuple):
+    inner: Inner
+    values: np.ndarray
+"""
+KERNEL = """
+from record import Outer
+def first(outer: Outer) -> float:
+    return outer.inner.a
+"""
+
+
+@pytest.mark.parametrize("future", ["", "from __future__ import annotations\n"], ids=["types", "texts"])
+def test_reordered_fields_of_a_record_are_compiled_again(tmp_path: Path, future: str) -> None:
+    script = (
+        "from atalante_hal.compiled import compiled; import kernel, record, numpy\n"
+        "print(compiled(kernel.first)(record.Outer(record.Inner(a=1.0, b=2.0), numpy.zeros(2))))"
+    )
+    (tmp_path / "kernel.py").write_text(future + KERNEL)
+    for fields in ("a: float\n    b", "b: float\n    a"):
+        (tmp_path / "record.py").write_text(future + RECORD.format(fields=fields))
+        result = subprocess.run(
+            [sys.executable, "-B", "-c", script],
+            cwd=tmp_path,
+            env={"XDG_CACHE_HOME": str(tmp_path), "PATH": "/usr/bin:/bin"},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert result.stdout.strip() == "1.0"
+
+
 def test_machine_code_is_the_same_for_every_machine() -> None:
     import numba
 
