@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 _PLAUSIBILITY = ("finding", "encoders", "imus", "legs", "feet", "stillness", "unchecked", "plausibility")
+_PLAUSIBILITY_TESTS = ("encoders", "imus", "legs", "feet", "stillness", "plausibility", "ridden_through")
 #: The safety core: files that are judged together, and the tests that have to notice a change of them.
 CORE = {
     "e2e": (("atalante_hal/wire/e2e.py",), ("hal/wire/test_e2e.py", "hal/wire/test_process_image.py")),
@@ -13,7 +14,7 @@ CORE = {
     ),
     "plausibility": (
         tuple(f"atalante_hal/safety/plausibility/{name}.py" for name in _PLAUSIBILITY),
-        ("hal/safety/plausibility/test_plausibility.py", "hal/safety/plausibility/test_ridden_through.py"),
+        tuple(f"hal/safety/plausibility/test_{name}.py" for name in _PLAUSIBILITY_TESTS),
     ),
     "heartbeats": (("atalante_hal/safety/heartbeats.py",), ("hal/safety/test_heartbeats.py",)),
     "transceiver": (("atalante_hal/transceiver.py",), ("hal/test_transceiver.py",)),

@@ -47,7 +47,7 @@ PLUGINS = (
 PYPROJECT = """
 [tool.pytest.ini_options]
 testpaths = ["tests"]
-pythonpath = ["tests/fuzz", "tests/witness"]
+pythonpath = ["tests/fuzz", "tests/witness", "tests/hal/safety/plausibility"]
 addopts = "-q --strict-markers --import-mode=importlib --hypothesis-profile=mutation -m 'not exhaustive' {plugins}"
 markers = ["exhaustive"]
 
