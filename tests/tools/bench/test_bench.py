@@ -1,4 +1,4 @@
-"""Tests of `atalante bench`: output format, and the error for a benchmark without work. No time is asserted."""
+"""Tests of `atalante bench`: output format, and the error of an invalid benchmark. No time is asserted."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from atalante_tools import bench
 from atalante_tools.bench import catalogue, wire
 from atalante_tools.bench.catalogue import BENCHMARKS, Benchmark
-from atalante_tools.bench.measure import Effort, Measurement, WorkError, require, timed
+from atalante_tools.bench.measure import BenchmarkError, Effort, Measurement, require, timed
 from atalante_tools.cli import cli
 
 KEYS = ["name", "value", "unit", "baseline", "baseline_value", "ratio"]
@@ -100,7 +100,7 @@ def test_without_a_compiler_the_values_are_null(monkeypatch: pytest.MonkeyPatch)
 @pytest.fixture
 def idle(monkeypatch: pytest.MonkeyPatch) -> None:
     def run(_effort: Effort) -> Measurement:
-        raise WorkError("nothing was done")
+        raise BenchmarkError("nothing was done")
 
     monkeypatch.setattr(catalogue, "BENCHMARKS", (replace(BENCHMARKS[0], run=run),))
 
@@ -109,7 +109,7 @@ def idle(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_benchmark_without_work_exits_with_1() -> None:
     result = CliRunner().invoke(cli, ["bench", "hal_cycle"])
     assert result.exit_code == 1
-    assert "hal_cycle did not do its work: nothing was done" in result.stderr
+    assert "the benchmark hal_cycle is invalid: nothing was done" in result.stderr
     assert result.stdout == ""
 
 
@@ -134,5 +134,5 @@ def test_timed_block_runs_the_given_number_of_times() -> None:
 
 def test_require_raises_its_message() -> None:
     require(True, "fine")
-    with pytest.raises(WorkError, match="the robot fell"):
+    with pytest.raises(BenchmarkError, match="the robot fell"):
         require(False, "the robot fell")

@@ -1,4 +1,4 @@
-"""Command `atalante bench`: run the benchmarks, each beside a baseline measured in the same run.
+"""Command `atalante bench`: measure the speed of the stack, and of baselines in the same run.
 
 nodes, generated_c, python_can_hal -> wire, motion, startup -> catalogue -> table or JSON lines
 """
@@ -28,7 +28,7 @@ def command(names: tuple[str, ...], quick: bool, as_json: bool) -> None:
     """Measure the speed of the stack against baselines and print the ratio of the medians.
 
     Value and baseline are measured alternately in short blocks. Absolute times depend on the machine and its load, so
-    only the ratio is comparable. Every benchmark checks that it did its work; the exit code is 1 if one did not. A missed
+    only the ratio is comparable. Every benchmark checks its results; the exit code is 1 if a result is wrong. A missed
     target is shown and does not change the exit code.
 
     \b
@@ -36,7 +36,7 @@ def command(names: tuple[str, ...], quick: bool, as_json: bool) -> None:
              atalante bench --json hal_cycle decode_cycle
     """
     from atalante_tools.bench.catalogue import BENCHMARKS
-    from atalante_tools.bench.measure import Effort, WorkError
+    from atalante_tools.bench.measure import BenchmarkError, Effort
 
     known = [benchmark.name for benchmark in BENCHMARKS]
     chosen = [BENCHMARKS[find(name, known, "benchmark")] for name in dict.fromkeys(names)] or list(BENCHMARKS)
@@ -53,9 +53,9 @@ def command(names: tuple[str, ...], quick: bool, as_json: bool) -> None:
         progress.show(f"{label}: preparing")
         try:
             measured = benchmark.run(Effort(quick, show))
-        except WorkError as error:
+        except BenchmarkError as error:
             progress.clear()
-            raise Failed(f"{benchmark.name} did not do its work: {error}") from error
+            raise Failed(f"the benchmark {benchmark.name} is invalid: {error}") from error
         progress.clear()
         for remark in measured.remarks:
             say(f"{benchmark.name}: {remark}")
@@ -67,7 +67,7 @@ def command(names: tuple[str, ...], quick: bool, as_json: bool) -> None:
 
 
 def line(benchmark: Benchmark, measured: Measurement) -> dict[str, Any]:
-    """Return one benchmark as a JSON object; values that were not measured are null."""
+    """Return a benchmark as a JSON object; a value that was not measured is null."""
     return {
         "name": benchmark.name,
         "value": _in_unit(benchmark, measured.value),
@@ -79,7 +79,7 @@ def line(benchmark: Benchmark, measured: Measurement) -> dict[str, Any]:
 
 
 def row(benchmark: Benchmark, measured: Measurement) -> tuple[str, ...]:
-    """Return one benchmark as a row of the table."""
+    """Return a benchmark as a row of the table."""
     ratio, target = measured.ratio, benchmark.target
     if ratio is None:
         verdict = "not measured"

@@ -1,4 +1,4 @@
-"""Table of all benchmarks: measured function, unit, baseline and target ratio."""
+"""Table of all benchmarks: name, measuring function, unit, baseline and target ratio."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ _UNITS: Final = {"us": 1e6, "s": 1.0}
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Benchmark with its baseline and target."""
+    """Benchmark with its unit, baseline and target ratio."""
 
     name: str
     run: Callable[[Effort], Measurement]
     unit: str
     baseline: str  # description of the baseline
-    target: float | None = None  # largest ratio that meets the target; None: no target
+    target: float | None = None  # largest accepted ratio of value to baseline; None: no target
 
     @property
     def per_second(self) -> float:
-        """Return the number of units per second."""
+        """Return the number of units in a second, such as 1e6 for us."""
         return _UNITS[self.unit]
 
 
@@ -74,7 +74,7 @@ BENCHMARKS: Final = (
         "emulator_tick",
         motion.emulator_tick,
         "us",
-        "share of PyBullet in the same tick: set torques, step, read state",
+        "time of PyBullet in the same tick: set torques, step, read state",
         2.3,
     ),
     Benchmark(

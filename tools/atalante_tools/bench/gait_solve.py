@@ -1,4 +1,4 @@
-"""Benchmarks of the gait optimiser on one core: a gait from the kinematic guess, and a gait from a neighbouring gait."""
+"""Benchmarks of the gait optimiser on one core, with two initial guesses: a kinematic guess and a neighbouring gait."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from atalante_control.gait.subject import Subject
 from atalante_control.model import Patient
 from atalante_tools.bench.measure import Effort, Measurement, require
 
-#: Time limit of a gait from the kinematic guess, and from a neighbouring gait, on one core [s].
+#: Target time for a gait that is solved from the kinematic guess [s].
 _COLD_LIMIT: Final = 3.0
+#: Target time for a gait that is solved from a neighbouring gait [s].
 _WARM_LIMIT: Final = 1.0
 _ROUNDS: Final = 12
 _CENTRE: Final = Subject(Patient(75.0, 1.75), 0.15, 0.9)
@@ -27,25 +28,25 @@ _SUBJECTS: Final = (
 
 
 def gait_solve_cold(effort: Effort) -> Measurement:
-    """Measure the solution of a gait from the kinematic guess."""
+    """Measure the time to solve a gait from the kinematic guess."""
     return Measurement(_solved(effort, None), _COLD_LIMIT)
 
 
 def gait_solve_warm(effort: Effort) -> Measurement:
-    """Measure the solution of a gait from a neighbouring gait."""
+    """Measure the time to solve a gait from a neighbouring gait."""
     return Measurement(_solved(effort, _centre()), _WARM_LIMIT)
 
 
 @cache
 def _centre() -> Gait:
-    """Return the gait from which the warm benchmark starts. The first call also builds the nonlinear program."""
+    """Return the initial guess of the warm benchmark. The first call also builds the nonlinear program."""
     from atalante_control.gait_optimization.solve import solve
 
     return solve(_CENTRE).gait
 
 
 def _solved(effort: Effort, neighbour: Gait | None) -> float:
-    """Return the median processor time of a solution [s], without the time to build and compile the nonlinear program."""
+    """Return the median processor time to solve a gait [s], without the time to build and compile the nonlinear program."""
     from atalante_control.gait_optimization.solve import solve
 
     if effort.quick:

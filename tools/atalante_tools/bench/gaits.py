@@ -16,9 +16,9 @@ from atalante_hal.robot import load_robot
 from atalante_tools.bench.measure import Effort, Measurement, require, timed
 
 _PATIENT: Final = Patient(75.0, 1.75)
-#: Time limit of one evaluation of the gait network [s].
+#: Target time for one evaluation of the gait network [s].
 _BUDGET: Final = 50e-6
-#: Time limit of one gait of a library on one core [s].
+#: Target time for one gait of a library on one core [s].
 _GAIT: Final = 3.0
 _BUILDS: Final = 3
 _EVALUATIONS: Final = 100
@@ -26,7 +26,7 @@ _DYNAMICS: Final = 100
 
 
 def model_build(effort: Effort) -> Measurement:
-    """Measure the construction of the Pinocchio model from mass and height of a patient."""
+    """Measure the time to build the Pinocchio model from mass and height of a patient."""
     robot, parameters = load_robot(), ExoskeletonParameters()
     text = urdf(parameters, robot, _PATIENT)
     return effort.interleave(
@@ -37,7 +37,7 @@ def model_build(effort: Effort) -> Measurement:
 
 
 def inverse_dynamics(effort: Effort) -> Measurement:
-    """Measure the inverse dynamics of one state on the stance foot: joint torques and ground wrench."""
+    """Measure the time to compute joint torques and ground wrench from the motion, by inverse dynamics on the stance foot."""
     robot = load_robot()
     dynamics = stance_dynamics(robot, _PATIENT)
     model = pinocchio_model(urdf(ExoskeletonParameters(), robot, _PATIENT), fixed_base=False).model
@@ -50,15 +50,15 @@ def inverse_dynamics(effort: Effort) -> Measurement:
     require(
         abs(force[2] - weight) < 1e-6, f"ground force must equal the weight of {weight:.1f} N, got {force[2]:.1f} N"
     )
-    ours, theirs = cycle(states), cycle(floating)
+    stance_states, floating_states = cycle(states), cycle(floating)
     return effort.interleave(
-        timed(lambda: dynamics.forces(*next(ours)), _DYNAMICS),
-        timed(lambda: pinocchio.rnea(model, data, *next(theirs)), _DYNAMICS),
+        timed(lambda: dynamics.forces(*next(stance_states)), _DYNAMICS),
+        timed(lambda: pinocchio.rnea(model, data, *next(floating_states)), _DYNAMICS),
     )
 
 
 def network_evaluation(effort: Effort) -> Measurement:
-    """Measure one evaluation of the gait network: from subject parameters to twelve joint trajectories."""
+    """Measure the time in which the gait network computes twelve joint trajectories from subject parameters."""
     network = load_network()
     inputs = np.random.default_rng(0).uniform(network.low, network.high, (64, len(network.low)))
     spread = np.ptp([network.coefficients(row) for row in inputs], axis=0).max()
@@ -69,17 +69,17 @@ def network_evaluation(effort: Effort) -> Measurement:
 
 
 def library_one_process(effort: Effort) -> Measurement:
-    """Measure the time per gait of a library in one process."""
+    """Measure the time per gait of a library that one process solves."""
     return _library(effort, 1)
 
 
 def library_two_processes(effort: Effort) -> Measurement:
-    """Measure the time per gait of a library in two processes."""
+    """Measure the time per gait of a library that two processes solve in parallel."""
     return _library(effort, 2)
 
 
 def _library(effort: Effort, jobs: int) -> Measurement:
-    """Measure the time per gait of a library. The first gait of each process includes its set-up and is not counted."""
+    """Measure the time per gait of a library. The first gait of each process is excluded, because it includes the set-up."""
     from atalante_control.gait_optimization.library import solve_subject
     from atalante_control.gait_optimization.network_error import random_subjects
     from atalante_control.gait_optimization.parallel import fan_out

@@ -1,6 +1,6 @@
-"""Measurement of one benchmark: value and baseline in alternating short blocks, and the median of each.
+"""Measurement of a benchmark: run value and baseline alternately in short blocks, and compute the median of each.
 
-Absolute times depend on the machine and its load. Both sides run under the same conditions, so the ratio is comparable
+Absolute times depend on the machine and its load. Value and baseline run under the same conditions, so their ratio is comparable
 between machines.
 """
 
@@ -13,21 +13,22 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-#: Number of blocks of each side for a robust median, and for a quick functional check.
+#: Number of blocks of value and of baseline in a normal run, for a robust median.
 ROUNDS: Final = 200
+#: Number of blocks of value and of baseline with `--quick`.
 QUICK_ROUNDS: Final = 5
 
-#: Function that runs one block and returns the time per unit of work [s].
+#: Function that runs one block and returns the time per repetition [s].
 Block = Callable[[], float]
 
 
-class WorkError(Exception):
-    """Benchmark did not do its work, so its times are meaningless."""
+class BenchmarkError(Exception):
+    """A benchmark computed a wrong result, so its times are meaningless."""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """Result of a benchmark: its time and its baseline [s], each None if it was not measured.
+    """Result of a benchmark: its time and the time of its baseline [s]. A time that was not measured is None.
 
     A measured time is usually the median of many blocks. The baseline may also be a fixed limit. `remarks` are sentences to log,
     such as the reason why a time is missing.
@@ -39,48 +40,50 @@ class Measurement:
 
     @property
     def ratio(self) -> float | None:
-        """Return value divided by baseline; None if one of them was not measured."""
+        """Return the value divided by the baseline, or None if either was not measured."""
         return None if self.value is None or not self.baseline else self.value / self.baseline
 
 
 @dataclass(frozen=True)
 class Effort:
-    """Number of rounds to measure. `progress(done, total)` is called after each round."""
+    """Number of rounds of a benchmark, and `progress(done, total)`, which is called after each round."""
 
     quick: bool = False
     progress: Callable[[int, int], None] = field(default=lambda _done, _total: None)
 
     def rounds(self, share: float = 1.0) -> int:
-        """Return the number of rounds.
+        """Return the number of rounds, at least `QUICK_ROUNDS`.
 
         Args:
-            share: fraction of the usual number, for benchmarks with long blocks; the result is at least `QUICK_ROUNDS`.
+            share: fraction of the usual number; below 1 for benchmarks with long blocks.
         """
         return QUICK_ROUNDS if self.quick else max(QUICK_ROUNDS, round(ROUNDS * share))
 
     def interleave(self, value: Block, baseline: Block, share: float = 1.0) -> Measurement:
-        """Run both blocks alternately and return the medians. One warm-up block each comes first; garbage collection is off.
+        """Run both blocks alternately and return the median times.
+
+        Each block runs once before the measurement, to warm up. Garbage collection is off.
 
         Args:
-            value: block of the benchmark.
+            value: block of the measured function.
             baseline: block of the baseline.
             share: fraction of the usual number of rounds.
         """
         rounds = self.rounds(share)
         value(), baseline()
-        ours, theirs = [], []
-        with _no_collection():
+        values, baselines = [], []
+        with _NoGarbageCollection():
             for done in range(1, rounds + 1):
-                ours.append(value())
-                theirs.append(baseline())
+                values.append(value())
+                baselines.append(baseline())
                 self.progress(done, rounds)
-        return Measurement(statistics.median(ours), statistics.median(theirs))
+        return Measurement(statistics.median(values), statistics.median(baselines))
 
 
 def timed(work: Callable[[], object], repetitions: int) -> Block:
-    """Return a block that calls `work` `repetitions` times."""
+    """Return a block that calls the function `work` `repetitions` times."""
     counter = range(repetitions)
-    # Processor time of this thread excludes the time used by other processes.
+    # The processor time of this thread excludes the time of other processes.
     now = time.thread_time
 
     def block() -> float:
@@ -93,17 +96,21 @@ def timed(work: Callable[[], object], repetitions: int) -> Block:
 
 
 def require(condition: object, message: str) -> None:
-    """Raise an error with `message` if the condition is false.
+    """Check a condition that every valid benchmark meets.
+
+    Args:
+        condition: condition that must be true.
+        message: text of the error.
 
     Raises:
-        WorkError: If the condition is false.
+        BenchmarkError: If the condition is false.
     """
     if not condition:
-        raise WorkError(message)
+        raise BenchmarkError(message)
 
 
-class _no_collection:  # noqa: N801 - used like a function
-    """Context with garbage collection off, because its pauses belong to no benchmark."""
+class _NoGarbageCollection:
+    """Context manager that switches garbage collection off, because its pauses would distort the times."""
 
     def __enter__(self) -> None:
         gc.collect()

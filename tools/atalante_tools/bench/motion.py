@@ -24,50 +24,52 @@ from atalante_tools.console.options import EMBEDDED, Target
 from atalante_tools.session.embedded import EmbeddedRobot
 from atalante_tools.session.rig import Rig, open_hal
 
-#: Largest difference of exact flow and step-by-step integration [rad].
+#: Largest accepted difference between exact flow and step-by-step integration [rad].
 AGREEMENT: Final = 1e-6
-#: Largest deviation of a joint from the gait while the robot walks [rad].
+#: Largest accepted deviation of a joint from the gait while the robot walks [rad].
 POSE: Final = 0.15
-#: Number of cycles from the start until the robot walks, and of one block.
+#: Number of cycles before the measurement; after these the robot walks.
 _BEFORE_WALKING: Final = 3000
+#: Number of cycles of a block.
 _BLOCK: Final = 50
 _TICKS: Final = 40
-_MARCHES: Final = 4
+_INTEGRATIONS: Final = 4
 
 
 def filter_tick(effort: Effort) -> Measurement:
-    """Measure the guide filter of both joints against the step-by-step integration of its rollouts."""
+    """Measure one tick of the guide filter; the baseline integrates the same rollouts step by step."""
     guide = walk().guide
     guide.start_step(ASSISTANCE, (ERROR, -ERROR), (ERROR_RATE, ERROR_RATE))
-    march = SteppedRollouts(guide)
+    stepped = SteppedRollouts(guide)
     rng = np.random.default_rng(0)
     errors = rng.uniform(-1.0, 1.0, (256, 4)) * np.array([ERROR, ERROR_RATE, ERROR, ERROR_RATE])
     moments = [
         (k, *x) for k, x in zip(rng.integers(0, guide.cycles, len(errors)).tolist(), errors.tolist(), strict=True)
     ]
     saturated = guide.stepped
-    worst = max(float(np.abs(guide.rollouts(*moment) - march.rollouts(*moment)).max()) for moment in moments)
+    worst = max(float(np.abs(guide.rollouts(*moment) - stepped.rollouts(*moment)).max()) for moment in moments)
     require(
         worst <= AGREEMENT,
         f"the exact flow must agree with the integration within {AGREEMENT:.0e} rad, got {worst:.1e}",
     )
-    ours, theirs = cycle(moments), cycle(moments)
+    exact_inputs, stepped_inputs = cycle(moments), cycle(moments)
     measured = effort.interleave(
-        timed(lambda: guide.tick(*next(ours)), _TICKS), timed(lambda: march.rollouts(*next(theirs)), _MARCHES)
+        timed(lambda: guide.tick(*next(exact_inputs)), _TICKS),
+        timed(lambda: stepped.rollouts(*next(stepped_inputs)), _INTEGRATIONS),
     )
     require(guide.stepped == saturated, "the filter must not saturate during the benchmark")
     return Measurement(measured.value, measured.baseline, (f"agrees with the integration to {worst:.1e} rad",))
 
 
 def emulator_tick(effort: Effort) -> Measurement:
-    """Measure one tick of the emulator while the whole stack walks, against the share of the engine in the same ticks.
+    """Measure one tick of the emulator while the robot walks; the baseline is the time of PyBullet in the same ticks.
 
-    Both are measured inside the running stack. An engine step repeated alone takes a third less, because nothing else
-    uses the caches.
+    Both are measured while the whole stack runs. A step of PyBullet that is repeated alone takes a third less time, because
+    no other code uses the processor caches.
     """
     now = time.perf_counter
-    ours: list[float] = []
-    theirs: list[float] = []
+    tick_times: list[float] = []
+    engine_times: list[float] = []
     with _stack(None) as stack:
         emulator = stack.rig.emulator
         assert emulator is not None
@@ -77,7 +79,7 @@ def emulator_tick(effort: Effort) -> Measurement:
         def timed_exchange(torque: Sequence[float]) -> Any:
             began = now()
             answer = exchange(torque)
-            theirs.append(now() - began)
+            engine_times.append(now() - began)
             return answer
 
         def tick() -> None:
@@ -85,48 +87,48 @@ def emulator_tick(effort: Effort) -> Measurement:
             ran = poll()
             polled = now()
             if ran:
-                ours.append(polled - begin)
+                tick_times.append(polled - begin)
 
         body.exchange = timed_exchange  # type: ignore[attr-defined]
         bus.step = tick  # type: ignore[attr-defined]
         cycles = stack.walk(effort)
-        # The robot does not walk before this range, and holds after it.
+        # The robot walks only in these ticks.
         walked = slice(_BEFORE_WALKING, _BEFORE_WALKING + cycles)
         require(
-            len(ours[walked]) == len(theirs[walked]) == cycles,
-            f"{_BEFORE_WALKING + cycles} ticks expected, got {len(ours)}",
+            len(tick_times[walked]) == len(engine_times[walked]) == cycles,
+            f"the emulator must run {_BEFORE_WALKING + cycles} ticks, got {len(tick_times)}",
         )
-    return Measurement(statistics.median(ours[walked]), statistics.median(theirs[walked]))
+    return Measurement(statistics.median(tick_times[walked]), statistics.median(engine_times[walked]))
 
 
 def lockstep(effort: Effort) -> Measurement:
-    """Measure the wall time of a simulated second: HAL, controller, emulator, and one record per cycle."""
+    """Measure the wall time in which HAL, controller, emulator and telemetry ring run one simulated second."""
     with _stack(EmbeddedRobot()) as stack:
         stack.walk(effort)
     ordered = [block / (_BLOCK * PERIOD) for block in sorted(stack.blocks)]
     seconds, undisturbed = statistics.median(ordered), ordered[len(ordered) // 10]
-    # A process on the sibling hyperthread of a core takes almost half of its speed and does not show up in the load.
+    # A process on the sibling hyperthread slows a core by almost half, so the fastest blocks are reported, too.
     remark = f"{1.0 / seconds:.1f} times real time; {1.0 / undisturbed:.1f} times in the fastest tenth of the blocks"
     return Measurement(seconds, 1.0, (remark,))
 
 
 @dataclass
 class _Stack:
-    """HAL, controller and emulator of the suspended robot, as in `atalante demo`."""
+    """HAL, controller, emulated suspended robot and telemetry ring, as in `atalante demo`."""
 
     rig: Rig
     controller: AirwalkController
     ring: RingWriter
-    blocks: list[float] = field(default_factory=list)  # s, wall time of each block of walking
+    blocks: list[float] = field(default_factory=list)  # wall time of each block of `_BLOCK` cycles [s]
 
     def walk(self, effort: Effort) -> int:
-        """Run until the robot has walked for all rounds of `_BLOCK` cycles; return the number of cycles walked.
+        """Run until the robot has walked for all rounds; return the number of these cycles.
 
         Args:
-            effort: number of rounds, and progress display.
+        effort: number of rounds of `_BLOCK` cycles, and progress display.
 
         Raises:
-            WorkError: If the robot does not walk, or frames or records are lost.
+        BenchmarkError: If the robot does not walk, or frames or records are lost.
         """
         rounds = effort.rounds()
         cycles = rounds * _BLOCK
@@ -149,14 +151,19 @@ class _Stack:
         hal, ring = self.rig.hal, self.ring
         self.rig.run(self.controller, until=finished, record=lambda: ring.write(hal.record))
         require(
-            ring.written == _BEFORE_WALKING + cycles, f"{ring.written} records in {_BEFORE_WALKING + cycles} cycles"
+            ring.written == _BEFORE_WALKING + cycles,
+            f"the ring must have {_BEFORE_WALKING + cycles} records, got {ring.written}",
         )
         frames = hal.record[hal.layout["frames"]][0]
-        require(hal.crc_errors == 0 and frames >= 19 * cycles, f"{frames:.0f} frames, {hal.crc_errors} CRC errors")
+        require(
+            hal.crc_errors == 0 and frames >= 19 * cycles,
+            f"the HAL must receive at least {19 * cycles} frames without CRC errors, "
+            f"got {frames:.0f} frames and {hal.crc_errors} CRC errors",
+        )
         return cycles
 
     def _require_walking(self, state: State) -> None:
-        """Require a robot that walks, because a robot without motion is cheaper to simulate."""
+        """Check that the robot walks, because a robot at rest takes less time to simulate."""
         reason = self.rig.hal.reason
         require(
             state.supervisor is SupervisorState.ACTIVE,
@@ -168,7 +175,11 @@ class _Stack:
 
 @contextmanager
 def _stack(robot_process: EmbeddedRobot | None) -> Iterator[_Stack]:
-    """Open the whole stack, with the emulated robot in a subprocess (`robot_process`) or in-process (None)."""
+    """Open HAL, controller, emulated robot and telemetry ring; close them after the block.
+
+    Args:
+        robot_process: subprocess of the emulated robot; None: the emulated robot runs in this process.
+    """
     walking = walk()
     controller = AirwalkController(walking.robot, walking.gait, CONSTANT)
     with (

@@ -1,8 +1,8 @@
-"""Recorded nodes: frames prepared in advance, with valid counters and CRCs, played to a HAL in lock-step.
+"""Recorded nodes: prepared frames with valid counters and CRCs, played to a HAL in lock-step.
 
-They replace the emulator in benchmarks of the HAL: the answer to a SYNC is a single copy of bytes. The recording
-oscillates about the first pose of a swing with a small tracking error, so the guide filter works on realistic values and
-no plausibility check fails.
+They replace the emulator in benchmarks of the HAL. The answer to a SYNC is only copied, which takes little time. The joints
+oscillate about the first pose of a swing with a small tracking error, so the guide filter gets realistic values and no
+plausibility check fails.
 """
 
 from __future__ import annotations
@@ -33,12 +33,13 @@ from atalante_tools.bench.measure import require
 
 Vector = npt.NDArray[np.float64]
 
-#: Number of cycles of the recording: one turn of the alive counters.
+#: Number of cycles after which an alive counter starts again at 0.
 TURN = 256
-#: Number of poses of the recording. Odd, so that a check of every 16th cycle gets a different pose each time.
+#: Number of poses of the recording. It is odd, so that a check in every 16th cycle gets a different pose each time.
 POSES = 15
-#: Tracking error of the recorded walk [rad], and its rate [rad/s]; small enough that the guide filter does not saturate.
+#: Tracking error of the recorded joints [rad], too small to saturate the guide filter.
 ERROR = 0.01
+#: Rate of the tracking error of the recorded joints [rad/s].
 ERROR_RATE = 0.05
 PERIOD = 1e-3  # s
 ASSISTANCE = 0.5
@@ -47,7 +48,7 @@ _E2E = Struct("<HB")
 
 @dataclass(frozen=True)
 class Walk:
-    """Network, robot, gait and guide filter of the recording."""
+    """Network, robot, gait and guide filter for the recording."""
 
     network: Network
     robot: Robot
@@ -58,14 +59,14 @@ class Walk:
 
 @cache
 def walk() -> Walk:
-    """Return the gait of the demo and its guide filter."""
+    """Load the network, the robot and the gait of the demo, and create the guide filter of this gait."""
     network, robot = atalante_dbc.load(), load_robot()
     gait = load_gait(AIRWALK_GAIT, robot)
     return Walk(network, robot, gait, gait.tables(), AirwalkController(robot, gait, CONSTANT).guide_at(ASSISTANCE))
 
 
 def cyclic_messages(network: Network) -> list[Message]:
-    """Return the messages the HAL receives in every cycle, in the order of the buses."""
+    """Return the messages that the HAL receives in every cycle, in the order of the buses."""
     return [m for bus in network.buses for m in network.received_by("HAL") if m.bus == bus and m.cycle_ms == 1]
 
 
@@ -75,9 +76,10 @@ def syncs(network: Network) -> list[Message]:
 
 
 class Recording:
-    """Answers of the nodes, cycle by cycle. `play` writes one cycle into `frames`.
+    """Recorded frames of all nodes. Each call of `play` writes the frames of the next cycle into `frames`.
 
-    The recording is small to keep the caches warm: `POSES` payloads, and the CRC of each payload for each counter.
+    The recording consists of `POSES` payloads, and the CRC of each payload for each counter. It is small, so it stays in the
+    processor caches.
 
     Attributes:
         cyclic: messages of every cycle, in order.
@@ -100,15 +102,14 @@ class Recording:
         error = rng.uniform(-ERROR, ERROR, len(JOINTS))
         self.values[:, codec.slice("Position")] = (walk.tables.q[0] + error + swing) * motor
         self.values[:, codec.slice("Velocity")] = ERROR_RATE * np.cos(phase) * motor
-        turn = np.where(np.arange(POSES) % 2, 1.0, -1.0)[:, None]  # consecutive sensor values differ
+        turn = np.where(np.arange(POSES) % 2, 1.0, -1.0)[:, None]  # sign, which makes consecutive sensor values differ
         for name, noise in (("Torque", 0.05), ("Gyro", 0.01), ("Accel", 0.05), ("Force", 1.0)):
             columns = codec.slice(name)
             self.values[:, columns] += turn * rng.uniform(0.5 * noise, noise, (POSES, columns.stop - columns.start))
         for side, leg in (("LEFT", 0), ("RIGHT", len(JOINTS) // 2)):
-            pitch = (
-                0.5 * (walk.tables.q[0] + error)[leg + 2 : leg + 4].sum()
-            )  # rad, half of the sum of hip and knee angle
-            for axis, value in (("W", np.cos(pitch)), ("Y", np.sin(pitch))):
+            # The tibia pitch is the sum of hip and knee angle [rad]. Its quaternion contains half of this angle.
+            half_pitch = 0.5 * (walk.tables.q[0] + error)[leg + 2 : leg + 4].sum()
+            for axis, value in (("W", np.cos(half_pitch)), ("Y", np.sin(half_pitch))):
                 self.values[:, codec.index(f"IMU_{side}_TIBIA_STATE", f"Quaternion{axis}")] = value
         request = [codec.index("PENDANT_STATE", name) for name in ("Request", "RequestCounter")]
         self._before = _seal(image, self.values)
@@ -121,7 +122,7 @@ class Recording:
         image.values[image.codec.slice("NodeState")] = 5  # operational
         image.values[image.codec.slice("SupplyVoltage")] = 48.0
         gap = max(m.cycle_ms for m in slow) // len(slow)
-        #: Phases are spread evenly, so that every block of ten cycles has the same load.
+        #: Slow messages. Their phases are spread evenly, so that every block of ten cycles has the same number of frames.
         self.slow = tuple((m, m.cycle_ms, gap * row % m.cycle_ms) for row, m in enumerate(slow))
         self._slow = _seal(image, image.values[None, :])
         self._slow_turn = [0] * len(slow)
@@ -138,7 +139,7 @@ class Recording:
         self.pose = 0
 
     def play(self) -> int:
-        """Write the next cycle into `frames`; return the number of frames."""
+        """Write the frames of the next cycle into `frames`; return their number."""
         cycle = self.cycles
         self.cycles = cycle + 1
         tag = self.cycles % TURN  # low byte of the SYNC cycle number, which starts at 1
@@ -174,7 +175,7 @@ def _seal(image: TransmitImage, values: Vector) -> _Sealed:
 
 
 def _e2e_fields(frames: Frames) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint16]]:
-    """Return views of the counters and the CRCs of frames, shape (frames,) each."""
+    """Return a view of the counters and a view of the CRCs of frames, shape (frames,) each."""
     octets, halves = (
         frames.view(np.uint8).reshape(-1, FRAME_BYTES),
         frames.view(np.uint16).reshape(-1, FRAME_BYTES // 2),
@@ -183,7 +184,7 @@ def _e2e_fields(frames: Frames) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.u
 
 
 def _walking(walk: Walk, image: TransmitImage) -> Vector:
-    """Return the constant part of the values: measurements within range and states without error. Shape (signals,)."""
+    """Return constant values of all signals, within their ranges and without errors, shape (signals,)."""
     codec, rng = image.codec, np.random.default_rng(1)
     values = np.zeros(codec.size)
     for name, low, high in (
@@ -214,22 +215,22 @@ class RecordedBus:
         self._into, self._into_memory = recording.frames, self._memory
         self._syncs = len(syncs(walk().network))
         self._synced = False
-        self._prepared: list[bytes] = []  # frames of the next cycles, in reverse order
+        self._prepared: list[bytes] = []  # frames of each prepared cycle, the next cycle last
 
     def prepare(self, cycles: int) -> None:
-        """Play the next cycles in advance, so that the time of the nodes is not measured as time of the HAL."""
+        """Prepare the frames of the next cycles, so that `receive` only copies them."""
         memory = self._memory
         self._prepared = [memory[: self._recording.play() * FRAME_BYTES].tobytes() for _ in range(cycles)][::-1]
 
     def send(self, frames: Frames) -> None:
-        """Count the frames. A batch with as many frames as there are buses is the batch of SYNCs."""
+        """Count the frames. A batch with one frame per bus consists of the SYNC frames."""
         count = len(frames)
         self.sent += count
         if count == self._syncs:
             self._synced = True
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Return the frames of the next cycle, if a SYNC was sent since the last one."""
+        """Copy the frames of the next cycle into `frames` if SYNC was sent; return their number."""
         if not self._synced:
             return 0
         self._synced = False
@@ -248,7 +249,7 @@ class RecordedBus:
 
 @dataclass
 class RecordedHal:
-    """HAL in ACTIVE on recorded nodes."""
+    """HAL in ACTIVE, with recorded nodes as its robot."""
 
     hal: Hal
     bus: RecordedBus
@@ -256,10 +257,10 @@ class RecordedHal:
 
 
 def active_hal() -> RecordedHal:
-    """Build a HAL on recorded nodes and bring it to ACTIVE.
+    """Create a HAL with recorded nodes and run it until ACTIVE.
 
     Raises:
-        WorkError: If the HAL does not reach ACTIVE.
+        BenchmarkError: If the HAL does not reach ACTIVE.
     """
     recording = Recording(walk())
     bus = RecordedBus(recording)

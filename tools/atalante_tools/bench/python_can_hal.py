@@ -1,8 +1,8 @@
-"""HAL cycle written with python-can and cantools: the baseline of `hal_cycle`.
+"""Baseline of `hal_cycle`: a HAL cycle written with python-can and cantools.
 
-It processes the same frames with the same checks of CRC, counter and range and the same filter and limiter, message by
-message and signal by signal. It omits ages, supervisor, record and HOLD, which makes it faster. The bus is the in-process
-`virtual` bus of python-can. The time of the nodes to send is not measured.
+It processes the same frames one by one, with the same checks of CRC, counter and range and the same filter and limiter. It
+omits the ages of values, the state machine, the telemetry record and HOLD, which makes it faster. The bus is the in-process
+`virtual` bus of python-can. The time in which the nodes send is not measured.
 """
 
 from __future__ import annotations
@@ -30,7 +30,13 @@ class VirtualNodes:
         self._bus = can.Bus(interface="virtual", channel="bench")
 
     def answer(self, cycles: int) -> list[int]:
-        """Discard the frames sent to the nodes, send the frames of the next cycles, and return the number of frames per cycle."""
+        """Send the frames of the next cycles, and return the number of frames of each cycle.
+
+        Frames from the HAL are discarded.
+
+        Args:
+            cycles: number of cycles.
+        """
         while self._bus.recv(0.0) is not None:
             pass
         return [self._answer_one() for _ in range(cycles)]
@@ -57,7 +63,7 @@ class VirtualNodes:
 
 
 class PythonCanHal:
-    """HAL that runs one cycle per call and keeps its state in plain arrays."""
+    """HAL of python-can and cantools, with one cycle per call and the state in plain arrays."""
 
     def __init__(self, walk: Walk, recording: Recording, controller: FilterOnly) -> None:
         network, robot = walk.network, walk.robot
@@ -93,7 +99,11 @@ class PythonCanHal:
         self.pendant: dict[str, Any] = {}
 
     def cycle(self, count: int) -> None:
-        """Run one cycle: send SYNC, receive the `count` frames of the answer, filter, limit, send commands."""
+        """Run one cycle: send SYNC, receive frames, run the guide filter and the limiter, send commands.
+
+        Args:
+            count: number of frames that the nodes sent.
+        """
         self._cycle += 1
         for frame_id in self._syncs:
             self._send(frame_id, {"HalState": 2, "Cycle": self._cycle})

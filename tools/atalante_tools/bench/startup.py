@@ -1,4 +1,4 @@
-"""Benchmark of a whole process, from its start to the first cycle."""
+"""Benchmark of the start of a process, up to the first cycle of HAL and emulator."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ _IMPORT_ALONE: Final = "import pybullet; print(1)"
 
 
 def start_up(effort: Effort) -> Measurement:
-    """Measure a process that starts HAL and emulator, runs one cycle and exits."""
-    ours: list[float] = []
-    theirs: list[float] = []
+    """Measure the time of a process that starts HAL and emulator, runs one cycle and exits."""
+    values: list[float] = []
+    baselines: list[float] = []
     rounds = 1 if effort.quick else 5
     for done in range(1, rounds + 1):
-        ours.append(_seconds(_FIRST_CYCLE))
-        theirs.append(_seconds(_IMPORT_ALONE))
+        values.append(_seconds(_FIRST_CYCLE))
+        baselines.append(_seconds(_IMPORT_ALONE))
         effort.progress(done, rounds)
-    return Measurement(statistics.median(ours), statistics.median(theirs))
+    return Measurement(statistics.median(values), statistics.median(baselines))
 
 
 def _seconds(program: str) -> float:

@@ -1,8 +1,8 @@
-"""Rollouts of the virtual guide by step-by-step integration: reference and baseline of the exact flow.
+"""Step-by-step integration of the rollouts of the virtual guide, as reference and baseline of the exact flow.
 
-This module is not part of the control loop. In each cycle it integrates all four rollouts (two joints, two extreme
-disturbances) over the horizon grid of the guide filter. The exact discretisation of each interval is computed in advance
-and all rollouts advance together, so that the number of numpy operations per step is minimal.
+This module is not part of the control loop. It integrates all four rollouts (two joints, two extreme disturbances) over the
+horizon grid of the guide filter. The exact discretisation of each grid interval is computed in advance. All rollouts are
+integrated together, which needs the fewest numpy operations per step.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Vector = npt.NDArray[np.float64]
 
 
 class SteppedRollouts:
-    """Step-by-step integration of the rollouts of a guide filter with monotone, unsaturated backup policies."""
+    """Step-by-step integration of the rollouts of a guide filter whose backup policies are monotone and not saturated."""
 
     def __init__(self, guide: GuideFilter) -> None:
         """Copy grid, gains and disturbance bounds of the guide filter.
@@ -30,7 +30,7 @@ class SteppedRollouts:
         lengths = np.arange(guide.stride + 1, dtype=np.float64) * PERIOD
         joints = [0, 0, 1, 1]
         self._phi = np.stack([config.policies[j].transition(lengths) for j in joints], axis=3)
-        # Every rollout is integrated in the tracking error e. Columns of a joint: upper, then lower disturbance extreme.
+        # Column of each rollout: largest, then smallest disturbance of the hip, then both of the knee.
         extremes = [config.disturbance[j][side] for j, side in zip(joints, (1, 0, 1, 0), strict=True)]
         self._push = np.stack(
             [config.policies[j].step_response(lengths) * u for j, u in zip(joints, extremes, strict=True)], axis=2
@@ -39,7 +39,7 @@ class SteppedRollouts:
         self.start_step()
 
     def start_step(self) -> None:
-        """Update the particular solution P and its increment per grid interval. Call it after `GuideFilter.start_step`."""
+        """Update the particular solution P for a new step. Must be called after `GuideFilter.start_step`."""
         guide = self._guide
         self._p = guide.solution()[:, [[0, 0, 2, 2], [1, 1, 3, 3]]]
         interval = self._p[guide.grid]

@@ -17,59 +17,61 @@ from atalante_tools.bench.generated_c import COMPILER, GeneratedC, available
 from atalante_tools.bench.measure import Effort, Measurement, require, timed
 from atalante_tools.bench.nodes import FilterOnly, RecordedHal, Recording, active_hal, walk
 
-#: Number of cycles of a block; the pattern of slow messages repeats after ten cycles.
+#: Number of cycles of a block. The schedule of the slow messages repeats after ten cycles.
 _BLOCK: Final = 10
-#: Number of repetitions inside a block for short functions, in Python and in C.
+#: Number of repetitions of a short Python function in a block.
 _MANY: Final = 100
+#: Number of repetitions of a C function in a block.
 _MANY_IN_C: Final = 1000
-#: Robot state that is compared between both HALs.
+#: Fields of the robot state in which the HAL and its baseline must agree.
 _COMPARED: Final = (
     "position", "velocity", "torque", "temperature", "drive_state", "imu_quaternion", "imu_gyro", "imu_accel", "foot_force",
 )  # fmt: skip
 
 
 def hal_cycle(effort: Effort) -> Measurement:
-    """Measure the whole cycle: receive, E2E check, decode, filter on two joints, limiter, encode, send."""
+    """Measure a whole HAL cycle: receive, E2E check, decode, guide filter of two joints, limiter, encode, send."""
     from atalante_tools.bench.python_can_hal import PythonCanHal, VirtualNodes
 
-    rig, ours = _hal()
+    recorded, hal_step = _hal()
     recording = Recording(walk())
-    nodes, theirs = VirtualNodes(recording), PythonCanHal(walk(), recording, FilterOnly(walk()))
+    nodes, baseline = VirtualNodes(recording), PythonCanHal(walk(), recording, FilterOnly(walk()))
 
-    def our_block() -> float:
-        rig.bus.prepare(_BLOCK)
+    def hal_block() -> float:
+        recorded.bus.prepare(_BLOCK)
         start = time.perf_counter()
         for _ in range(_BLOCK):
-            ours()
+            hal_step()
         return (time.perf_counter() - start) / _BLOCK
 
-    def their_block() -> float:
+    def baseline_block() -> float:
         frames = nodes.answer(_BLOCK)
         start = time.perf_counter()
         for count in frames:
-            theirs.cycle(count)
+            baseline.cycle(count)
         return (time.perf_counter() - start) / _BLOCK
 
-    their_block(), their_block()
-    sent_before, played, cycles = rig.bus.sent, rig.recording.cycles, rig.hal.state.cycle
-    measured = effort.interleave(our_block, their_block)
-    _check_hal(rig)
-    sent, answered = rig.bus.sent - sent_before, rig.recording.cycles - played
-    elapsed = rig.hal.state.cycle - cycles
+    baseline_block(), baseline_block()
+    sent_before, played, cycles = recorded.bus.sent, recorded.recording.cycles, recorded.hal.state.cycle
+    measured = effort.interleave(hal_block, baseline_block)
+    _check_hal(recorded)
+    sent, answered = recorded.bus.sent - sent_before, recorded.recording.cycles - played
+    elapsed = recorded.hal.state.cycle - cycles
     require(
-        answered == elapsed and sent >= 7 * elapsed, f"{sent} frames sent and {answered} answers in {elapsed} cycles"
+        answered == elapsed and sent >= 7 * elapsed,
+        f"the bus must have {elapsed} answers and {7 * elapsed} sent frames, got {answered} and {sent}",
     )
-    require(theirs.rejected == 0, f"the baseline rejected {theirs.rejected} frames")
-    while rig.recording.pose != recording.pose:
-        theirs.cycle(*nodes.answer(1))
-    _check_same_state(rig, theirs)
-    theirs.bus.shutdown()
+    require(baseline.rejected == 0, f"the baseline rejected {baseline.rejected} frames")
+    while recorded.recording.pose != recording.pose:
+        baseline.cycle(*nodes.answer(1))
+    _check_same_state(recorded, baseline)
+    baseline.bus.shutdown()
     nodes.close()
     return measured
 
 
 def decode_cycle(effort: Effort) -> Measurement:
-    """Measure the decoding of all messages received in a cycle, with the range check of every signal."""
+    """Measure the decoding of all messages that the HAL receives in a cycle, with the range check of every signal."""
     if (missing := _no_compiler()) is not None:
         return missing
     recording = Recording(walk())
@@ -77,44 +79,44 @@ def decode_cycle(effort: Effort) -> Measurement:
     frames = recording.frames[: len(recording.cyclic)]
     recording.play()
     generated = GeneratedC(codec)
-    ours, theirs = np.empty(codec.size), np.empty(codec.size)
-    require(codec.decode(frames, ours), "the recording has signals outside their range")
-    generated.decode(frames, theirs, 1)
+    by_codec, by_c = np.empty(codec.size), np.empty(codec.size)
+    require(codec.decode(frames, by_codec), "all signals of the recording must be in their range")
+    generated.decode(frames, by_c, 1)
     require(generated.inside, "the generated C code reports signals outside their range")
-    require(np.allclose(ours, theirs, rtol=1e-12, atol=0.0), "the generated C code decodes different values")
+    require(np.allclose(by_codec, by_c, rtol=1e-12, atol=0.0), "the generated C code decodes different values")
     return effort.interleave(
-        timed(lambda: codec.decode(frames, ours), _MANY), lambda: generated.decode(frames, theirs, _MANY_IN_C)
+        timed(lambda: codec.decode(frames, by_codec), _MANY), lambda: generated.decode(frames, by_c, _MANY_IN_C)
     )
 
 
 def encode_cycle(effort: Effort) -> Measurement:
-    """Measure the encoding of all messages sent in a cycle, with the range check of every signal."""
+    """Measure the encoding of all messages that the HAL sends in a cycle, with the range check of every signal."""
     if (missing := _no_compiler()) is not None:
         return missing
     codec = Codec([m for m in walk().network.sent_by("HAL") if m.cycle_ms == 1])
     low = np.array([s.minimum for _, s in codec.signals])
     high = np.array([s.maximum for _, s in codec.signals])
     values = np.random.default_rng(0).uniform(low, high)
-    ours, theirs = codec.template(), codec.template()
+    by_codec, by_c = codec.template(), codec.template()
     generated = GeneratedC(codec)
-    codec.encode(values, ours)
-    generated.encode(values, theirs, 1)
+    codec.encode(values, by_codec)
+    generated.encode(values, by_c, 1)
     require(generated.inside, "the generated C code reports values outside their range")
     decoded = np.empty((2, codec.size))
-    for frames, out in zip((ours, theirs), decoded, strict=True):
+    for frames, out in zip((by_codec, by_c), decoded, strict=True):
         codec.decode(frames, out)
-    # The generated C code truncates, while the codec rounds.
+    # The generated C code truncates and the codec rounds, so they may differ by one resolution step.
     resolution = np.array([s.factor for _, s in codec.signals])
     require(
         (np.abs(decoded[0] - decoded[1]) <= 1.001 * resolution).all(), "the generated C code encodes different values"
     )
     return effort.interleave(
-        timed(lambda: codec.encode(values, ours), _MANY), lambda: generated.encode(values, theirs, _MANY_IN_C)
+        timed(lambda: codec.encode(values, by_codec), _MANY), lambda: generated.encode(values, by_c, _MANY_IN_C)
     )
 
 
 def e2e_check(effort: Effort) -> Measurement:
-    """Measure the check of CRC and counter of all messages received in a cycle."""
+    """Measure the check of CRC and counter of all messages that the HAL receives in a cycle."""
     recording = Recording(walk())
     recording.play()
     count = len(recording.cyclic)
@@ -122,32 +124,32 @@ def e2e_check(effort: Effort) -> Measurement:
     expected = octets[spans[:, 0] + COUNTER_BYTE].astype(np.int64)
     check_all = compiled(intact)
 
-    def ours() -> bool:
+    def compiled_check() -> bool:
         return check_all(octets, spans, expected)
 
     check, remark = _frame_checker()
     payloads = [(f["data"][: m.length], m.data_id) for f, m in zip(recording.frames, recording.cyclic, strict=False)]
 
-    def theirs() -> bool:
+    def frame_by_frame() -> bool:
         valid = True
         for (data, data_id), counter in zip(payloads, expected, strict=True):
             payload = data.tobytes()
             valid &= check(payload, data_id) and payload[COUNTER_BYTE] == counter
         return valid
 
-    require(ours() and theirs(), "a valid cycle was rejected")
+    require(compiled_check() and frame_by_frame(), "a valid cycle was rejected")
     recording.frames[count // 2]["data"][5] ^= 1
-    require(not ours() and not theirs(), "a damaged frame was accepted")
+    require(not compiled_check() and not frame_by_frame(), "a damaged frame was accepted")
     recording.frames[count // 2]["data"][5] ^= 1
-    measured = effort.interleave(timed(ours, _MANY), timed(theirs, _BLOCK))
-    require(ours() and theirs(), "a valid cycle was rejected after the benchmark")
+    measured = effort.interleave(timed(compiled_check, _MANY), timed(frame_by_frame, _BLOCK))
+    require(compiled_check() and frame_by_frame(), "a valid cycle was rejected after the benchmark")
     return Measurement(measured.value, measured.baseline, remark)
 
 
 def ring_write(effort: Effort) -> Measurement:
-    """Measure the write of one record into the shared-memory ring."""
-    rig, cycle = _hal()
-    record = rig.hal.record
+    """Measure the time to write one record into the shared-memory ring."""
+    recorded, cycle = _hal()
+    record = recorded.hal.record
     with RingWriter(record.nbytes) as ring:
         measured = effort.interleave(timed(lambda: ring.write(record), _MANY), timed(cycle, _BLOCK))
         ring.write(record)
@@ -156,24 +158,24 @@ def ring_write(effort: Effort) -> Measurement:
             ring.written >= effort.rounds() * _MANY,
             f"the ring must hold at least {effort.rounds() * _MANY} records, got {ring.written}",
         )
-    _check_hal(rig)
+    _check_hal(recorded)
     return measured
 
 
 def _hal() -> tuple[RecordedHal, Callable[[], object]]:
-    rig, controller = active_hal(), FilterOnly(walk())
-    read, write, update = rig.hal.read, rig.hal.write, controller.update
+    recorded, controller = active_hal(), FilterOnly(walk())
+    read, write, update = recorded.hal.read, recorded.hal.write, controller.update
 
     def cycle() -> None:
         write(update(read()))
 
     for _ in range(2 * _BLOCK):
         cycle()
-    return rig, cycle
+    return recorded, cycle
 
 
-def _check_hal(rig: RecordedHal) -> None:
-    hal = rig.hal
+def _check_hal(recorded: RecordedHal) -> None:
+    hal = recorded.hal
     state = hal.state
     require(
         state.supervisor is SupervisorState.ACTIVE,
@@ -183,19 +185,19 @@ def _check_hal(rig: RecordedHal) -> None:
     require(walk().guide.stepped == 0, "the filter must not saturate during the benchmark")
 
 
-def _check_same_state(rig: RecordedHal, theirs: object) -> None:
-    """Require equal state of both HALs at the same pose of the recording.
+def _check_same_state(recorded: RecordedHal, baseline: object) -> None:
+    """Check that the HAL and its baseline have the same state at the same pose of the recording.
 
     Raises:
-        WorkError: If a value differs.
+        BenchmarkError: If a value differs.
     """
     from atalante_tools.bench.python_can_hal import PythonCanHal
 
-    assert isinstance(theirs, PythonCanHal)
-    state = rig.hal.state
+    assert isinstance(baseline, PythonCanHal)
+    state = recorded.hal.state
     for name in _COMPARED:
         require(
-            np.allclose(getattr(state, name), getattr(theirs, name), rtol=1e-9, atol=1e-12),
+            np.allclose(getattr(state, name), getattr(baseline, name), rtol=1e-9, atol=1e-12),
             f"the baseline has a different {name}",
         )
 
