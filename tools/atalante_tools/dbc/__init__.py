@@ -1,4 +1,4 @@
-"""Command `atalante dbc`: check, print and compare DBC files, and generate C code. All commands take `--json`."""
+"""Command `atalante dbc`: check, print and compare DBC files, and generate C code."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from atalante_tools.console.outcome import FAILED, Failed
 from atalante_tools.console.terminal import say, show_json, table
 
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
-#: Optional DBC file; the default is the network of the robot.
+#: Argument FILE: a DBC file. The default is the DBC file of the robot.
 _file_argument = click.argument("file", type=_FILE, required=False)
 
 
 @click.group()
 def command() -> None:
-    """Check, print and compare DBC files, and generate C code. Without FILE, the network of the robot is used.
+    """Check, print and compare DBC files, and generate C code. The default of FILE is the DBC file of the robot.
 
     \b
     Example: atalante dbc lint
@@ -29,7 +29,7 @@ def command() -> None:
 @_file_argument
 @json_option
 def lint(file: Path | None, as_json: bool) -> None:
-    """List the errors that the strict loader finds in FILE, with line numbers; the exit code is 1 if there are any."""
+    """List all errors in FILE with their line numbers; the exit code is 1 if there are any."""
     from atalante_tools.dbc.lint import findings
 
     path = file or _own()
@@ -50,7 +50,7 @@ def lint(file: Path | None, as_json: bool) -> None:
 @click.option("--signals", is_flag=True, help="Print one row per signal, with unit, range and invalid code.")
 @json_option
 def print_table(file: Path | None, signals: bool, as_json: bool) -> None:
-    """Print the messages of FILE, one per line."""
+    """Print a table of the messages of FILE."""
     import atalante_dbc
     from atalante_tools.dbc.tables import message_rows, signal_rows
 
@@ -66,11 +66,11 @@ def print_table(file: Path | None, signals: bool, as_json: bool) -> None:
     default=60.0,
     show_default=True,
     metavar="PERCENT",
-    help="Largest load of a bus, in percent.",
+    help="Largest accepted load of a bus, in percent.",
 )
 @json_option
 def busload(file: Path | None, limit: float, as_json: bool) -> None:
-    """Print the worst-case load of each bus and its messages; the exit code is 1 if a bus exceeds the limit."""
+    """Print the worst-case load of each bus and its messages; the exit code is 1 if a load is above the limit."""
     import atalante_dbc
     from atalante_tools.dbc.tables import load_rows
 
@@ -93,7 +93,7 @@ def busload(file: Path | None, limit: float, as_json: bool) -> None:
 @click.argument("new", type=_FILE)
 @json_option
 def diff(old: Path, new: Path, as_json: bool) -> None:
-    """List the changes on the bus from OLD to NEW; the exit code is 1 if nodes of both versions cannot communicate."""
+    """List the changes from OLD to NEW; the exit code is 1 if a node with OLD cannot communicate with a node with NEW."""
     import atalante_dbc
     from atalante_tools.dbc.diff import changes
 
@@ -120,27 +120,27 @@ def diff(old: Path, new: Path, as_json: bool) -> None:
     metavar="DIR",
     help="Folder of the generated files; created if it does not exist.",
 )
-@click.option("--node", metavar="NODE", help="Generate only the messages that this node sends and receives.")
+@click.option("--node", metavar="NODE", help="Generate code only for the messages that this node sends or receives.")
 @click.option(
     "--check",
     is_flag=True,
-    help="Compile the host test and compare the C code with the Python codec on --images random images.",
+    help="Compile the host test, and use it to compare the C code with the Python codec.",
 )
 @click.option(
     "--images",
     type=click.IntRange(min=1),
     default=10_000,
     show_default=True,
-    help="Number of random images for --check.",
+    help="Number of comparisons by --check, each with one random payload of every message.",
 )
-@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the random images.")
+@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the random payloads.")
 @json_option
 def c_code(
     file: Path | None, output: Path, node: str | None, check: bool, images: int, seed: int, as_json: bool
 ) -> None:
     """Generate C code for FILE: pack, unpack, E2E protect and check, with test vectors and a host test.
 
-    The host test compares the C code with the Python codec. An image is one payload of every message.
+    The host test is a C program that compares the C code with the Python codec. An image is one payload of every message.
     """
     from atalante_tools.dbc.build import Build
     from atalante_tools.dbc.c_code import write

@@ -1,4 +1,4 @@
-"""What C is generated for: a whole network, or one node's share of it. `DBC, node -> Build`."""
+"""Input of the C code generators: all messages of a DBC file, or the messages of one node."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from atalante_tools.console.names import find
 
 @dataclass(frozen=True)
 class Build:
-    """Input of the generators: a whole network, or the messages of one node."""
+    """Input of the C code generators: a network, and the node whose messages are generated."""
 
     network: Network
     text: str  # content of the DBC file
     name: str  # prefix of every C identifier
-    node: str | None  # None: whole network
+    node: str | None  # node whose messages are generated; None: all messages
 
     @classmethod
     def of(cls, path: Path, node: str | None) -> Build:
@@ -40,17 +40,17 @@ class Build:
 
     @property
     def messages(self) -> tuple[Message, ...]:
-        """Return the messages with C code, in DBC order."""
+        """Return the messages for which C code is generated, in DBC order."""
         return tuple(m for m in self.network.messages if self.sends(m) or self.received(m))
 
     def sends(self, message: Message) -> bool:
-        """Return whether the message has a pack function."""
+        """Return whether a pack function is generated for the message."""
         return self.node in (None, message.sender)
 
     def received(self, message: Message) -> tuple[Signal, ...]:
-        """Return the signals that the unpack function fills; empty: there is no unpack function."""
+        """Return the signals that the unpack function decodes; empty if no unpack function is generated."""
         return tuple(s for s in message.signals if self.node is None or self.node in s.receivers)
 
     def c_name(self, message: Message) -> str:
-        """Return the prefix of the C identifiers of a message, without the trailing underscore."""
+        """Return the prefix of all C identifiers of a message, without the underscore at its end."""
         return f"{self.name}_{camel_to_snake_case(message.name)}"

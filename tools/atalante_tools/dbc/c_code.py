@@ -1,4 +1,4 @@
-"""C code of a network: pack and unpack from the generator of cantools, E2E Profile 5, and files to test both.
+"""C code generator: pack and unpack functions by cantools, E2E Profile 5 functions, and a host test with test vectors.
 
 DBC -> Build -> NAME.h NAME.c (cantools)  NAME_e2e.h NAME_e2e.c (`e2e_c`)  host_test.c vectors.bin vectors.json Makefile
 """
@@ -19,16 +19,16 @@ from atalante_tools.dbc.e2e_c import e2e_header, e2e_source
 from atalante_tools.dbc.host_test import makefile, source
 from atalante_tools.dbc.vectors import Vectors
 
-#: Number of images in the vector file of the folder, for a test without Python.
+#: Number of images in the file of test vectors. An image is one payload of every message.
 _IMAGES: Final = 100
 _HOST_TEST, _VECTORS, _EXAMPLES, _MAKEFILE = "host_test.c", "vectors.bin", "vectors.json", "Makefile"
 
 
 def write(build: Build, folder: Path, seed: int) -> list[Path]:
-    """Write every file of the build and return the paths. The same DBC gives the same bytes.
+    """Write all generated files and return their paths. Equal arguments give equal bytes.
 
     Args:
-        build: network and node.
+        build: messages for which code is generated.
         folder: folder of the files; created if it does not exist.
         seed: seed of the random images of the test vectors.
     """
@@ -53,7 +53,7 @@ def write(build: Build, folder: Path, seed: int) -> list[Path]:
 
 
 def _cantools(build: Build) -> tuple[str, str]:
-    # Not strict, because the strict loader has already accepted the file and checks more than cantools.
+    # `strict` is off, because the loader of `atalante_dbc` has already accepted the file and checks more than cantools.
     database = cantools.database.load_string(build.text, database_format="dbc", strict=False)
     assert isinstance(database, Database)
     header, code, _, _ = generate(
@@ -63,8 +63,8 @@ def _cantools(build: Build) -> tuple[str, str]:
         f"{build.name}.c",
         "",
         node_name=build.node,
-        use_round=True,  # otherwise the encoder truncates, and 0.0375 Nm is sent as 0.025 Nm
+        use_round=True,  # without rounding, the encoder would truncate 0.0375 Nm to 0.025 Nm
     )
-    # Remove the date, so that the files depend only on the DBC.
+    # Remove the date of generation, so that the files depend only on the DBC.
     header, code = (re.sub(r"(by cantools version \S+) .*", r"\1.", part) for part in (header, code))
     return header, code

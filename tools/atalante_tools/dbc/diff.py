@@ -1,8 +1,8 @@
-"""Differences between two versions of a network on the bus.
+"""Comparison of two versions of a DBC file.
 
-A change is breaking if a node of one version and a node of the other version cannot communicate. The receivers of this
-project set the criterion: they reject another length, another Data ID and a value out of range, and report a message as
-late after its timeout.
+A change is breaking if a node with the old version and a node with the new version cannot communicate. The criterion is the
+behaviour of the receivers in this project: they reject a wrong length, a wrong Data ID and a value out of range, and report
+a message as late after its timeout.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from atalante_dbc import Message, Network, Signal
 
 @dataclass(frozen=True)
 class Change:
-    """One difference. `subject` is the kind of the changed property, `where` the name of its message, signal or node."""
+    """One difference between two DBC files. `subject` is the changed property; `where` names the message, signal or node."""
 
     breaking: bool
     subject: str
@@ -24,7 +24,7 @@ class Change:
 
 
 def changes(old: Network, new: Network) -> list[Change]:
-    """Return every difference between two networks, in the order of `new`; removed items come last."""
+    """Return all differences between two networks, in the order of `new`; removed items are at the end."""
     return [*_network(old, new), *_messages(old, new)]
 
 
@@ -51,7 +51,7 @@ def _network(old: Network, new: Network) -> Iterator[Change]:
 
 def _messages(old: Network, new: Network) -> Iterator[Change]:
     was, now = ({m.name: m for m in network.messages} for network in (old, new))
-    # A renamed message is unchanged on the bus. Identifier and Data ID identify it.
+    # A message with another name, but the same identifier and Data ID, is a renamed message.
     lost = {(m.frame_id, m.data_id): m for name, m in was.items() if name not in now}
     for name, message in now.items():
         before = was.get(name)
@@ -90,7 +90,7 @@ def _timing(old: Message, new: Message) -> Iterator[Change]:
     elif old.cycle_ms != new.cycle_ms:
         yield Change(True, "timing", new.name, f"cycle {old.cycle_ms} -> {new.cycle_ms} ms")
     if old.timeout_ms != new.timeout_ms:
-        # A changed timeout is breaking only if it is not longer than the cycle time of the other version.
+        # A changed timeout breaks communication only if it is at most the cycle time of the other version.
         late = 0 < old.timeout_ms <= new.cycle_ms or 0 < new.timeout_ms <= old.cycle_ms
         yield Change(late, "timing", new.name, f"timeout {old.timeout_ms} -> {new.timeout_ms} ms")
     if old.inhibit_ms != new.inhibit_ms:
@@ -99,7 +99,7 @@ def _timing(old: Message, new: Message) -> Iterator[Change]:
 
 def _signals(old: Message, new: Message) -> Iterator[Change]:
     was, now = ({s.name: s for s in message.signals} for message in (old, new))
-    # A renamed signal is unchanged on the bus. Its bits identify it.
+    # A signal with another name, but the same bits, is a renamed signal.
     lost = {(s.start, s.length): s for name, s in was.items() if name not in now}
     for name, signal in now.items():
         where = f"{new.name}.{name}"

@@ -1,6 +1,6 @@
-"""C code for AUTOSAR E2E Profile 5 in the style of cantools: protect and check, invalid codes and range checks.
+"""C code generator for AUTOSAR E2E Profile 5 (protect and check), invalid codes and range checks.
 
-It is equivalent to `atalante_hal.wire.e2e` in Python. The generated host test compares both.
+The C code is equivalent to `atalante_hal.wire.e2e`. The generated host test compares both.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def crc_table() -> list[int]:
-    """Return the table for CRC-16/CCITT (polynomial 0x1021), one byte per step. 256 entries."""
+    """Return the CRC-16/CCITT (polynomial 0x1021) of each byte value, 256 entries."""
     table = []
     for byte in range(256):
         value = byte << 8
@@ -28,7 +28,7 @@ def crc_table() -> list[int]:
 
 
 def e2e_header(build: Build) -> str:
-    """Return the header file with the declarations of E2E protect and check."""
+    """Return the C header file with the declarations of the E2E functions."""
     name, upper = build.name, build.name.upper()
     states = "\n".join(f"    {upper}_E2E_{check.name} = {check.value}," for check in Check)
     data_ids = "\n".join(f"#define {build.c_name(m).upper()}_DATA_ID ({m.data_id:#06x}u)" for m in build.messages)
@@ -149,12 +149,12 @@ enum {name}_e2e_status_t {name}_e2e_check(
 
 
 def invalid_name(build: Build, message: Message, signal: Signal) -> str:
-    """Return the name of the macro for the invalid code of a signal."""
+    """Return the name of the C macro for the invalid code of a signal."""
     return f"{build.c_name(message)}_{camel_to_snake_case(signal.name)}".upper() + "_INVALID"
 
 
 def _signed(signal: Signal) -> str:
-    """Return the invalid code as a C literal of the type of the signal."""
+    """Return the invalid code of a signal as a signed or unsigned C literal."""
     raw = signal.invalid_raw or 0
     return str(raw - (1 << signal.length)) if signal.signed and raw >> signal.length - 1 else f"{raw:#x}u"
 
@@ -184,7 +184,7 @@ def _declarations(build: Build, message: Message) -> str:
 
 
 def e2e_source(build: Build) -> str:
-    """Return the source file with the definitions of E2E protect and check."""
+    """Return the C source file with the definitions of the E2E functions."""
     name, upper, entries = build.name, build.name.upper(), [f"{value:#06x}u" for value in crc_table()]
     table = "\n".join(f"    {', '.join(entries[start : start + 8])}," for start in range(0, len(entries), 8))
     functions = "\n".join(_definitions(build, m) for m in build.messages)

@@ -1,6 +1,6 @@
-"""Host test: a C program that compares the generated C code with the Python codec on this machine.
+"""Host test: a generated C program that compares the generated C code with the Python codec on this computer.
 
-The program reads the stream of `vectors.Vectors` from a file or from stdin. A stream on stdin needs no disk space.
+The program reads the test vectors (see `vectors.Vectors`) from a file or from stdin.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from atalante_tools.dbc.vectors import MAGIC, Vectors, signals_after_header
 if TYPE_CHECKING:
     from atalante_tools.dbc.build import Build
 
-#: Compiler flags. Values are compared bit for bit, so fused multiply-add (contraction) is off: it rounds once, the codec twice.
+#: Compiler flags. Fused multiply-add (contraction) is off, because its rounding differs from that of the Python codec.
 FLAGS: Final = (
     "-std=c11 -Wall -Wextra -Werror -O1 -g -ffp-contract=off -fsanitize=undefined,address -fno-sanitize-recover=all"
 )
@@ -30,9 +30,9 @@ _PROGRAM: Final = "host_test"
 
 
 def compile_host_test(build: Build, folder: Path) -> Path:
-    """Compile the files of `c_code.write` with sanitizers and warnings as errors, and return the program.
+    """Compile the generated files with sanitizers and with warnings as errors, and return the path of the program.
 
-    The environment variable `CC` selects another compiler than gcc.
+    The environment variable `CC` names the compiler; the default is gcc.
 
     Args:
         build: network and node.
@@ -50,12 +50,12 @@ def compile_host_test(build: Build, folder: Path) -> Path:
         [compiler, *FLAGS.split(), *sources, "-o", program, "-lm"], capture_output=True, text=True, check=False
     )
     if done.returncode:
-        raise Failed(f"{compiler} rejects the generated code: {done.stderr.strip()}")
+        raise Failed(f"{compiler} cannot compile the generated code: {done.stderr.strip()}")
     return program
 
 
 def run_host_test(build: Build, program: Path, images: int, seed: int) -> int:
-    """Run the program on random images and return the number of frames it compared.
+    """Run the host test on random images and return the number of frames that it compared.
 
     Args:
         build: network and node.
@@ -78,7 +78,7 @@ def run_host_test(build: Build, program: Path, images: int, seed: int) -> int:
                 process.stdin.write(image)
             process.stdin.close()
         except BrokenPipeError:
-            pass  # the program stops at the first difference and prints it
+            pass  # the host test prints the first difference and exits
         output = process.stdout.read().decode(errors="replace").strip()
     if process.returncode:
         raise Failed(f"the generated C code differs from the Python codec: {output}")
@@ -86,7 +86,7 @@ def run_host_test(build: Build, program: Path, images: int, seed: int) -> int:
 
 
 def makefile(build: Build) -> str:
-    """Return a Makefile that compiles and runs the host test on the vector file, without Python."""
+    """Return a Makefile that compiles the host test and runs it on the file of test vectors, without Python."""
     sources = " ".join(_sources(build))
     return f"""\
 # `make test` compares the generated C code with the test vectors of the Python codec, with sanitizers.
@@ -111,7 +111,7 @@ def _sources(build: Build) -> tuple[str, ...]:
 
 
 def source(build: Build) -> str:
-    """Return the source of `host_test.c`."""
+    """Return the C source file of the host test."""
     messages = build.messages
     functions = "\n".join(_message(build, m, messages[(row + 1) % len(messages)]) for row, m in enumerate(messages))
     table = "\n".join(f"    {{ {_size(build, m)}u, test_{camel_to_snake_case(m.name)} }}," for m in messages)
@@ -246,7 +246,7 @@ def _size(build: Build, message: Message) -> int:
 
 
 def _message(build: Build, message: Message, other: Message) -> str:
-    """Return the C test function of one message; `other` is a message with another Data ID."""
+    """Return the C test function of a message; its frames must fail the check with the Data ID of the message `other`."""
     body = ""
     if received := build.received(message):
         body += _receive(build, message, received, other)
@@ -263,7 +263,7 @@ def _receive(build: Build, message: Message, received: tuple[Signal, ...], other
     names = [camel_to_snake_case(s.name) for s in received]
     values = "\n".join(f"        EXPECT({prefix}_{name}_decode(message.{name}) == next(&in_p));" for name in names)
     wrong_id = f"{build.name}_e2e_check(&copy, payload, sizeof(payload), sizeof(payload), {other.data_id:#06x}u)"
-    # A network with one message has no other Data ID.
+    # A network with a single message has no other Data ID.
     other_id = f"            EXPECT({wrong_id} == {upper}_E2E_CRC);\n" if other is not message else ""
     return f"""
     {{

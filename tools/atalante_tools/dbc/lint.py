@@ -1,4 +1,4 @@
-"""Errors of the strict loader as findings with line numbers."""
+"""Errors of the DBC loader, split into findings with line numbers."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _LINE = re.compile(r"at line (\d+)")
 
 @dataclass(frozen=True)
 class Finding:
-    """One broken rule. `line` is None if the rule applies to the whole file."""
+    """Error in a DBC file. `line` is None if the error concerns the whole file."""
 
     line: int | None
     text: str
 
 
 def findings(path: Path) -> list[Finding]:
-    """Return the errors in `path` in the order of its lines; empty if the strict loader accepts the file."""
+    """Return the errors in a DBC file in the order of its lines; empty if the loader accepts the file."""
     try:
         atalante_dbc.load(path)
     except atalante_dbc.DbcError as error:
@@ -33,5 +33,5 @@ def _finding(path: Path, line: str) -> Finding:
     number, colon, rest = text.partition(":")
     if colon and number.isdigit():
         return Finding(int(number), rest.strip())
-    found = _LINE.search(text)  # format of the parser
+    found = _LINE.search(text)  # error text of the cantools parser
     return Finding(int(found[1]) if found else None, text.strip())

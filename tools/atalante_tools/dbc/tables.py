@@ -1,4 +1,4 @@
-"""Tables of a network: messages, signals, and the share of each message in the load of a bus."""
+"""Tables of a network: its messages, its signals, and the bus load of each message."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ Row = dict[str, object]
 
 
 def message_rows(network: Network) -> list[Row]:
-    """Return one row per message, in the order of the file."""
+    """Return one row per message, in the order of the DBC file."""
     return [
         {
             "id": f"{m.frame_id:#05x}",
@@ -27,7 +27,7 @@ def message_rows(network: Network) -> list[Row]:
 
 
 def signal_rows(network: Network) -> list[Row]:
-    """Return one row per signal, in the order of the file."""
+    """Return one row per signal, in the order of the DBC file."""
     return [
         {
             "message": m.name,
@@ -49,9 +49,9 @@ def signal_rows(network: Network) -> list[Row]:
 
 
 def load_rows(network: Network, bus: str) -> list[Row]:
-    """Return one row per message of a bus with its worst-case load, largest first.
+    """Return one row per message of a bus with its worst-case load, the largest load first.
 
-    As in `Network.bus_load`, cyclic messages count with their cycle time, event messages with their inhibit time.
+    The period of a cyclic message is its cycle time. The shortest period of an event message is its inhibit time.
 
     Args:
         network: network with the bus.

@@ -1,4 +1,4 @@
-"""Test vectors of a network: random images with the values of the Python codec, as a binary stream and as JSON examples.
+"""Test vectors of a network: random payloads and their values by the Python codec, as a binary stream and as JSON.
 
 An image is one payload of every message. The generated host test reads the stream, which is little endian: 8 bytes magic,
 u32 network hash, u32 number of images, then the images. Each image has the messages of the build in DBC order:
@@ -32,7 +32,7 @@ HEADER: Final = Struct("<8sII")
 
 
 class Vectors:
-    """Generator of random images for the messages of a build. Equal seeds give equal sequences."""
+    """Generator of random images for the messages of a `Build`. Equal seeds give equal images."""
 
     def __init__(self, build: Build, seed: int) -> None:
         self._build = build
@@ -57,7 +57,7 @@ class Vectors:
         self._order = self._stream_order()
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return, for each byte of an image in the stream, its index in the parts that `images` concatenates."""
+        """Return the index of each byte of the stream in the concatenated arrays of `images`, shape (bytes of an image,)."""
         build, codec = self._build, self._codec
         rows = len(build.messages)
         parts = (FRAME_BYTES * rows, FRAME_BYTES * rows, 8 * codec.size, 8 * codec.size, rows)
@@ -80,18 +80,18 @@ class Vectors:
         return np.array(order, np.intp)
 
     def header(self, images: int) -> bytes:
-        """Return the head of the stream for a number of images."""
+        """Return the first bytes of the stream: magic, network hash and number of images."""
         return HEADER.pack(MAGIC, self._build.network.hash32, images)
 
     def images(self, count: int) -> Iterator[bytes]:
-        """Yield the images of the stream, first the range limits and invalid codes. Call it once per instance."""
+        """Yield the images of the stream: minimum, maximum, invalid codes, then random. Can be called once per instance."""
         for image in range(count):
             encoded = self._next(image)
             parts = (self._received, self._sender.frames, self._decoded, encoded, self._in_range)
             yield np.concatenate([part.view(np.uint8) for part in parts])[self._order].tobytes()
 
     def examples(self) -> Iterator[dict[str, Any]]:
-        """Yield JSON objects of all messages with range limits, invalid codes and random values. Call it once per instance."""
+        """Yield a JSON object per message for minimum, maximum, invalid and random values. Can be called once per instance."""
         for image, kind in enumerate(("minimum", "maximum", "invalid codes", "random")):
             self._next(image)
             for row, message in enumerate(self._build.messages):
@@ -109,7 +109,7 @@ class Vectors:
                 }
 
     def _next(self, image: int) -> Vector:
-        """Make image number `image` and return the values that were encoded, shape (signals,)."""
+        """Create image number `image` and return its values before encoding, shape (signals,)."""
         limits = (self._minimum, self._maximum, self._invalid)
         encoded = limits[image] if image < len(limits) else self._random.uniform(self._minimum, self._maximum)
         self._sender.values[:] = encoded
@@ -128,5 +128,5 @@ class Vectors:
 
 
 def signals_after_header(message: Message) -> list[Signal]:
-    """Return the signals without the CRC and counter of the E2E header."""
+    """Return the signals of a message except the CRC and the counter of the E2E header."""
     return [s for s in message.signals if s.name not in ("Crc", "Counter")]

@@ -1,1 +1,1 @@
-"""Pytest plugin with fixtures for tests on the emulated robot and on hardware."""
+"""Pytest plugin with fixtures for tests on an emulated or real robot."""

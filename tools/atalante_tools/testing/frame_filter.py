@@ -1,8 +1,8 @@
-"""Communication faults for tests: a bus that loses, delays or damages frames of chosen messages, and records the others.
+"""Communication faults for tests: a bus that loses, delays or damages frames of chosen messages.
 
     HAL <- FrameFilter <- bus        HAL -> FrameFilter -> bus
 
-Faults of messages from the HAL act in `send`, faults of all other messages in `receive`.
+Faults of messages that the HAL sends act in `send`. Faults of messages that the HAL receives act in `receive`.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.transceiver import FrameTap
 from atalante_hal.wire.frame import Frames, as_words
 
-#: Largest number of delayed frames that arrive in one batch.
-_ROOM: Final = 128
+#: Largest number of delayed frames that one call of `send` or `receive` passes on.
+_BATCH: Final = 128
 
 
 @dataclass
 class Fault:
-    """Fault of chosen messages; it ends after `frames` frames of each message, or with `end()`."""
+    """Fault of chosen messages. It ends after it has affected `frames` frames of each message, or by a call of `end`."""
 
     kind: str  # drop, delay or corrupt
     messages: tuple[str, ...]  # names of the messages
     ids: frozenset[int]  # identifiers of the messages
     probability: float  # probability that a frame is affected
-    frames: int | None  # number of frames of each message; None: no limit
+    frames: int | None  # largest number of affected frames of each message; None: no limit
     cycles: int = 0  # duration of a delay [cycles]
-    bit: int | None = None  # index of the bit to damage; None: random
-    hits: dict[int, int] = field(default_factory=dict)  # identifier -> number of affected frames
+    bit: int | None = None  # index of the bit to invert; None: random
+    hits: dict[int, int] = field(default_factory=dict)  # CAN identifier -> number of affected frames
 
     @property
     def hit(self) -> int:
-        """Number of frames affected so far."""
+        """Number of affected frames so far."""
         return sum(self.hits.values())
 
     def end(self) -> None:
@@ -54,15 +54,15 @@ class Fault:
 
 
 class FrameFilter(WrappedBus):
-    """Bus with faults; without a fault it passes all frames.
+    """Bus that applies faults to frames. Without a fault it passes all frames on.
 
-    Time stamps are not shifted with the frames: a delayed frame, or a frame after a dropped one, has the stamp of another frame.
+    Time stamps are not moved with the frames: after a dropped or delayed frame, a frame has the time stamp of another frame.
 
     Args:
         bus: wrapped bus, owned by the caller.
         network: nodes and messages of the DBC.
-        tap: records the frames that pass.
-        step: makes the emulated robot in this process answer. It is called before every receive, which then does not wait.
+        tap: recorder of the frames that are passed on; None: frames are not recorded.
+        step: function that runs the emulated robot, called in every `receive`, which then does not wait; None: a real robot.
         seed: seed of the random faults.
     """
 
@@ -82,15 +82,13 @@ class FrameFilter(WrappedBus):
         self._random = np.random.default_rng(seed)
         self._syncs = {m.frame_id for m in network.messages if m.name.startswith("SYNC_")}
         self._cycle = 0
-        self._late: tuple[list[tuple[int, Frames]], list[tuple[int, Frames]]] = ([], [])  # out, in: (due, frame)
+        self._delayed: tuple[list[tuple[int, Frames]], list[tuple[int, Frames]]] = ([], [])  # out, in: (due, frame)
 
-    # -- faults --------------------------------------------------------------------------------------------------------
-
-    def drop(self, what: str, *, frames: int | None = None, probability: float = 1.0) -> Fault:
-        """Lose frames.
+    def drop(self, name: str, *, frames: int | None = None, probability: float = 1.0) -> Fault:
+        """Drop frames of the given messages.
 
         Args:
-            what: name of a message (LEFT_SK_STATE), of a node (LEFT_SK: all its messages), or a pattern (LEFT_*, *_STATE).
+            name: name of a message (LEFT_SK_STATE), of a node (LEFT_SK: all its messages), or a pattern (LEFT_*, *_STATE).
             frames: number of frames of each message. None means until the fault ends.
             probability: probability that a frame is affected, above 0 to 1.
 
@@ -100,13 +98,13 @@ class FrameFilter(WrappedBus):
         Raises:
             ValueError: If there is no such message or node, or the probability is out of range.
         """
-        return self._add("drop", what, frames, probability)
+        return self._add("drop", name, frames, probability)
 
-    def delay(self, what: str, cycles: int, *, frames: int | None = None, probability: float = 1.0) -> Fault:
-        """Delay frames.
+    def delay(self, name: str, cycles: int, *, frames: int | None = None, probability: float = 1.0) -> Fault:
+        """Delay frames of the given messages.
 
         Args:
-            what: name or pattern of messages or nodes, as in `drop`.
+            name: name or pattern of messages or nodes, as in `drop`.
             cycles: delay in cycles, from 1.
             frames: number of frames of each message. None means until the fault ends.
             probability: probability that a frame is affected, above 0 to 1.
@@ -119,17 +117,17 @@ class FrameFilter(WrappedBus):
         """
         if cycles < 1:
             raise ValueError(f"cycles of a delay must be 1 or more, got {cycles}")
-        fault = self._add("delay", what, frames, probability)
+        fault = self._add("delay", name, frames, probability)
         fault.cycles = cycles
         return fault
 
     def corrupt(
-        self, what: str, *, bit: int | None = None, frames: int | None = None, probability: float = 1.0
+        self, name: str, *, bit: int | None = None, frames: int | None = None, probability: float = 1.0
     ) -> Fault:
-        """Invert one bit of the payload.
+        """Invert one bit in the payload of frames of the given messages.
 
         Args:
-            what: name or pattern of messages or nodes, as in `drop`.
+            name: name or pattern of messages or nodes, as in `drop`.
             bit: index of the bit, modulo the payload length. None means a random bit.
             frames: number of frames of each message. None means until the fault ends.
             probability: probability that a frame is affected, above 0 to 1.
@@ -140,47 +138,45 @@ class FrameFilter(WrappedBus):
         Raises:
             ValueError: If an argument is out of range, or there is no such message or node.
         """
-        fault = self._add("corrupt", what, frames, probability)
+        fault = self._add("corrupt", name, frames, probability)
         fault.bit = bit
         return fault
 
     def clear(self) -> None:
-        """End all faults; delayed frames still arrive."""
+        """End all faults; delayed frames are still passed on."""
         self.faults.clear()
 
-    def _add(self, kind: str, what: str, frames: int | None, probability: float) -> Fault:
+    def _add(self, kind: str, name: str, frames: int | None, probability: float) -> Fault:
         if not 0.0 < probability <= 1.0:
             raise ValueError(f"probability must be above 0 and at most 1, got {probability}")
-        messages = [m for m in self._network.messages if fnmatchcase(m.name, what) or fnmatchcase(m.sender, what)]
+        messages = [m for m in self._network.messages if fnmatchcase(m.name, name) or fnmatchcase(m.sender, name)]
         if not messages:
             names = [*(m.name for m in self._network.messages), *(n.name for n in self._network.nodes)]
-            near = difflib.get_close_matches(what.upper(), names, 3)
+            near = difflib.get_close_matches(name.upper(), names, 3)
             hint = f"; did you mean {' or '.join(near)}?" if near else ""
-            raise ValueError(f"no message or node has the name {what!r}{hint}")
-        names_hit, ids = tuple(m.name for m in messages), frozenset(m.frame_id for m in messages)
-        fault = Fault(kind, names_hit, ids, probability, frames)
+            raise ValueError(f"no message or node has the name {name!r}{hint}")
+        affected, ids = tuple(m.name for m in messages), frozenset(m.frame_id for m in messages)
+        fault = Fault(kind, affected, ids, probability, frames)
         self.faults.append(fault)
         return fault
 
-    # -- bus -----------------------------------------------------------------------------------------------------------
-
     def send(self, frames: Frames) -> None:
-        """Send frames that pass the faults; see `Bus.send`.
+        """Apply the faults and send the other frames; see `Bus.send`.
 
         Args:
             frames: frames to send, shape (n,).
         """
         if not self._syncs.isdisjoint(frames["can_id"].tolist()):
             self._cycle += 1
-        if self.faults or self._late[0]:
-            frames = self._through(frames, self._late[0])
+        if self.faults or self._delayed[0]:
+            frames = self._apply_faults(frames, self._delayed[0])
         if len(frames):
             self.bus.send(frames)
             if self.tap is not None:
                 self.tap.sent(frames)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Receive frames that pass the faults; see `Bus.receive`.
+        """Receive frames and apply the faults; see `Bus.receive`.
 
         Args:
             frames: receive buffer, shape (n,).
@@ -193,18 +189,18 @@ class FrameFilter(WrappedBus):
             self._step()
             timeout = 0.0
         count = self.bus.receive(frames, timeout)
-        if self.faults or self._late[1]:
-            kept = self._through(frames[:count], self._late[1])[: len(frames)]
+        if self.faults or self._delayed[1]:
+            kept = self._apply_faults(frames[:count], self._delayed[1])[: len(frames)]
             count = len(kept)
             as_words(frames)[:count] = as_words(kept)
         if self.tap is not None and count:
             self.tap.received(frames, count)
         return count
 
-    def _through(self, frames: Frames, late: list[tuple[int, Frames]]) -> Frames:
-        """Return a copy of the frames of a batch that pass, after the delayed frames that are due."""
-        due = [frame for cycle, frame in late if cycle <= self._cycle][:_ROOM]
-        late[:] = [(cycle, frame) for cycle, frame in late if cycle > self._cycle]
+    def _apply_faults(self, frames: Frames, delayed: list[tuple[int, Frames]]) -> Frames:
+        """Apply the faults and return the frames to pass on: first the delayed frames that are due, then those of this batch."""
+        due = [frame for cycle, frame in delayed if cycle <= self._cycle][:_BATCH]
+        delayed[:] = [(cycle, frame) for cycle, frame in delayed if cycle > self._cycle]
         arriving = due
         for row, frame_id in enumerate(frames["can_id"].tolist()):
             frame: Frames = frames[row : row + 1].copy()
@@ -212,7 +208,7 @@ class FrameFilter(WrappedBus):
             if fault is None:
                 arriving.append(frame)
             elif fault.kind == "delay":
-                late.append((self._cycle + fault.cycles, frame))
+                delayed.append((self._cycle + fault.cycles, frame))
             elif fault.kind == "corrupt":
                 self._damage(frame, fault)
                 arriving.append(frame)

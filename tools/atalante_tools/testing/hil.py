@@ -1,6 +1,6 @@
-"""Parts of the pytest fixtures: a bus with the robot on it, the loop in steps and a recording of the frames.
+"""Parts of the pytest fixtures: the bus with a robot, the HAL loop in steps, and a recording of all frames.
 
-An emulated robot runs in lock-step with the HAL; on a wire it is polled before every receive of the HAL.
+An emulated robot runs in lock-step with the HAL. On a CAN interface it is polled before every `receive` of the HAL.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from atalante_tools.session.rig import join, open_buses
 if TYPE_CHECKING:
     from atalante_emulator.emulator import Emulator
 
-#: Longest wait of the emulated robot for the frames of a cycle on a wire [s].
+#: Longest time for which the emulated robot waits for the frames of a cycle on a CAN interface [s].
 _POLL: Final = 0.01
-#: Time without a frame before an emulated robot is connected to a wire [s].
+#: Time without a frame after which a CAN interface counts as free for an emulated robot [s].
 _QUIET: Final = 0.15
-#: Largest number of frames in a recording, about half a minute.
+#: Largest number of frames in a recording, about 30 s.
 KEPT: Final = 600_000
-#: Time between two frames of a cycle in a recording of virtual time [ns].
+#: Time between the time stamps of two frames of a cycle in a recording [ns].
 _FRAME_NS: Final = 20_000
 
 
-class WireTaken(BusError):  # noqa: N818
-    """Bus with frames of another robot, on which an emulated robot cannot run."""
+class BusInUse(BusError):  # noqa: N818
+    """The bus carries frames of another robot, so an emulated robot cannot use it."""
 
 
-def open_line(network: Network, target: Target, *, emulated: bool) -> tuple[Bus, Bus | None]:
-    """Open the HAL's end of the bus, and the other end if the robot is emulated.
+def open_bus(network: Network, target: Target, *, emulated: bool) -> tuple[Bus, Bus | None]:
+    """Open the bus for the HAL, and a second time for the robot if it is emulated.
 
     Args:
         network: nodes and messages of the DBC.
@@ -52,62 +52,62 @@ def open_line(network: Network, target: Target, *, emulated: bool) -> tuple[Bus,
         emulated: whether the robot is emulated.
 
     Returns:
-        The HAL's end, and the end for the emulated robot, None for a real robot.
+        Bus for the HAL, and bus for the emulated robot; the latter is None for a real robot.
 
     Raises:
         BusError: If the bus cannot be opened.
-        WireTaken: If the robot is emulated but another robot sends frames on the bus.
+        BusInUse: If the robot is emulated but another robot sends frames on the bus.
     """
     if target.embedded:
         return lockstep_pair()
-    ours = join(network, open_buses(network, target))
+    hal_bus = join(network, open_buses(network, target))
     if not emulated:
-        return ours, None
-    # A robot sends heartbeats even without SYNC.
+        return hal_bus, None
+    # The nodes of a robot send heartbeats without SYNC, too.
     scratch = new_frames(1)
-    if ours.receive(scratch, _QUIET):
-        ours.close()
-        raise WireTaken(
+    if hal_bus.receive(scratch, _QUIET):
+        hal_bus.close()
+        raise BusInUse(
             f"{target} must be free for the emulated robot, got frame {int(scratch['can_id'][0]):#x}: mark tests of the "
             "connected robot with @pytest.mark.hil, and run all others on another bus"
         )
-    return ours, join(network, open_buses(network, target))
+    return hal_bus, join(network, open_buses(network, target))
 
 
 @contextmanager
-def emulated_robot(network: Network, robot: Robot, theirs: Bus) -> Iterator[Emulator]:
-    """Run the emulated robot on its end of the bus, with an operator who presses START when the HAL is READY.
+def emulated_robot(network: Network, robot: Robot, robot_bus: Bus) -> Iterator[Emulator]:
+    """Create the emulated robot, with an operator who presses START when the HAL is READY.
 
     Args:
         network: nodes and messages of the DBC.
         robot: joint properties.
-        theirs: end of the bus for the robot.
+        robot_bus: end of the bus for the robot.
     """
-    with open_body(robot) as body:  # without PyBullet, its error names the package to install
+    with open_body(robot) as body:  # if PyBullet is missing, the error names the package to install
         from atalante_emulator.emulator import Emulator
         from atalante_emulator.pendant import Operator
 
-        yield Emulator(network, robot, body, theirs, operator=Operator())
+        yield Emulator(network, robot, body, robot_bus, operator=Operator())
 
 
-def answering(ours: Bus, emulator: Emulator) -> Callable[[], object] | None:
-    """Connect the emulated robot to the receive calls of the HAL.
+def connect(hal_bus: Bus, emulator: Emulator) -> Callable[[], object] | None:
+    """Connect the emulated robot to the bus of the HAL.
 
     Args:
-        ours: HAL's end of the bus.
+        hal_bus: HAL's end of the bus.
         emulator: emulated robot at the other end.
 
     Returns:
         Function to call before every receive of the HAL. None for a `PairBus`, which calls the emulator directly.
     """
-    if isinstance(ours, PairBus):
-        ours.step = emulator.poll
+    if isinstance(hal_bus, PairBus):
+        hal_bus.step = emulator.poll
         return None
     return lambda: emulator.poll(_POLL)
 
 
 class Stepper:
-    """HAL loop in steps. The default `controller` holds the pose in which the robot became ACTIVE."""
+    """HAL loop that runs cycle by cycle. The default `controller` holds the pose in which the robot became ACTIVE."""
 
     def __init__(self, hal: Hal, clock: Clock) -> None:
         self.hal = hal
@@ -122,11 +122,11 @@ class Stepper:
 
     @property
     def codes(self) -> list[str]:
-        """Return the diagnostic codes of the events so far, the newest `fault_memory.EVENTS_KEPT` of them."""
+        """Return the diagnostic codes of the last `fault_memory.EVENTS_KEPT` events."""
         return [event.code for event in self.hal.events]
 
     def cycle(self) -> State:
-        """Run one cycle and return its state."""
+        """Run one cycle and return the state of the HAL."""
         self._clock.wait()
         state = self.hal.read()
         if self.hal.moving:
@@ -141,7 +141,7 @@ class Stepper:
         return state
 
     def run(self, cycles: int) -> State:
-        """Run some cycles and return the state of the last one.
+        """Run a number of cycles and return the last state of the HAL.
 
         Args:
             cycles: number of cycles.
@@ -151,7 +151,7 @@ class Stepper:
         return self.state
 
     def until(self, wanted: SupervisorState, cycles: int = 2000) -> State:
-        """Run cycles until the HAL is in a state, and return the last state.
+        """Run cycles until the HAL reaches a state, and return the last state.
 
         Args:
             wanted: state to wait for.
@@ -171,14 +171,14 @@ class Stepper:
 
 
 class Recording:
-    """Recording of all frames between HAL and nodes, as `FrameTap`. It keeps the newest `KEPT` frames."""
+    """`FrameTap` that records all frames between HAL and nodes. It keeps the last `KEPT` frames."""
 
     def __init__(self, network: Network) -> None:
         self._network = network
         self._batches: list[tuple[Frames, Stamps, bool]] = []
         self._count = 0
         self._cycle, self._in_cycle = 0, 0
-        #: Returns the HAL cycle, from which the time stamps are computed: robot time, not wall-clock time.
+        #: Function that returns the HAL cycle. The time stamps are computed from this cycle.
         self.cycle: Callable[[], int] = lambda: 0
 
     def sent(self, frames: Frames) -> None:

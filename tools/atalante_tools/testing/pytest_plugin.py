@@ -1,14 +1,14 @@
-"""Pytest fixtures for tests with a robot: an emulated robot in this process, or a real robot with `--can-interface`.
+"""Pytest fixtures for tests with a robot: an emulated robot in this process, or a real robot on `--can-interface`.
 
     emulator -> bus -> faults -> hal -> loop          recorded_run: all frames
 
-- `emulator`: emulated robot; `emulator.operator` holds its pendant.
-- `bus`, `hal`: HAL's end of the bus, and the HAL on it.
-- `loop`: cycles of the HAL: `loop.until(ACTIVE)`, `loop.run(20)`, `loop.state`, `loop.codes`.
-- `faults`: communication faults by name: `faults.drop("LEFT_SK_STATE", frames=5)`, `delay`, `corrupt`.
+- `emulator`: emulated robot; `emulator.operator` is its emulated operator.
+- `bus`, `hal`: bus of the HAL, and the HAL.
+- `loop`: runs cycles of the HAL: `loop.until(ACTIVE)`, `loop.run(20)`, `loop.state`, `loop.codes`.
+- `faults`: injects communication faults: `faults.drop("LEFT_SK_STATE", frames=5)`, `delay`, `corrupt`.
 - `recorded_run`: all frames of the test, written to a CAN log if the test fails.
 
-A test marked `hil` runs with the robot on the bus, without emulator. If the bus is missing, the test fails and names the options
+A test marked `hil` runs with the robot on the bus, without emulator. If the bus is missing, the test fails and prints the options
 to use; `--can-missing=skip` skips it instead. Every pytest run loads this module, so it imports nothing heavy.
 """
 
@@ -50,20 +50,20 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--can-channel",
         default="",
         metavar="CHANNEL",
-        help="one channel for all four buses (vcan0), or one per bus: "
+        help="one channel for all four buses (vcan0), or a channel for each bus: "
         "left_leg=can0,right_leg=can1,left_sense=can2,right_sense=can3",
     )
     group.addoption(
         "--can-missing",
         choices=("fail", "skip"),
         default="fail",
-        help="result of a test whose bus is missing (default: fail)",
+        help="result of a test if its bus is missing (default: fail)",
     )
     group.addoption(
         "--can-log",
         choices=("failed", "always", "never"),
         default="failed",
-        help="tests whose frames are written to a CAN log (default: failed)",
+        help="which tests write their frames to a CAN log (default: failed)",
     )
     group.addoption(
         "--can-log-dir", default="runs/can-logs", metavar="DIR", help="folder of the CAN logs (default: %(default)s)"
@@ -71,7 +71,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Add the marker and check the options.
+    """Register the marker `hil` and check the options.
 
     Args:
         config: pytest's configuration.
@@ -79,14 +79,14 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "hil: run with the robot on the bus of --can-interface, without the emulator")
     interface, channel = config.getoption("--can-interface"), config.getoption("--can-channel")
     if interface == _EMBEDDED and channel:
-        raise pytest.UsageError(f"--can-channel {channel} needs an interface, add --can-interface socketcan")
+        raise pytest.UsageError(f"--can-channel {channel} needs an interface: add --can-interface socketcan")
     if interface != _EMBEDDED and not channel:
-        raise pytest.UsageError(f"--can-interface {interface} needs a channel, add --can-channel vcan0")
+        raise pytest.UsageError(f"--can-interface {interface} needs a channel: add --can-channel vcan0")
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Write the CAN log of a test with a recording and add its path to the report.
+    """Write the recorded frames of a test to a CAN log, and add its path to the report.
 
     Args:
         item: test item.
@@ -140,24 +140,24 @@ def _atalante_robot() -> Robot:
 
 
 @pytest.fixture
-def _atalante_line(request: pytest.FixtureRequest, _atalante_network: Network) -> Iterator[tuple[Bus, Bus | None]]:
-    """Open both ends of the bus."""
+def _atalante_buses(request: pytest.FixtureRequest, _atalante_network: Network) -> Iterator[tuple[Bus, Bus | None]]:
+    """Open the bus for the HAL and for the emulated robot."""
     from atalante_hal.bus import BusAbsent
     from atalante_tools.console.options import Target
-    from atalante_tools.testing.hil import WireTaken, open_line
+    from atalante_tools.testing.hil import BusInUse, open_bus
 
     interface, channel = request.config.getoption("--can-interface"), request.config.getoption("--can-channel")
     target = Target(interface, channel, lockstep=True)
     if target.embedded and _is_hil(request):
         _missing(request, "a hil test needs the robot: use --can-interface socketcan --can-channel can0")
     try:
-        ours, theirs = open_line(_atalante_network, target, emulated=not _is_hil(request))
+        hal_bus, robot_bus = open_bus(_atalante_network, target, emulated=not _is_hil(request))
     except BusAbsent as error:
         _missing(request, str(error))
-    except WireTaken as error:
+    except BusInUse as error:
         pytest.fail(str(error), pytrace=False)
-    yield ours, theirs
-    for end in (ours, theirs):
+    yield hal_bus, robot_bus
+    for end in (hal_bus, robot_bus):
         if end is not None:
             end.close()
 
@@ -165,26 +165,26 @@ def _atalante_line(request: pytest.FixtureRequest, _atalante_network: Network) -
 @pytest.fixture
 def emulator(
     request: pytest.FixtureRequest,
-    _atalante_line: tuple[Bus, Bus | None],
+    _atalante_buses: tuple[Bus, Bus | None],
     _atalante_network: Network,
     _atalante_robot: Robot,
 ) -> Iterator[Emulator]:
     """Return the emulated robot, with an operator who presses START when the HAL is READY."""
     from atalante_tools.testing.hil import emulated_robot
 
-    theirs = _atalante_line[1]
-    if theirs is None:
+    robot_bus = _atalante_buses[1]
+    if robot_bus is None:
         pytest.fail(
             f"{request.node.name} is marked hil and has no emulator: remove the marker or the fixture `emulator`",
             pytrace=False,
         )
-    with emulated_robot(_atalante_network, _atalante_robot, theirs) as robot:
+    with emulated_robot(_atalante_network, _atalante_robot, robot_bus) as robot:
         yield robot
 
 
 @pytest.fixture
 def recorded_run(request: pytest.FixtureRequest, _atalante_network: Network) -> Recording:
-    """Return the recording of all frames between HAL and nodes in this test; see `--can-log`."""
+    """Return the recording of all frames between HAL and nodes; `--can-log` writes it to a file."""
     from atalante_tools.testing.hil import Recording
 
     recording = Recording(_atalante_network)
@@ -195,22 +195,22 @@ def recorded_run(request: pytest.FixtureRequest, _atalante_network: Network) -> 
 @pytest.fixture
 def bus(
     request: pytest.FixtureRequest,
-    _atalante_line: tuple[Bus, Bus | None],
+    _atalante_buses: tuple[Bus, Bus | None],
     _atalante_network: Network,
     recorded_run: Recording,
 ) -> FrameFilter:
-    """Return the HAL's end of the bus with injectable faults."""
+    """Return the bus of the HAL, into which faults can be injected."""
     from atalante_tools.testing.frame_filter import FrameFilter
-    from atalante_tools.testing.hil import answering
+    from atalante_tools.testing.hil import connect
 
-    ours = _atalante_line[0]
-    step = None if _is_hil(request) else answering(ours, request.getfixturevalue("emulator"))
-    return FrameFilter(ours, _atalante_network, tap=recorded_run, step=step)
+    hal_bus = _atalante_buses[0]
+    step = None if _is_hil(request) else connect(hal_bus, request.getfixturevalue("emulator"))
+    return FrameFilter(hal_bus, _atalante_network, tap=recorded_run, step=step)
 
 
 @pytest.fixture
 def faults(bus: FrameFilter) -> FrameFilter:
-    """Return the injectable communication faults: `drop`, `delay` and `corrupt` for messages and nodes by name."""
+    """Return the injector of communication faults, with the methods `drop`, `delay` and `corrupt`."""
     return bus
 
 
@@ -222,7 +222,7 @@ def hal(
     _atalante_robot: Robot,
     recorded_run: Recording,
 ) -> Iterator[Hal]:
-    """Return the HAL, in lock-step with an emulated robot; it ends in HOLD."""
+    """Return a HAL on the bus. After the test it changes to HOLD."""
     from atalante_hal.hal import Hal
     from atalante_tools.session.rig import LOCKSTEP_PATIENCE, PATIENCE
 
@@ -236,7 +236,7 @@ def hal(
 
 @pytest.fixture
 def loop(request: pytest.FixtureRequest, hal: Hal) -> Stepper:
-    """Return the HAL loop with a controller that holds the pose; with a real robot it runs one cycle per millisecond."""
+    """Return the HAL loop with a controller that holds the pose. With a real robot, a cycle takes 1 ms."""
     from atalante_hal.loop import LockStep, WallClock
     from atalante_tools.testing.hil import Stepper
 
