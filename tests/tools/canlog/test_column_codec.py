@@ -14,7 +14,7 @@ from atalante_dbc.foreign import Layout, catalogue
 from atalante_hal.wire.codec import Codec
 from atalante_hal.wire.e2e import crc, data_id_bytes
 from atalante_hal.wire.frame import Frames, new_frames
-from atalante_tools.canlog.column_codec import BulkCodec, crc_differences, crc_of_zeros
+from atalante_tools.canlog.column_codec import ColumnCodec, crc_differences, crc_of_zeros
 
 #: DBCs with every kind of layout; each message is compared with cantools.
 COLLECTION = sorted(Path(__file__).parents[2].joinpath("foreign").glob("*.dbc"))
@@ -121,9 +121,9 @@ def compare(path: Path, generator: np.random.Generator, count: int) -> int:
     assert not found.refused
     for layout in found.layouts:
         frames = random_frames(generator, layout, count)
-        columns = BulkCodec(layout).decode(frames)
+        columns = ColumnCodec(layout).decode(frames)
         lists = {name: column.values.tolist() for name, column in columns.items()}
-        codec = BulkCodec(layout)
+        codec = ColumnCodec(layout)
         undefined = np.zeros(count, np.bool_)
         raw = codec.extract(frames.view(np.uint64).reshape(count, -1)[:, 1:].T) if layout.length else None
         for multiplexer in layout.multiplexers:
@@ -237,7 +237,7 @@ def test_short_frames_are_rejected(network: atalante_dbc.Network) -> None:
     frames = new_frames(2)
     frames["len"] = 12, 8
     with pytest.raises(ValueError, match="frames of LEFT_FH_STATE must have at least 12 bytes, got 8"):
-        BulkCodec(layout).decode(frames)
+        ColumnCodec(layout).decode(frames)
     assert network.message("LEFT_FH_STATE").length == 12
 
 
@@ -247,7 +247,7 @@ def test_values_are_equal_to_the_codec_of_the_control_loop(network: atalante_dbc
     found = catalogue(atalante_dbc.DBC_FILE)
     for message in network.messages:
         frames = random_frames(generator, found.layout(message.name), 5)
-        codec = BulkCodec(found.layout(message.name))
+        codec = ColumnCodec(found.layout(message.name))
         columns = codec.decode(frames)
         single = Codec([message])
         out = np.zeros(single.size)
@@ -259,7 +259,7 @@ def test_values_are_equal_to_the_codec_of_the_control_loop(network: atalante_dbc
 
 
 def test_index_finds_a_signal_or_lists_the_valid_names() -> None:
-    codec = BulkCodec(catalogue(atalante_dbc.DBC_FILE).layout("LEFT_FH_STATE"))
+    codec = ColumnCodec(catalogue(atalante_dbc.DBC_FILE).layout("LEFT_FH_STATE"))
     assert codec.fields[codec.index("Position")].name == "Position"
     with pytest.raises(KeyError, match=r"signal of LEFT_FH_STATE must be one of .*, got 'Nothing'"):
         codec.index("Nothing")

@@ -1,1 +1,1 @@
-"""CAN logs: decode and validate them."""
+"""Commands that decode and validate CAN logs."""

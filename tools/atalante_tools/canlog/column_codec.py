@@ -1,8 +1,8 @@
-"""Array codec for logs: decodes all frames of one message of any DBC, and computes their E2E CRCs.
+"""Codec for logs: decodes many frames of one message in one call, for any DBC, and computes E2E CRCs.
 
 The codec of the control loop (`codec.Codec`) decodes many messages of one cycle and requires that no signal crosses a 64-bit
-word. This codec decodes many frames of one message and supports every layout: Intel and Motorola, signals across 64-bit words,
-64-bit signals, IEEE floats and multiplexed signals. The values are equal to those of cantools.
+word. This codec decodes many frames of one message. It supports Intel and Motorola layouts, signals across 64-bit words, 64-bit
+signals, IEEE floats and multiplexed signals. The values are equal to those of cantools.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ class Column:
     """Values of one signal in many frames.
 
     Attributes:
-        values: physical values, shape (n,), DBC units; int64 or uint64 if factor and offset in the DBC are integers (Python
-            integers if neither type is wide enough), otherwise float64.
-        present: frames with the signal, shape (n,); None: all. The multiplexer selects another signal in the other frames, and
-            their values are meaningless.
+        values: physical values, shape (n,), DBC units. The type is float64 if factor or offset in the DBC is not an integer;
+            otherwise int64, uint64, or Python integers for values of more than 64 bits.
+        present: mask of the frames that contain the signal, shape (n,); None: all frames. A frame without the signal contains
+            another signal of the multiplexer, so its value here is meaningless.
     """
 
     values: Values
@@ -49,7 +49,7 @@ class Column:
 
 
 def payload_words(frames: Frames, length: int) -> Words:
-    """Return payloads as little-endian words, with the first words of all frames in the first row. Shape (words, n).
+    """Return the payloads as 64-bit little-endian words; row k holds word k of every frame. Shape (words, n).
 
     Args:
         frames: `FRAME` records, shape (n,).
@@ -59,8 +59,8 @@ def payload_words(frames: Frames, length: int) -> Words:
     return np.ascontiguousarray(as_words(frames)[:, 1 : 1 + count].T)
 
 
-class BulkCodec:
-    """Codec of one message layout. `fields` is ordered by kind: signed, unsigned, float; `index` returns the row of a signal."""
+class ColumnCodec:
+    """Decoder for one message layout. `fields` lists the signed fields first, then the unsigned fields, then the floats."""
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
@@ -84,11 +84,11 @@ class BulkCodec:
             ) from None
 
     def _plan(self) -> None:
-        """Assign each field to its source: an Intel word, a byte-swapped (Motorola) word, or a word joined from two."""
+        """Assign a source to each field: an Intel word, a byte-swapped Motorola word, or a word joined from two words."""
         rows: dict[tuple[str, int], int] = {}
         self._little: list[int] = []  # Intel words
         self._big: list[int] = []  # Motorola words, byte-swapped
-        self._joined: list[tuple[bool, int, int]] = []  # (is Motorola, first word, shift) of fields across two words
+        self._joined: list[tuple[bool, int, int]] = []  # (is Motorola, first word, shift) of each field in two words
         sources: list[tuple[str, int]] = []
         left: list[int] = []
         for number, field in enumerate(self.fields):
@@ -115,7 +115,9 @@ class BulkCodec:
         self._right_unsigned = np.array(right[self._signed :], np.uint64)[:, None]
 
     def extract(self, words: Words) -> Words:
-        """Extract the raw codes: signed ones as two's complement of 64 bits, floats as their bits. Shape (fields, n).
+        """Return the raw code of every field in every frame, as 64 bits. Shape (fields, n).
+
+        Signed codes are sign-extended. A float field keeps its bit pattern.
 
         Args:
             words: result of `payload_words`, shape (words, n).
@@ -141,7 +143,7 @@ class BulkCodec:
         return raw
 
     def values(self, raw: Words, index: int) -> Values:
-        """Return the physical values of one field, integers exact. Shape (n,), DBC units.
+        """Return the physical values of one field, in DBC units; integers are exact. Shape (n,).
 
         Args:
             raw: result of `extract`, shape (fields, n).
@@ -150,7 +152,7 @@ class BulkCodec:
         field, codes = self.fields[index], raw[index]
         if field.kind == "float":
             unsigned, floating = _FLOATS[field.length]
-            with np.errstate(invalid="ignore", over="ignore"):  # any payload is allowed, also a signalling NaN
+            with np.errstate(invalid="ignore", over="ignore"):  # a payload may contain a signalling NaN
                 real = codes.astype(unsigned).view(floating).astype(np.float64)
                 return np.asarray(real * field.factor + field.offset)
         integers = codes.view(np.int64) if field.kind == "signed" or field.length < _WORD else codes
@@ -176,7 +178,7 @@ class BulkCodec:
         return mask
 
     def undefined(self, raw: Words, multiplexer: str) -> Mask:
-        """Return the mask of the frames whose multiplexer has a value without a layout in the DBC. Shape (n,).
+        """Return the mask of the frames with a multiplexer value that the DBC does not define. Shape (n,).
 
         Args:
             raw: result of `extract`, shape (fields, n).
@@ -188,7 +190,7 @@ class BulkCodec:
         return unknown if present is None else unknown & present
 
     def decode(self, frames: Frames) -> dict[str, Column]:
-        """Decode every signal of frames of this message, in the order of the DBC.
+        """Decode every signal of the given frames, in DBC order.
 
         Args:
             frames: `FRAME` records, shape (n,), each at least as long as the message.
@@ -214,9 +216,9 @@ def raw_range(field: Field) -> range:
 
 
 def _integer_type(field: Field) -> Any:
-    """Return the type that holds every raw and physical value of a field with integer factor and offset.
+    """Return the integer type that can hold every raw and physical value of a field with integer factor and offset.
 
-    It is int64, uint64, or object for Python integers.
+    The type is int64, uint64, or object for Python integers.
     """
     factor, offset = int(field.factor), int(field.offset)
     codes = raw_range(field)
@@ -232,7 +234,9 @@ def _integer_type(field: Field) -> Any:
 
 @cache
 def _byte_table(followed_by: int) -> npt.NDArray[np.uint16]:
-    """Return the contribution of a byte to the CRC (over GF(2), start 0), by its value. Shape (256,).
+    """Return the CRC contribution of one payload byte, for each byte value. Shape (256,).
+
+    The contribution is the CRC with start value 0 over the byte and the zero bytes after it.
 
     Args:
         followed_by: number of bytes after the byte.
@@ -243,7 +247,7 @@ def _byte_table(followed_by: int) -> npt.NDArray[np.uint16]:
 
 @cache
 def _pair_table(followed_by: int) -> npt.NDArray[np.uint16]:
-    """Return the contribution of two bytes to the CRC, by their little-endian number. Shape (65536,).
+    """Return the CRC contribution of two adjacent payload bytes, for each little-endian value. Shape (65536,).
 
     Args:
         followed_by: number of bytes after the two bytes.
@@ -252,7 +256,7 @@ def _pair_table(followed_by: int) -> npt.NDArray[np.uint16]:
 
 
 def crc_of_zeros(length: int, data_id: int) -> int:
-    """Return the CRC of a payload of zeros, which is the constant of the affine map.
+    """Return the CRC of a payload of zeros, to which the contributions of the payload bytes are added.
 
     Args:
         length: payload length with the CRC, bytes.
@@ -262,7 +266,7 @@ def crc_of_zeros(length: int, data_id: int) -> int:
 
 
 def crc_differences(frames: Frames, length: int) -> npt.NDArray[np.uint16]:
-    """Return the received CRC xor the contribution of the payload. Shape (n,).
+    """Return the received CRC XORed with the CRC contributions of all payload bytes. Shape (n,).
 
     The CRC is affine over GF(2), so a frame is intact if and only if the result is `crc_of_zeros(length, data_id)`. A lookup
     table of 65536 entries gives the contribution of each pair of bytes.

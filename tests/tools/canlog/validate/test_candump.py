@@ -97,7 +97,7 @@ def test_chunk_size_does_not_change_the_frames(tmp_path: Path, monkeypatch: pyte
 
     whole = read()
     for piece, frames in ((400, 7), (1000, 100), (4096, 801)):
-        monkeypatch.setattr(log_module, "_PIECE_BYTES", piece)
+        monkeypatch.setattr(log_module, "_TEXT_BYTES", piece)
         monkeypatch.setattr(log_module, "_CHUNK_FRAMES", frames)
         assert read() == whole
 
@@ -221,7 +221,7 @@ def test_seconds_with_different_numbers_of_digits_are_read(tmp_path: Path) -> No
 
 
 def test_line_longer_than_the_buffer_is_unreadable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(log_module, "_PIECE_BYTES", 512)
+    monkeypatch.setattr(log_module, "_TEXT_BYTES", 512)
     path = tmp_path / "long.log"
     path.write_text("(0.000001) can0 100#00\n" + "x" * 2000 + "\n(0.000002) can0 100#00\n")
     log = open_log(path)

@@ -358,8 +358,8 @@ def test_list_rules_as_json_has_every_threshold() -> None:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ((), "name one or more logs, or a live bus"),
-        (("a.log", "-i", "virtual", "-c", "x"), "name one or more logs, or a live bus"),
+        ((), "the input must be log files or a live bus (-i socketcan -c can0), got neither"),
+        (("a.log", "-i", "virtual", "-c", "x"), "(-i socketcan -c can0), got both"),
         (("-i", "virtual"), "virtual needs a channel"),
         (("a.log", "--node", "NO_NODE"), "--node must be a sender in the DBC"),
     ],

@@ -1,6 +1,6 @@
 """Command `atalante decode`: convert the signals of CAN logs to Parquet or MCAP.
 
-Data flow, chunk by chunk: log -> bulk codec -> columns -> file.
+Data flow of each chunk of frames: log -> column codec -> columns of values -> file.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
     "-o", "--out", required=True, type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
     help="Output file: .parquet (one row per value) or .mcap (protobuf, one topic per message).",
 )  # fmt: skip
-@click.option("--dbc", type=_FILE, default=None, help="DBC of the logs.  [default: the DBC of the robot]")
+@click.option("--dbc", type=_FILE, default=None, help="DBC to decode with.  [default: the DBC of the robot]")
 def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
     """Decode CAN logs (.log of candump, .asc, .blf, .mf4, .trc, .csv) to signals in physical units.
 
@@ -48,16 +48,16 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
     from atalante_tools.canlog.validate.plan import Plan
 
     plan = Plan(catalogue(dbc or DBC_FILE))
-    for refused in plan.refused:
-        say(f"{refused.name} is not decoded: {refused.reason}")
+    for unsupported in plan.refused:
+        say(f"{unsupported.name} is not decoded: {unsupported.reason}")
     sources = [open_log(path) for path in logs]
     decoder = Decoder(plan)
     progress = Progress()
     with _complete_file(out) as part, closing(_sink(part, out.suffix.lower(), plan)) as sink:
         for source in sources:
             for chunk in source.chunks():
-                for piece in decoder.decode(chunk):
-                    sink.write(piece, source.channels.names)
+                for decoded in decoder.decode(chunk):
+                    sink.write(decoded, source.channels.names)
                 sink.flush()
                 if progress.due():
                     share = 100.0 * source.position / max(1, source.size)
@@ -66,15 +66,15 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
             for remark in source.remarks:
                 say(remark.sentence)
     say(f"{out}: {sink.values} values of {decoder.decoded} frames")
-    if decoder.left_out:
-        say(f"skipped: {decoder.left_out}")
+    if decoder.skipped:
+        say(f"skipped: {decoder.skipped}")
     if not decoder.decoded:
         raise SystemExit(FAILED)
 
 
 @contextmanager
 def _complete_file(out: Path) -> Iterator[Path]:
-    """Provide a temporary path, and rename it to `out` after the `with` block.
+    """Yield the path of a temporary file, which is renamed to `out` after the `with` block.
 
     If the block raises an exception, the temporary file is removed and an existing `out` is unchanged.
 
@@ -92,7 +92,7 @@ def _complete_file(out: Path) -> Iterator[Path]:
 
 
 def _sink(out: Path, suffix: str, plan: Plan) -> Sink:
-    """Open the output file in the format of the suffix.
+    """Open the output file as Parquet or MCAP, according to its suffix.
 
     Raises:
         Failed: If a package for the format is not installed.

@@ -1,7 +1,7 @@
 """Writer of decoded signals as MCAP, with one topic per message (`/can/LEFT_FH_STATE`) and protobuf schemas from the DBC.
 
-Every field is eight bytes wide: a double, or a fixed-width integer if the values in the DBC are integers. Therefore array
-operations encode all messages of a chunk. Fields that the multiplexer does not select are absent, not zero.
+Every field has eight bytes: a double, or a fixed-width integer if the values in the DBC are integers. The equal width allows
+array operations to encode all messages of a chunk. Fields that the multiplexer does not select are absent from the message.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorS
 from mcap.writer import CompressionType, Writer
 
 from atalante_dbc.foreign import Layout
-from atalante_tools.canlog.decode.signals import Piece
+from atalante_tools.canlog.decode.signals import DecodedFrames
 from atalante_tools.canlog.validate.plan import Plan
 
 _PACKAGE = "atalante.can"
@@ -30,7 +30,7 @@ _TYPES: dict[str, tuple[Any, str]] = {
 
 
 class McapSink:
-    """MCAP file; the messages of each chunk are written in the order of the log."""
+    """MCAP file with one protobuf message per CAN frame, in the order of the log."""
 
     def __init__(self, path: Path, plan: Plan) -> None:
         self._plan = plan
@@ -41,26 +41,27 @@ class McapSink:
         self._writer.add_metadata("dbc", {"file": plan.catalogue.path.name, "crc32": f"{plan.catalogue.hash32:08X}"})
         self._topics: dict[tuple[int, int], int] = {}
         self._schemas: dict[int, int] = {}
-        self._waiting: list[tuple[int, int, int, bytes]] = []  # index in the chunk, topic, stamp [ns], payload
+        #: Messages for the next `flush`: (index in the chunk, topic, time stamp [ns], payload).
+        self._buffered: list[tuple[int, int, int, bytes]] = []
 
-    def write(self, piece: Piece, channels: Sequence[str]) -> None:
-        """Encode the messages of a piece.
+    def write(self, decoded: DecodedFrames, channels: Sequence[str]) -> None:
+        """Encode the decoded frames of one message.
 
         Args:
-            piece: decoded frames of one message.
+            decoded: decoded frames of one message.
             channels: names of the channels of the log.
         """
-        columns = [piece.column(index) for index in range(len(piece.codec.fields))]
-        layout = self._plan.layouts[piece.row]
-        if piece.row not in self._schemas:
-            self._schemas[piece.row] = self._writer.register_schema(
+        columns = [decoded.column(index) for index in range(len(decoded.codec.fields))]
+        layout = self._plan.layouts[decoded.row]
+        if decoded.row not in self._schemas:
+            self._schemas[decoded.row] = self._writer.register_schema(
                 f"{_PACKAGE}.{layout.name}",
                 "protobuf",
                 _descriptor(
-                    layout, [(f.name, c.values.dtype.kind) for f, c in zip(piece.codec.fields, columns, strict=True)]
+                    layout, [(f.name, c.values.dtype.kind) for f, c in zip(decoded.codec.fields, columns, strict=True)]
                 ),
             )
-        topics = np.array([self._topic(piece.row, channel, channels) for channel in piece.channels.tolist()])
+        topics = np.array([self._topic(decoded.row, channel, channels) for channel in decoded.channels.tolist()])
         masks = [c.present for c in columns]
         patterns = np.array([np.ones(len(topics), np.bool_) if m is None else m for m in masks]).T
         self.values += int(patterns.sum())
@@ -68,25 +69,25 @@ class McapSink:
             where = np.flatnonzero((patterns == pattern).all(axis=1))
             present_fields = [number for number, present in enumerate(pattern.tolist()) if present]
             payloads = encode([(number + 1, columns[number].values[where]) for number in present_fields], len(where))
-            self._waiting += zip(
-                piece.indices[where].tolist(),
+            self._buffered += zip(
+                decoded.indices[where].tolist(),
                 topics[where].tolist(),
-                piece.stamps[where].tolist(),
+                decoded.stamps[where].tolist(),
                 payloads,
                 strict=True,
             )
 
     def flush(self) -> None:
         """Write the encoded messages of the chunk to the file."""
-        self._waiting.sort(key=lambda message: message[0])
-        for _, topic, stamp, payload in self._waiting:
+        self._buffered.sort(key=lambda message: message[0])
+        for _, topic, stamp, payload in self._buffered:
             self._writer.add_message(topic, stamp, payload, stamp)
-        self._waiting.clear()
+        self._buffered.clear()
 
     def _topic(self, row: int, channel: int, channels: Sequence[str]) -> int:
-        """Return the topic of a message on a channel.
+        """Return the MCAP topic number of a message on a channel.
 
-        It is `/can/MESSAGE` for the first channel of the message and `/can/CHANNEL/MESSAGE` for further channels.
+        The topic name is `/can/MESSAGE` for the first channel of the message and `/can/CHANNEL/MESSAGE` for further channels.
         """
         topic = self._topics.get((row, channel))
         if topic is None:
@@ -99,13 +100,13 @@ class McapSink:
         return topic
 
     def close(self) -> None:
-        """Write the end of the file and close it."""
+        """Write the file footer and close the file."""
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._file.close()
 
 
 def encode(fields: Sequence[tuple[int, npt.NDArray[Any]]], count: int) -> list[bytes]:
-    """Encode protobuf messages with eight-byte fields.
+    """Encode protobuf messages in which every field has eight bytes.
 
     Args:
         fields: (field number, values of shape (count,)) of each field.
@@ -134,7 +135,7 @@ def _varint(number: int) -> bytes:
 
 
 def _descriptor(layout: Layout, fields: Sequence[tuple[str, str]]) -> bytes:
-    """Return the descriptor set of a message as proto2, in which optional fields can be absent."""
+    """Return the serialized protobuf descriptor of a message, as proto2 because its fields are optional."""
     files = FileDescriptorSet()
     file = files.file.add(name=f"{layout.name}.proto", package=_PACKAGE)
     message = file.message_type.add(name=layout.name)

@@ -1,15 +1,15 @@
-"""Writer of decoded signals as Parquet, with one row per value, so that every DBC gives the same seven columns.
+"""Writer of decoded signals as Parquet: one row per value, with the same seven columns for every DBC.
 
 | column | content |
 |---|---|
-| time | stamp of the frame, ns |
+| time | time stamp of the frame, ns |
 | channel, message, signal | names |
 | value | physical value, float64 |
 | integer | exact integer if float64 cannot hold every value of the signal, otherwise null |
 | text | name of the value in the value table, null without a name |
 
-The rows of one signal are contiguous, so that `pandas.read_parquet(file, filters=[("signal", "==", "Position")])` reads only a
-small part of the file.
+The rows of one signal are contiguous. Therefore `pandas.read_parquet(file, filters=[("signal", "==", "Position")])` reads only
+a small part of the file.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ import pyarrow.parquet as pq
 
 from atalante_dbc.foreign import Field
 from atalante_tools.canlog.column_codec import Column, raw_range
-from atalante_tools.canlog.decode.signals import Piece
+from atalante_tools.canlog.decode.signals import DecodedFrames
 from atalante_tools.canlog.validate.plan import Plan
 
-_EXACT = 1 << 53  # largest range of integers that are exact in float64
+_EXACT = 1 << 53  # float64 is exact for integers up to this magnitude
 _DECIMAL = pa.decimal128(38, 0)
 _NAMES = pa.dictionary(pa.int32(), pa.string())
 _SCHEMA = pa.schema(
@@ -68,17 +68,17 @@ class ParquetSink:
             column_encoding={"time": "DELTA_BINARY_PACKED", "value": "BYTE_STREAM_SPLIT"},
         )
 
-    def write(self, piece: Piece, channels: Sequence[str]) -> None:
-        """Add the values of a piece.
+    def write(self, decoded: DecodedFrames, channels: Sequence[str]) -> None:
+        """Add the signal values of the decoded frames of one message.
 
         Args:
-            piece: decoded frames of one message.
+            decoded: decoded frames of one message.
             channels: names of the channels of the log.
         """
         self._channels = channels
-        for index, field in enumerate(piece.codec.fields):
-            column, stamps, channel_of_row = piece.column(index), piece.stamps, piece.channels
-            texts = self._texts_of(field, piece.raw[index].view(np.int64))
+        for index, field in enumerate(decoded.codec.fields):
+            column, stamps, channel_of_row = decoded.column(index), decoded.stamps, decoded.channels
+            texts = self._texts_of(field, decoded.raw[index].view(np.int64))
             if column.present is not None:
                 present = column.present
                 column, stamps, channel_of_row = (
@@ -92,7 +92,7 @@ class ParquetSink:
                 continue
             if texts is None:
                 texts = np.full(count, -1, np.int32)
-            message = np.full(count, piece.row, np.int32)
+            message = np.full(count, decoded.row, np.int32)
             signal = np.full(count, self._signal_number[field.name], np.int32)
             values = column.values.astype(np.float64)
             self._rows.append((stamps, channel_of_row.astype(np.int32), message, signal, values, texts))
@@ -100,7 +100,7 @@ class ParquetSink:
             self.values += count
 
     def flush(self) -> None:
-        """Write the values since the last call as a row group."""
+        """Write the values added since the last flush as one row group."""
         if not self._rows:
             return
         times, channel_of_row, messages, signals, values, texts = (
@@ -121,7 +121,11 @@ class ParquetSink:
         self._integers.clear()
 
     def _texts_of(self, field: Field, codes: npt.NDArray[np.int64]) -> npt.NDArray[np.int32] | None:
-        """Return the index into `_texts` of each code, -1 for a code without a name; None for a field without a value table."""
+        """Return the index into `_texts` for each code; -1 for a code without a name.
+
+        Returns:
+            The indices, shape (n,); None if the field has no value table.
+        """
         if not field.choices:
             return None
         known = np.array(sorted(field.choices), np.int64)
@@ -130,18 +134,18 @@ class ParquetSink:
         return np.where(known[at] == codes, numbers[at], np.int32(-1))
 
     def close(self) -> None:
-        """Write the end of the file and close it."""
+        """Write the file footer and close the file."""
         self._writer.close()
 
 
 def _exact(field: Field, values: npt.NDArray[Any]) -> Any:
-    """Return the values as decimals if float64 cannot hold every value of the field, otherwise nulls."""
+    """Return the values as decimals if float64 is not exact for the field, otherwise as nulls."""
     codes = raw_range(field) if field.kind != "float" else range(0)
     if values.dtype.kind == "f" or not codes or max(-codes[0], codes[-1]) * abs(field.factor) <= _EXACT:
         return pa.nulls(len(values), _DECIMAL)
     if values.dtype.kind == "O":
         return pa.array(values.tolist(), _DECIMAL)
-    # A decimal is 16 bytes, two's complement, low word first.
+    # Arrow stores a decimal as 16 bytes in two's complement, low word first.
     words = np.zeros((len(values), 2), np.int64)
     words[:, 0] = values.view(np.int64)
     if values.dtype.kind == "i":

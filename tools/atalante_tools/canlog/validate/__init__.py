@@ -30,11 +30,11 @@ _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 class Options:
     """Options of `atalante validate`."""
 
-    interface: str  # interface of python-can; empty: read logs
-    channel: str  # channels of the interface
-    seconds: float | None  # duration of listening [s]; None: until Ctrl-C
+    interface: str  # python-can interface of the live bus; empty: check log files
+    channel: str  # channels of the live bus
+    seconds: float | None  # listening time on the live bus [s]; None: until Ctrl-C
     dbc: Path | None  # None: the DBC of the robot
-    node: str | None  # the only node whose messages are expected; None: all nodes
+    node: str | None  # require only the messages of this node; None: of all nodes
     rules_file: Path | None
     list_rules: bool
     junit: Path | None
@@ -66,14 +66,14 @@ _options = options_as(
             type=Between(0.1),
             default=None,
             metavar="SECONDS",
-            help="Duration of listening to the live bus, s.  [default: until Ctrl-C]",
+            help="Listening time on the live bus, in seconds.  [default: until Ctrl-C]",
         ),
         click.option("--dbc", type=_FILE, default=None, help="DBC to check against.  [default: the DBC of the robot]"),
         click.option(
             "--node",
             default=None,
             metavar="NODE",
-            help="Expect only the messages of this node, for a test bench with one node.  [default: all nodes]",
+            help="Require only the messages of this node, for a test bench with one node.  [default: all nodes]",
         ),
         click.option(
             "--rules",
@@ -124,7 +124,8 @@ def command(logs: tuple[Path, ...], options: Options) -> None:
             click.echo(rules_text())
         return
     if bool(logs) == bool(options.interface):
-        raise click.UsageError("name one or more logs, or a live bus: -i socketcan -c can0")
+        received = "both" if logs else "neither"
+        raise click.UsageError(f"the input must be log files or a live bus (-i socketcan -c can0), got {received}")
     if options.interface and not options.channel:
         raise click.UsageError(f"{options.interface} needs a channel: -c can0")
     plan, project = _prepare(options)
@@ -163,7 +164,7 @@ def _prepare(options: Options) -> tuple[Plan, Project]:
 
 
 def _read(logs: Sequence[Path], plan: Plan, project: Project, node: str | None) -> tuple[list[Report], int]:
-    """Check the logs one after the other; log an error for each one that cannot be opened.
+    """Check the logs in turn. A log that cannot be opened is reported on stderr and skipped.
 
     Returns:
         The reports of the logs that could be opened, and the exit code.
@@ -189,7 +190,7 @@ def _read(logs: Sequence[Path], plan: Plan, project: Project, node: str | None) 
 
 
 def _listen(options: Options, plan: Plan, project: Project) -> tuple[list[Report], int]:
-    """Check a live bus until the time is over or a stop signal arrives.
+    """Check a live bus until the listening time ends or a stop signal is received.
 
     Returns:
         The report, and the exit code; Ctrl-C is the normal end and gives 0.
@@ -225,7 +226,7 @@ def _listen(options: Options, plan: Plan, project: Project) -> tuple[list[Report
 
 
 def _show(result: Report, as_json: bool) -> None:
-    """Print a report: as text on stdout, or the findings as JSON on stdout and the text on stderr."""
+    """Print the report as text on stdout. With `as_json`, print the findings on stdout and the text on stderr."""
     from atalante_tools.canlog.validate.report import text
 
     if as_json:

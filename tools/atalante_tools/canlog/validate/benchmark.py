@@ -1,7 +1,7 @@
 """Benchmarks of `atalante bench`: time to check a log, with other decoders as baselines.
 
-The log is a run of the emulated robot in ACTIVE, repeated to 1.3 million frames. Alive counters and CRCs are computed again for
-the repeated frames, so that no rule reports a finding.
+The log is a run of the emulated robot in ACTIVE, repeated to 1.3 million frames. The repeated frames get new alive counters and
+CRCs, because the rules would report the repetition otherwise.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from atalante_tools.canlog.column_codec import crc_differences, crc_of_zeros
 from atalante_tools.canlog.validate.plan import Plan
 from atalante_tools.canlog.validate.project import Project
 
-#: Recorded cycles and number of repetitions: together 50,000 cycles, 1.3 million frames. The recording holds whole periods of
-#: every message and is long enough for the joints to come to rest.
+#: Recorded cycles, and number of repetitions. The log has 50,000 cycles with 1.3 million frames.
+#: The recording has a whole number of periods of every message, and the joints come to rest in it.
 _CYCLES, _REPEATED = 2000, 25
 _QUICK_CYCLES, _QUICK_REPEATED = 300, 2
-#: Frames in a block of the baseline python-can with cantools, which is slow.
+#: Number of frames that the slow baseline of python-can and cantools decodes per block.
 _SLICE = 30_000
 _MS = 1_000_000  # ns
 _BEGIN = 1_700_000_000 * 1000 * _MS
@@ -36,7 +36,7 @@ _LENGTHS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64])
 
 
 def judge_log(effort: Effort) -> Measurement:
-    """Measure reading, decoding and checking a candump log by all rules.
+    """Measure the CPU time to read, decode and check a candump log with all rules.
 
     The baseline reads and decodes the same log with python-can and cantools.
 
@@ -66,7 +66,7 @@ def judge_log(effort: Effort) -> Measurement:
 
 
 def judge_against_mdf(effort: Effort) -> Measurement:
-    """Measure the work of `judge_log` against asammdf.
+    """Compare the check of a candump log with the asammdf decoder.
 
     The baseline decodes the same frames from MF4. It parses no text and checks no rule.
 
@@ -98,7 +98,7 @@ def judge_against_mdf(effort: Effort) -> Measurement:
 
 
 def _validation(path: Path, frames: Frames) -> Block:
-    """Return a block that checks the log and requires a report without findings."""
+    """Return a benchmark block that checks the log and fails if the report has findings."""
     from atalante_dbc.foreign import catalogue
     from atalante_tools.canlog.validate.run import validate_log
 
@@ -128,7 +128,7 @@ def _dbc() -> Path:
 
 @contextmanager
 def _log(effort: Effort) -> Iterator[tuple[Path, Frames]]:
-    """Provide the path of a candump log in a temporary folder, and its frames."""
+    """Yield the path of a temporary candump log, and its frames."""
     cycles, repeated = (_QUICK_CYCLES, _QUICK_REPEATED) if effort.quick else (_CYCLES, _REPEATED)
     frames, cycle, sent = _repeat(*_record(cycles), cycles, repeated)
     with tempfile.TemporaryDirectory(prefix="atalante-bench-") as folder:
@@ -142,20 +142,20 @@ class _Tap:
 
     def __init__(self) -> None:
         self.cycle = 0
-        self.taken: list[tuple[Frames, int, bool]] = []
+        self.recorded: list[tuple[Frames, int, bool]] = []
 
     def sent(self, frames: Frames) -> None:
-        self.taken.append((frames.copy(), self.cycle, True))
+        self.recorded.append((frames.copy(), self.cycle, True))
 
     def received(self, frames: Frames, count: int) -> None:
-        self.taken.append((frames[:count].copy(), self.cycle, False))
+        self.recorded.append((frames[:count].copy(), self.cycle, False))
 
 
 @cache
 def _record(cycles: int) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """Record the robot while it holds its pose in ACTIVE.
+    """Record the CAN frames while the robot holds its pose in ACTIVE.
 
-    The hold compensates gravity, so the joints come to rest at their first position and a repetition begins without a jump.
+    The hold compensates gravity, so the joints return to their first position and a repetition begins without a jump.
 
     Args:
         cycles: number of cycles in ACTIVE.
@@ -182,23 +182,23 @@ def _record(cycles: int) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.
                 held += 1
             else:
                 hal.hold()
-                tap.taken.clear()
+                tap.recorded.clear()
             require(
                 hal.state.cycle < cycles + 2000,
                 f"the robot must be ACTIVE within 2000 cycles, got {hal.state.supervisor.name}",
             )
-    taken = tap.taken
-    frames = np.concatenate([f for f, _, _ in taken])
-    counts = [len(f) for f, _, _ in taken]
-    return frames, np.repeat([c for _, c, _ in taken], counts), np.repeat([s for _, _, s in taken], counts)
+    recorded = tap.recorded
+    frames = np.concatenate([f for f, _, _ in recorded])
+    counts = [len(f) for f, _, _ in recorded]
+    return frames, np.repeat([c for _, c, _ in recorded], counts), np.repeat([s for _, _, s in recorded], counts)
 
 
 def _repeat(
     frames: Frames, cycle: npt.NDArray[np.int64], sent: npt.NDArray[np.bool_], cycles: int, times: int
 ) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """Repeat the recording, with alive counters and CRCs of one continuous run.
+    """Repeat the recorded frames, with the alive counters and CRCs of one continuous run.
 
-    The arrays have shape (n,), the results (times * n,).
+    The arrays have shape (n,), the results have shape (times * n,).
     """
     whole = new_frames(len(frames) * times)
     whole.view("<u8").reshape(times, -1)[:] = frames.view("<u8")
@@ -221,7 +221,14 @@ def _repeat(
 
 
 def _write(path: Path, frames: Frames, stamps: npt.NDArray[np.int64], sent: npt.NDArray[np.bool_]) -> None:
-    """Write frames in the format of candump, with one channel per bus; `stamps` are in ns."""
+    """Write frames in the format of candump, with one channel per bus.
+
+    Args:
+        path: file to write.
+        frames: frames of the log, shape (n,).
+        stamps: time stamp of each frame [ns], shape (n,).
+        sent: mask of the frames that the HAL sent, shape (n,).
+    """
     from atalante_dbc import load
 
     head = {m.frame_id: f"{m.bus} {m.frame_id:03X}##1" for m in load().messages}

@@ -10,20 +10,20 @@ import numpy.typing as npt
 from atalante_tools.canlog.validate.chunk import Chunk
 from atalante_tools.canlog.validate.plan import UNKNOWN, Plan, Rows
 
-#: Minimum share of the known frames of a channel that belong to one bus for the channel to be assigned to that bus.
+#: A channel is assigned to a bus if at least this share of its known frames belongs to that bus (0 to 1).
 _MAJORITY = 0.9
 
 
 class ChannelMap:
     """Bus of each channel and expected channel of each message, derived from the frames.
 
-    A channel is assigned to the bus of its name, otherwise to the bus that most of its messages belong to. A channel with
-    messages of several buses (all four buses on one vcan0) is assigned to none. The expected channel of a message is the channel
-    of its bus, otherwise the channel of its first frame.
+    A channel with the name of a bus is assigned to that bus. Any other channel is assigned to the bus of most of its frames. A
+    channel that carries several buses (all four buses on one vcan0) is assigned to no bus. The expected channel of a message is
+    the channel of its bus. If the message has no such channel, it is the channel of the first frame of the message.
     """
 
     def __init__(self, plan: Plan, named: Mapping[str, str]) -> None:
-        """Create a map without frames.
+        """Create a map without channels.
 
         Args:
             plan: compiled DBC.
@@ -31,7 +31,7 @@ class ChannelMap:
         """
         self._plan = plan
         self._named = dict(named)
-        #: Bus number of each channel received so far; `UNKNOWN` for a channel with messages of several buses.
+        #: Bus number of each channel in the log so far; `UNKNOWN` for a channel with messages of several buses.
         self.bus_of_channel: list[int] = []
         self._channel_of_row = np.full(len(plan.layouts) + len(plan.refused), UNKNOWN, np.int16)
 
@@ -54,7 +54,7 @@ class ChannelMap:
                 self._channel_of_row[row] = self._expected_channel(row, int(chunk.channels[index]))
 
     def on_wrong_channel(self, chunk: Chunk, rows: Rows) -> npt.NDArray[np.bool_]:
-        """Return which frames are on another channel than the expected one of their message. Shape (n,)."""
+        """Return the mask of the frames that are not on the expected channel of their message. Shape (n,)."""
         if len(self.bus_of_channel) < 2:
             return np.zeros(len(chunk), np.bool_)
         known = rows >= 0

@@ -1,10 +1,10 @@
-"""Parser for the log format of candump (`candump -l`, .log of python-can), with array operations on many lines.
+"""Parser for candump logs (`candump -l`, .log of python-can). It parses many lines at a time with array operations.
 
     (1700000000.123456) left_leg 181##15A0F004000000041 R
      time                channel id fd flags, payload   direction (may be missing)
 
-The array operations accept a line only if it has exactly this format. All other lines (remote frame, raw DLC, other spacing) are
-parsed individually by a regular expression. Lines that are no frame are counted. A damaged line is never read as a shorter frame,
+The array operations accept a line only if it has exactly this format. A regular expression parses all other lines individually
+(remote frame, raw DLC, other spacing). Lines that are not a frame are counted. A damaged line is never read as a shorter frame,
 because the validator would then report a wrong length or a lost frame.
 """
 
@@ -32,23 +32,23 @@ from atalante_tools.canlog.validate.chunk import NO_DIRECTION, RECEIVED, SENT, C
 Text = npt.NDArray[np.uint8]
 Positions = npt.NDArray[np.intp]
 
-#: Bytes that must be readable before and after the text; at least the width of the widest window that is read.
+#: Size of the padding before and after the text [byte]; the parser reads less than this beyond a line.
 MARGIN = 160
 _NEWLINE, _RETURN, _SPACE, _OPEN, _CLOSE, _HASH, _DOT = b"\n\r ()#."
 _MAX_CHANNELS = 256
-_NAME_BYTES = 16  # longest channel name that the array operations read; Linux allows 15
+_NAME_BYTES = 16  # longest channel name that the array operations parse; Linux allows 15
 _MAX_DIGITS = 2 * 64  # hexadecimal digits
 _STANDARD, _ALL_BITS = 0x7FF, 0x1FFF_FFFF
 _NOT_HEX = 255
 _HEX = np.full(256, _NOT_HEX, np.uint8)
 _HEX[np.frombuffer(b"0123456789", np.uint8)] = np.arange(10)
 _HEX[np.frombuffer(b"ABCDEF", np.uint8)] = _HEX[np.frombuffer(b"abcdef", np.uint8)] = np.arange(10, 16)
-#: Value of two characters, indexed by their little-endian number; 0xFFFF if they are not two hexadecimal digits.
+#: Value of two hexadecimal digits, indexed by the two characters as a little-endian number; 0xFFFF if not hexadecimal.
 _HEX_PAIR = np.full(1 << 16, 0xFFFF, np.uint16)
 _HEX_PAIR.reshape(256, 256)[:] = np.where(
     (_HEX < 16) & (_HEX < 16)[:, None], _HEX.astype(np.uint16) << 4 | _HEX[:, None], 0xFFFF
 )
-#: Masks of the last k bytes of a word, k = 0..8.
+#: Bit masks for the last k bytes of a 64-bit word, k = 0 to 8.
 _TAIL = np.array([0, *((((1 << 8 * k) - 1) << 64 - 8 * k) for k in range(1, 9))], np.uint64)
 _ZEROS = np.uint64(0x3030303030303030)
 _LINE = re.compile(
@@ -59,14 +59,14 @@ _LINE = re.compile(
 
 @dataclass
 class Channels:
-    """Channel names in the order of their first frames."""
+    """Channel names of a log, in the order of their first frames."""
 
     names: list[str] = field(default_factory=list)
 
     def index(self, name: str) -> int:
-        """Return the index of a channel; a new name is appended.
+        """Return the index of a channel name, and append the name if it is new.
 
-        Names beyond the 256th share the last index. Only damaged logs have that many.
+        Names after the 256th name share the last index. Only a damaged log has that many names.
 
         Args:
             name: name of the channel in the log.
@@ -80,7 +80,7 @@ class Channels:
 
 @dataclass
 class Parsed:
-    """Frames of a piece of text, and the count of lines that are no frame."""
+    """Frames parsed from a text, and the number of lines that are not a frame."""
 
     chunk: Chunk
     unreadable: int  # lines
@@ -112,7 +112,7 @@ def parse(text: Text, begin: int, end: int, channels: Channels) -> Parsed:
 
 
 class _Lines:
-    """Positions of the parts of each line, as indices into the text. Shape (lines,)."""
+    """Positions of the fields in each line (time, channel, identifier, payload), as indices into the text. Shape (lines,)."""
 
     def __init__(self, text: Text, begin: int, end: int) -> None:
         self.text, self.begin, self.end = text, begin, end
@@ -122,22 +122,22 @@ class _Lines:
             self.starts[0], self.starts[1:] = begin, self.ends[:-1] + 1
 
     def window(self, positions: Positions, width: int) -> Text:
-        """Return `width` bytes from each position. Shape (positions, width)."""
+        """Return the `width` bytes at each position. Shape (positions, width)."""
         rows: Text = np.ndarray((len(self.text) - width,), f"V{width}", self.text, strides=(1,))[positions].view(
             np.uint8
         )
         return rows.reshape(len(positions), width)
 
     def word(self, positions: Positions) -> npt.NDArray[np.uint64]:
-        """Return eight bytes from each position as a little-endian number. Shape (positions,)."""
+        """Return the eight bytes at each position as a little-endian number. Shape (positions,)."""
         return np.ndarray((len(self.text) - 8,), "<u8", self.text, strides=(1,))[positions]
 
     def pair(self, positions: Positions) -> npt.NDArray[np.uint16]:
-        """Return two bytes from each position as a little-endian number. Shape (positions,)."""
+        """Return the two bytes at each position as a little-endian number. Shape (positions,)."""
         return np.ndarray((len(self.text) - 2,), "<u2", self.text, strides=(1,))[positions]
 
     def split(self) -> npt.NDArray[np.bool_]:
-        """Find the parts of each line; return which lines have the regular format so far. Shape (lines,)."""
+        """Find the fields of each line, and return the mask of the lines with the regular format. Shape (lines,)."""
         stops = self.ends - (self.text[self.ends[0] - 1] == _RETURN)
         last = self.pair(stops - 2)
         has_direction = last & 0xFF == _SPACE
@@ -147,7 +147,7 @@ class _Lines:
         regular: npt.NDArray[np.bool_] = ~has_direction | is_sent | (letter == ord("R"))
         self.stops: Positions = stops - 2 * has_direction
         self.marks = self._marks(regular)
-        #: Eight characters around the first #. Before it: a blank and three digits. After it: a second #, flags and payload.
+        #: Eight characters of each line: the four before the first #, the # itself and three after it.
         self.head = self.word(self.marks - 4)
         self.fd = self.head >> np.uint64(40) & np.uint64(0xFF) == _HASH
         self.data: Positions = self.marks + 1 + 2 * self.fd
@@ -162,14 +162,14 @@ class _Lines:
         return regular
 
     def _marks(self, regular: npt.NDArray[np.bool_]) -> Positions:
-        """Return the position of the first # of each line. Shape (lines,)."""
+        """Return the position of the first # in each line. Shape (lines,)."""
         is_hash = (self.text[self.begin - 1 : self.end] == _HASH).view(np.uint8)
         return self._one_per_line(np.flatnonzero(is_hash[1:] > is_hash[:-1]) + self.begin, regular)
 
     def _closes(self, regular: npt.NDArray[np.bool_]) -> Positions:
-        """Return the position of the ) of each line. Shape (lines,).
+        """Return the position of the closing parenthesis in each line. Shape (lines,).
 
-        The offset of the first line is tried for all lines, because it seldom changes.
+        The parenthesis is usually at the same offset in all lines, so the offset of the first line is tried first.
         """
         text, starts = self.text, self.starts
         width = int(np.argmax(text[starts[0] : starts[0] + MARGIN] == _CLOSE))
@@ -184,12 +184,12 @@ class _Lines:
         return closes
 
     def _one_per_line(self, found: Positions, regular: npt.NDArray[np.bool_], *, alone: bool = True) -> Positions:
-        """Select for each line the first of the found positions.
+        """Return the first of the found positions in each line. Shape (lines,).
 
         Args:
             found: positions in the text, ascending.
-            regular: set to False for a line without a position; shape (lines,).
-            alone: also set `regular` to False for a line with several positions.
+            regular: mask of the lines, set to False for a line without a position; shape (lines,).
+            alone: True to set `regular` to False also for a line with several positions.
         """
         if len(found) == len(self.starts) and bool(((found > self.starts) & (found < self.stops)).all()):
             return found
@@ -207,7 +207,7 @@ class _Lines:
 
 
 def _times(lines: _Lines, stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Write the time of each line to `stamps` [ns]; return which lines have a regular time. Shape (lines,)."""
+    """Parse the time of each line into `stamps` [ns], and return the mask of the lines with a regular time. Shape (lines,)."""
     text, closes = lines.text, lines.closes
     decimals = 9 if text[closes[0] - 10] == _DOT else 6
     dots = closes - decimals - 1
@@ -236,23 +236,37 @@ def _times(lines: _Lines, stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_
 def _number(
     word: npt.NDArray[np.uint64], digits: npt.NDArray[np.intp]
 ) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.bool_]]:
-    """Return the number formed by the last `digits` of eight characters, and whether all those characters are digits.
+    """Parse the last `digits` of eight characters as a decimal number.
 
-    Both results have shape (lines,).
+    Args:
+        word: eight characters of each line, shape (lines,).
+        digits: number of characters to parse, shape (lines,) or (1,).
+
+    Returns:
+        The numbers, and the mask of the lines in which all these characters are digits; shapes (lines,).
     """
     tail = _TAIL[digits]
     word = (word & tail) | (_ZEROS & ~tail)
     changes = np.flatnonzero(word[1:] != word[:-1]) + 1
     if len(changes) * 4 > len(word):
         return _parse_digits(word)
-    runs = np.concatenate([[0], changes])  # the seconds are equal in thousands of consecutive lines
+    runs = np.concatenate([[0], changes])  # thousands of consecutive lines have equal seconds, which are parsed once
     number, valid = _parse_digits(word[runs])
     lengths = np.diff(runs, append=len(word))
     return number.repeat(lengths), valid.repeat(lengths)
 
 
 def _parse_digits(word: npt.NDArray[np.uint64]) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.bool_]]:
-    """Parse eight digits, the first in the lowest byte: combine pairs, then fours, then all eight."""
+    """Parse eight decimal digits, of which the first is in the lowest byte.
+
+    The digits are combined in pairs, then in fours, then in one number.
+
+    Args:
+        word: eight characters, shape (n,).
+
+    Returns:
+        The numbers, and the mask of the words in which all characters are digits; shapes (n,).
+    """
     above, below = word + np.uint64(0x4646464646464646), word - _ZEROS
     valid: npt.NDArray[np.bool_] = ((above | below) & np.uint64(0x8080808080808080)) == 0
     word = below * np.uint64(10) + (below >> np.uint64(8))
@@ -262,7 +276,7 @@ def _parse_digits(word: npt.NDArray[np.uint64]) -> tuple[npt.NDArray[np.uint64],
 
 
 def _channels(lines: _Lines, numbers: npt.NDArray[np.uint8], channels: Channels) -> npt.NDArray[np.bool_]:
-    """Write the channel index of each line to `numbers`; return which lines have a regular name. Shape (lines,)."""
+    """Parse the channel of each line into `numbers`, and return the mask of the lines with a regular name. Shape (lines,)."""
     stops = lines.id_starts - 1
     length = stops - lines.closes - 2
     regular: npt.NDArray[np.bool_] = (length > 0) & (length <= _NAME_BYTES)
@@ -285,7 +299,7 @@ def _channels(lines: _Lines, numbers: npt.NDArray[np.uint8], channels: Channels)
 
 
 def _identifiers(lines: _Lines, frames: npt.NDArray[np.void]) -> npt.NDArray[np.bool_]:
-    """Write identifier, length and flags of each line; return which lines have regular ones. Shape (lines,)."""
+    """Parse identifier, length and flags of each line, and return the mask of the regular lines. Shape (lines,)."""
     head = lines.head.view(np.int64)
     number = _HEX[head >> 8 & 0xFF].astype(np.uint32) << 8 | _HEX_PAIR[head >> 16 & 0xFFFF]
     regular: npt.NDArray[np.bool_] = number < 16 << 8
@@ -307,7 +321,10 @@ def _identifiers(lines: _Lines, frames: npt.NDArray[np.void]) -> npt.NDArray[np.
 
 
 def _payloads(lines: _Lines, frames: npt.NDArray[np.void], wanted: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Write the payloads, grouped by length; return which lines of `wanted` are hexadecimal. Shape (lines,)."""
+    """Parse the payloads of the `wanted` lines, and return the mask of the lines with a hexadecimal payload. Shape (lines,).
+
+    Lines of equal length are parsed together.
+    """
     regular = wanted.copy()
     digits = np.where(wanted, lines.digits, 0)
     memory = frames.view(np.uint8)
@@ -329,7 +346,7 @@ def _payloads(lines: _Lines, frames: npt.NDArray[np.void], wanted: npt.NDArray[n
 
 
 def _parse_individually(lines: _Lines, chunk: Chunk, regular: npt.NDArray[np.bool_], channels: Channels) -> Parsed:
-    """Parse the lines that do not have the regular format; remove and count the lines that are no frame."""
+    """Parse the irregular lines one by one; remove and count the lines that are not a frame."""
     keep = np.ones(len(regular), np.bool_)
     unreadable, first = 0, b""
     for row in np.flatnonzero(~regular).tolist():
@@ -344,7 +361,7 @@ def _parse_individually(lines: _Lines, chunk: Chunk, regular: npt.NDArray[np.boo
 
 
 def _read_line(line: bytes, chunk: Chunk, row: int, channels: Channels) -> bool:
-    """Write the frame of a line in any format of candump to `chunk`; return whether the line is a frame."""
+    """Parse a line in any candump format into row `row` of the chunk; return whether the line is a frame."""
     match = _LINE.fullmatch(line)
     if match is None:
         return False

@@ -1,4 +1,4 @@
-"""Frames of a piece of a log as arrays: output of every log reader, input of every rule."""
+"""Chunk: consecutive frames of a log as arrays. The log readers return chunks, and the rules check them."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ SENT, RECEIVED, NO_DIRECTION = 1, 0, -1
 
 
 class LogError(ValueError):
-    """Error for a log that cannot be opened; the message gives the reason and what to do."""
+    """Raised if a log cannot be opened. The message gives the reason and the remedy."""
 
 
 @dataclass
 class Chunk:
-    """Frames of a piece of a log, in the order of the log. Shapes (n,)."""
+    """Consecutive frames of a log. Each array has shape (n,)."""
 
     frames: Frames  # `FRAME` records
     stamps: npt.NDArray[np.int64]  # ns
-    channels: npt.NDArray[np.uint8]  # index in the channel names of the log
+    channels: npt.NDArray[np.uint8]  # index of the channel of each frame in the channel list of the log
     sent: npt.NDArray[np.int8]  # direction: SENT, RECEIVED or NO_DIRECTION
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def select(self, indices: npt.NDArray[Any]) -> Chunk:
-        """Return part of the frames.
+        """Return a chunk with the selected frames.
 
         Args:
             indices: indices of frames, or a mask of shape (n,).

@@ -1,6 +1,6 @@
 """List of the rules, messages and signals that were not checked in a log, each with the reason.
 
-Without this list, a report without findings would read as approval of everything in the log.
+Without this list, a report without findings would look like an approval of the whole log.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _E2E = ("Crc", "Counter")
 
 @dataclass(frozen=True)
 class Unchecked:
-    """Items that some rules did not check, with the reason."""
+    """Messages, signals or channels that some rules did not check, with the reason."""
 
     rules: tuple[str, ...]  # empty: all rules
     items: tuple[str, ...]  # messages, signals or channels; empty: the whole log
@@ -32,7 +32,7 @@ class Unchecked:
 
 
 def unchecked(validator: Validator, *, live: bool = False) -> list[Unchecked]:
-    """List everything that was not checked.
+    """Return the rules, messages and signals that were not checked, each with the reason.
 
     Args:
         validator: finished validator of the log.
@@ -141,7 +141,7 @@ def _of_messages(validator: Validator) -> Iterator[Unchecked]:
 
 
 def unseen_signals(validator: Validator) -> list[tuple[Layout, str]]:
-    """Return the signals of received messages whose values no rule checked, with their layouts."""
+    """Return the received signals that no rule checked, each with the layout of its message."""
     plan = validator.plan
     found = []
     for family in plan.families:
@@ -162,7 +162,7 @@ def unseen_signals(validator: Validator) -> list[tuple[Layout, str]]:
 
 
 def _is_checked(validator: Validator, layout: Layout, field: Field) -> bool:
-    """Return whether a range, invalid code, value table, hash or multiplexer rule can reject a value of the field."""
+    """Return whether a value rule can reject a value of the field: range, invalid code, value table, hash or multiplexer."""
     if is_limited(field) or is_enumeration(field) or field.invalid_raw is not None:
         return True
     if is_hash(field, validator.values.hash_signal):

@@ -1,6 +1,6 @@
 """Rules for drive states: only transitions of CiA 402 are legal, and a drive must respond to a controlword in time.
 
-The rules work on changes of state and controlword, because these are few in a log of any length.
+The rules check only the frames in which the state or the controlword changes, because such frames are rare in any log.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from atalante_tools.canlog.validate.value_rules import Decoded
 
 _S, _C = DriveState, Controlword
 _STATES = {int(state) for state in DriveState}
-#: Transitions without a command: fault detected, fault reaction finished, boot finished.
+#: Transitions that a drive makes without a command: fault detected, fault reaction finished, boot finished.
 _SPONTANEOUS = {(s, f) for s in DriveState for f in (_S.FAULT_REACTION_ACTIVE, _S.FAULT)} | {
     (_S.NOT_READY_TO_SWITCH_ON, _S.SWITCH_ON_DISABLED)
 }
-#: Legal transitions: (state, next state).
+#: Legal transitions of a drive: (state, next state).
 LEGAL = {(int(state), int(after)) for (state, _), after in TRANSITIONS.items()} | {
     (int(a), int(b)) for a, b in _SPONTANEOUS
 }
-#: (state, controlword) without a required response: a quick stop must be acknowledged first, or the fault is still present.
+#: Pairs (state, controlword) that need no response: a quick stop without acknowledgement, and a fault that is still present.
 EXEMPT = {(int(_S.QUICK_STOP_ACTIVE), int(_C.ENABLE_OPERATION)), (int(_S.FAULT), int(_C.FAULT_RESET))}
 _NOTHING = -1
 
@@ -47,15 +47,15 @@ def must_respond(state: int, controlword: int) -> bool:
 
 @dataclass
 class _Drive:
-    """One drive: its state and command messages, and its state at the end of the last chunk."""
+    """Drive with its messages, and with its state and command at the end of the last chunk."""
 
-    row: int
-    command_row: int  # -1: the DBC has no command for the drive
-    command_index: int  # index of the controlword in the fields of its codec
+    row: int  # row of the state message
+    command_row: int  # row of the command message; -1: the DBC has no command for the drive
+    command_index: int  # index of the controlword in the fields of the command message
     state: int = _NOTHING
     command: int = _NOTHING
-    since: int = 0  # stamp of the last change of state or command [ns]
-    state_stamp: int = 0  # stamp of the last state frame [ns]
+    since: int = 0  # time stamp of the last change of state or command [ns]
+    state_stamp: int = 0  # time stamp of the last state frame [ns]
 
 
 class DriveRules:
@@ -65,7 +65,7 @@ class DriveRules:
         self._plan, self._findings = plan, findings
         self._limit_ns = project.number("cia402-response", "limit_ms") * 1e6
         state, command = project.text("cia402-transition", "state"), project.text("cia402-response", "command")
-        #: Drives by the first row of their family.
+        #: Drives with equal state messages, by the first row of their family.
         self.drives: dict[int, list[_Drive]] = {}
         for family in plan.families:
             index = next((p for p, f in enumerate(family.codec.fields) if f.name == state), None)
@@ -75,7 +75,7 @@ class DriveRules:
 
     @staticmethod
     def _drive(plan: Plan, row: int, command: str) -> _Drive:
-        """Find the command of a drive.
+        """Create a drive and find its command message.
 
         The command is a signal that the node receives. Its name is `Controlword`, or `FH_Controlword` for the node LEFT_FH.
         """
@@ -90,11 +90,11 @@ class DriveRules:
 
     @property
     def command_rows(self) -> set[int]:
-        """Return the rows of the command messages, whose decoded frames `check` needs."""
+        """Return the rows of the command messages of all drives."""
         return {drive.command_row for drives in self.drives.values() for drive in drives} - {_NOTHING}
 
     def check(self, decoded: dict[int, Decoded], family_of: dict[int, Family], stream: Stream, steps: Steps) -> None:
-        """Check a chunk.
+        """Check the drive states and the responses to controlwords in a chunk.
 
         Args:
             decoded: decoded frames of the families in the chunk, by the first row of the family.
@@ -168,8 +168,8 @@ class DriveRules:
         """Apply the changes in order of time and check the response time at each change.
 
         Args:
-            drive: updated with each change.
-            events: (index in the chunk, stamp [ns], whether it is a state, code) of each change.
+            drive: drive that is updated with each change.
+            events: (index in the chunk, time stamp [ns], True for a state and False for a command, code) of each change.
             indices: indices of the state frames in the chunk, shape (k,).
             stamps: stamps of the state frames [ns], shape (k,).
         """
@@ -184,7 +184,7 @@ class DriveRules:
         drive.state_stamp = int(stamps[-1])
 
     def _check(self, drive: _Drive, until: int) -> None:
-        """Report a drive that has not responded to its command by the stamp `until` [ns]."""
+        """Report the drive if it has not responded to its command before the time stamp `until` [ns]."""
         waited = until - drive.since
         if waited > self._limit_ns and must_respond(drive.state, drive.command):
             self._findings.add(
@@ -196,7 +196,7 @@ class DriveRules:
             )
 
     def finish(self) -> None:
-        """Check the commands without a response at the end of the log."""
+        """Check the last command of each drive at the end of the log."""
         for drives in self.drives.values():
             for drive in drives:
                 if drive.state_stamp:
@@ -204,6 +204,11 @@ class DriveRules:
 
 
 def _changes(codes: npt.NDArray[np.int64], before: int) -> list[int]:
-    """Return the indices where a column of shape (n,) differs from the previous value; `before` is the value before the first."""
+    """Return the indices of the codes that differ from the previous code.
+
+    Args:
+        codes: codes of consecutive frames, shape (n,).
+        before: code before the first of them.
+    """
     changed = np.flatnonzero(codes[1:] != codes[:-1]) + 1
     return [*([0] if int(codes[0]) != before else []), *changed.tolist()]

@@ -14,12 +14,17 @@ from atalante_tools.canlog.validate.stream import Stream
 
 Steps = npt.NDArray[np.int64]
 
-#: Counter step of a repeated frame, and mark of a frame without a counter or without a previous frame.
+#: Counter step of a repeated frame, and code for a frame without a counter or without a previous frame.
 REPEATED, NO_STEP = 0, -1
 
 
 def counter_steps(counters: npt.NDArray[np.uint8], before: npt.NDArray[np.uint8]) -> Steps:
-    """Return the step of each alive counter since the previous frame: 1 in order, 0 repeated. Shape (n,), 0 to 255."""
+    """Return the increment of the alive counter since the previous frame, 0 to 255. Shape (n,).
+
+    Args:
+        counters: alive counter of each frame, shape (n,).
+        before: alive counter of the previous frame of the same message, shape (n,).
+    """
     return np.subtract(counters, before).astype(np.int64)
 
 
@@ -29,7 +34,7 @@ class CrcRules:
     def __init__(self, plan: Plan, findings: Findings) -> None:
         self._plan, self._findings = plan, findings
         lengths = np.where(plan.protected, plan.lengths, 0)
-        #: Rows of the protected messages of each payload length, which are contiguous.
+        #: Range of rows of the protected messages of each payload length.
         self._spans = [
             range(int(r[0]), int(r[-1]) + 1) for n in np.unique(lengths[lengths > 0]) for r in [_at(plan, n)]
         ]
@@ -40,7 +45,14 @@ class CrcRules:
         }
 
     def check(self, stream: Stream) -> npt.NDArray[np.bool_] | None:
-        """Report damaged frames; return which frames are intact, shape (n,), or None if all are."""
+        """Report the frames with a wrong CRC.
+
+        Args:
+            stream: frames of the chunk by message, n of them.
+
+        Returns:
+            Mask of the intact frames, shape (n,); None: all frames are intact.
+        """
         intact: npt.NDArray[np.bool_] | None = None
         for rows in self._spans:
             span = stream.span(rows)
@@ -62,7 +74,7 @@ class CrcRules:
     ) -> None:
         """Report wrong CRCs.
 
-        A CRC that fits the Data ID of another message identifies that message, so the frame has the wrong identifier.
+        If the CRC matches the Data ID of another message, the frame has the wrong identifier.
 
         Args:
             of: row of each frame, shape (k,).
@@ -86,7 +98,7 @@ def _at(plan: Plan, length: int) -> npt.NDArray[np.intp]:
 
 
 class Counters:
-    """Steps of the alive counters of all messages; keeps the last counter of each message."""
+    """Alive counters of all messages, with the last counter of each message."""
 
     def __init__(self, plan: Plan) -> None:
         self._protected = plan.protected
@@ -94,7 +106,7 @@ class Counters:
         self._seen = np.zeros(len(plan.layouts), np.bool_)
 
     def steps(self, stream: Stream) -> Steps:
-        """Return the counter step of each frame; `NO_STEP` without a counter or a previous frame. Shape (n,)."""
+        """Return the counter step of each frame; `NO_STEP` for a frame without counter or previous frame. Shape (n,)."""
         counters = stream.frames.view(np.uint8).reshape(-1, FRAME_BYTES)[:, HEADER_BYTES + COUNTER_BYTE].copy()
         steps = counter_steps(counters, stream.before(counters, self._last))
         steps[stream.starts[~self._seen[stream.present]]] = NO_STEP

@@ -1,4 +1,4 @@
-"""Findings: one per rule, message and signal, with count, first, last and worst occurrence."""
+"""Findings of the validator. One finding combines all violations of one rule by one message or signal."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from atalante_tools.canlog.validate.plan import Plan
 from atalante_tools.canlog.validate.rules import RULE_OF
 
 Stamps = npt.NDArray[np.int64]
-#: Maximum number of findings of a rule in `_UNBOUNDED`; further ones are combined in one finding, `OTHERS`.
+#: Maximum number of unknown identifiers with a finding of their own. The finding `OTHERS` combines all further ones.
 MAX_UNKNOWN_IDS = 100
 OTHERS = "(others)"
-#: Rules whose number of findings is not bounded by the DBC.
+#: Rules that can have more findings than the DBC has messages.
 _UNBOUNDED = ("unknown-id",)
 
 
@@ -36,12 +36,12 @@ class Finding:
 
     @property
     def first_s(self) -> float:
-        """Return the stamp of the first occurrence in the log [s]."""
+        """Return the time stamp of the first occurrence in the log [s]."""
         return self.first * 1e-9
 
     @property
     def last_s(self) -> float:
-        """Return the stamp of the last occurrence in the log [s]."""
+        """Return the time stamp of the last occurrence in the log [s]."""
         return self.last * 1e-9
 
     def as_json(self) -> dict[str, Any]:
@@ -58,7 +58,7 @@ class Finding:
 
 
 class Findings:
-    """Collection of the findings of one log; the rules add their violations as columns."""
+    """Collection of the findings of one log. Each rule adds its violations as arrays."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
@@ -89,7 +89,7 @@ class Findings:
         Args:
             rule: identifier of the rule.
             message: name of the message; a bus for the bus load, an identifier for an unknown message.
-            stamps: stamp of each violation, shape (n,) [ns], n >= 1.
+            stamps: time stamp of each violation, shape (n,) [ns], n >= 1.
             node: sender of the message, if known.
             signal: name of the signal; empty for a rule about the whole frame.
             shown: value of each violation for the report, shape (n,).
@@ -125,7 +125,17 @@ class Findings:
         badness: npt.NDArray[Any] | None = None,
         unit: str | None = None,
     ) -> None:
-        """Add violations of a rule by several messages; `rows` are the rows of the messages. Arguments as in `add`."""
+        """Add violations of a rule by several messages.
+
+        Args:
+            rule: identifier of the rule.
+            rows: row of the message of each violation, shape (n,).
+            stamps: time stamp of each violation, shape (n,) [ns], n >= 1.
+            signal: name of the signal; empty for a rule about the whole frame.
+            shown: value of each violation for the report, shape (n,).
+            badness: severity of each violation, shape (n,), larger is worse.  [default: `shown`]
+            unit: unit of `shown`.  [default: unit of the rule]
+        """
         for row in np.unique(rows).tolist():
             of_row = rows == row
             self.add(
@@ -140,7 +150,7 @@ class Findings:
             )
 
     def add_whole(self, rule: str, row: int, first: int, last: int, *, shown: float, count: int = 1) -> None:
-        """Add a violation of a rule by a message between the stamps `first` and `last` [ns]."""
+        """Add a violation by one message that lasts from the time stamp `first` to `last` [ns]."""
         worst = _text(shown, RULE_OF[rule].worst, "")
         self._merge(
             Finding(
@@ -157,7 +167,7 @@ class Findings:
         )
 
     def add_log(self, rule: str, stamp: int, count: int, sentence: str) -> None:
-        """Add a finding about the log itself; the sentence describes it."""
+        """Add a finding about the log file, with a sentence that describes it."""
         self._merge(
             Finding(
                 rule=rule,

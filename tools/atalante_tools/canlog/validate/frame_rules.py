@@ -1,6 +1,7 @@
 """Rules for frame headers: identifier, bus, sender, flags and length. First stage of the validator.
 
-Nearly all frames of a log pass one comparison of their header word with the DBC. The functions here check the remaining frames.
+Nearly all frames pass one comparison of their header word with the DBC. Only the remaining frames are checked one property at a
+time.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ Indices = npt.NDArray[np.intp]
 
 _FD_LENGTH = np.isin(np.arange(256), FD_LENGTHS)
 _CLASSIC_LENGTH = np.arange(256) <= 8
-#: Error frames of linux/can/error.h: class "controller problem", and the receive and transmit overflow bits of byte 1.
+#: Bits of an error frame (linux/can/error.h): class "controller problem", and receive and transmit overflow in byte 1.
 _CONTROLLER, _OVERFLOW = 0x4, 0x3
 _NUMBER = 0x1FFF_FFFF
-#: Minimum share of the frames marked as sent that come from one node for the log to be assigned to that node.
+#: A node is the recorder of the log if it sent at least this share of the frames marked as sent (0 to 1).
 _RECORDER = 0.99
 
 
 @dataclass(frozen=True)
 class Sorted:
-    """Result of the first stage: frames that can be decoded, and rejected frames."""
+    """Result of the header check: frames that can be decoded, and rejected frames."""
 
     good: Indices | None  # indices of the frames that can be decoded; None: all
     rejected_rows: Rows  # messages of the rejected frames; shape (k,)
@@ -37,18 +38,18 @@ class Sorted:
 
 
 class FrameRules:
-    """Rules for the frame headers; determines the node that recorded the log."""
+    """Rules for the frame headers. They also identify the node that recorded the log."""
 
     def __init__(self, plan: Plan, findings: Findings, channel_map: ChannelMap, *, keeps_flags: bool) -> None:
-        self._plan, self._findings, self._homes, self._keeps_flags = plan, findings, channel_map, keeps_flags
+        self._plan, self._findings, self._channel_map, self._keeps_flags = plan, findings, channel_map, keeps_flags
         layouts = plan.layouts
-        #: FDF and BRS flags in the DBC: 0, 1, or `UNKNOWN` if the DBC has no such attribute.
+        #: Expected FDF and BRS flags of each message: 0, 1, or `UNKNOWN` if the DBC has no such attribute.
         fd = [UNKNOWN if m.fd is None else int(m.fd) for m in layouts]
         switch = [UNKNOWN if m.bit_rate_switch is None else int(m.bit_rate_switch) for m in layouts]
-        # One element more than messages: index 0 must exist for a DBC without messages.
+        # The last element is never used; it allows index 0 for a DBC without messages.
         self._fd, self._switch = np.array([*fd, UNKNOWN], np.int8), np.array([*switch, UNKNOWN], np.int8)
         self._length, self._sender = np.append(plan.lengths, 0), np.append(plan.sender_of_row, UNKNOWN)
-        #: Node that recorded the log; None: not known yet; empty: no single node.
+        #: Node that recorded the log; None: not known yet; empty: several nodes.
         self.recorder: str | None = None
         self.direction_seen = False
 
@@ -62,7 +63,7 @@ class FrameRules:
         return rows
 
     def check(self, chunk: Chunk, rows: Rows, channel_names: list[str]) -> Sorted:
-        """Report wrong headers.
+        """Report the frames with a wrong header.
 
         Args:
             chunk: frames of the log, n of them.
@@ -72,11 +73,11 @@ class FrameRules:
         Returns:
             The frames that can be decoded, and the rejected ones.
         """
-        self._homes.update(chunk, rows, channel_names)
+        self._channel_map.update(chunk, rows, channel_names)
         self._check_sender(chunk, rows)
         headers = as_words(chunk.frames)[:, 0]
         matches = (headers == self._plan.headers[rows]) & (rows != UNKNOWN)
-        on_wrong_channel = self._homes.on_wrong_channel(chunk, rows)
+        on_wrong_channel = self._channel_map.on_wrong_channel(chunk, rows)
         indices = np.flatnonzero(~matches | on_wrong_channel)
         if not len(indices):
             return Sorted(None, np.empty(0, np.int16), np.empty(0, np.intp))
@@ -140,8 +141,8 @@ class FrameRules:
     def _check_sender(self, chunk: Chunk, rows: Rows) -> None:
         """Report messages with the wrong direction.
 
-        If the frames marked as sent come from one node, that node recorded the log. All its messages must then be marked as sent
-        and all other messages as received.
+        If the frames marked as sent come from one node, that node recorded the log. All its messages must then be marked as
+        sent, and all other messages must be marked as received.
         """
         sent = chunk.sent == SENT
         known = (rows >= 0) & (rows < len(self._plan.layouts))

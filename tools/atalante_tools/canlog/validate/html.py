@@ -18,7 +18,7 @@ Vector = npt.NDArray[np.float64]
 
 _WIDTH, _HEIGHT = 760, 200
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 28, 24, 36
-_LETTER = 7.0  # width of a character of the legend
+_LETTER = 7.0  # width of a legend character [px]
 _COLOURS = ("#1b6ca8", "#c8553d", "#4f772d", "#7b4b94", "#b08900", "#3d5a6c", "#8d5524", "#555555")
 _POINTS = 720  # maximum points of a curve, about one per pixel
 _HISTOGRAMS = 12  # maximum number of histograms per log
@@ -139,7 +139,7 @@ class _Axes:
         )
 
     def legend(self, names: Sequence[str]) -> None:
-        """Draw the legend; names beyond the width of the plot become an ellipsis."""
+        """Draw the legend. An ellipsis replaces the names that do not fit into the width of the plot."""
         across = float(_LEFT)
         for number, name in enumerate(names):
             width = 26 + _LETTER * len(name)
@@ -175,7 +175,7 @@ class _Axes:
 
 
 def _ticks(low: float, high: float, most: int) -> list[float]:
-    """Return at most about `most` multiples of 1, 2 or 5 times a power of ten between `low` and `high`."""
+    """Return about `most` axis ticks between `low` and `high`, at a distance of 1, 2 or 5 times a power of ten."""
     rough = (high - low) / most or 1.0
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(power * unit for unit in (1.0, 2.0, 5.0, 10.0) if power * unit >= rough * (1 - 1e-9))
@@ -201,7 +201,7 @@ def _load_plot(result: Report) -> str:
 
 
 def _thinned(x: Vector, y: Vector) -> tuple[Vector, Vector]:
-    """Reduce a curve to at most `_POINTS` points; each keeps the maximum of its section, so that peaks remain visible."""
+    """Reduce a curve to at most `_POINTS` points. Each point is the maximum of its section of the curve."""
     step = math.ceil(len(x) / _POINTS)
     if step == 1:
         return x, y
@@ -226,7 +226,7 @@ def _gap_plot(result: Report) -> str:
 
 
 def _histograms(result: Report) -> list[str]:
-    """Plot the histograms of the messages with timing findings, then of those with the widest spread of intervals."""
+    """Plot interval histograms: first the messages with timing findings, then the messages with the widest spread."""
     validator = result.validator
     reported = {f.message for f in result.findings if f.rule in _TIMING}
     rows = [r for r in np.flatnonzero(validator.timing.intervals > 0).tolist() if validator.plan.cycle_ns[r] > 0]

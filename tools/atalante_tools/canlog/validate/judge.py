@@ -30,7 +30,7 @@ _ALL_BITS = 0x1FFF_FFFF
 
 
 class Validator:
-    """Validator of one log against one DBC; `findings` is complete after `finish`."""
+    """Validator of one log against one DBC. The findings are complete after `finish`."""
 
     def __init__(
         self, plan: Plan, project: Project | None = None, *, node: str | None = None, keeps_flags: bool = True
@@ -40,7 +40,7 @@ class Validator:
         Args:
             plan: compiled DBC; several validators may share it.
             project: thresholds, silenced rules and channel names; None: the default thresholds.
-            node: the only node whose messages are expected; None: all nodes.
+            node: require only the messages of this node; None: of all nodes.
             keeps_flags: whether the log has the flags of CAN FD frames.
         """
         self.project = project or Project()
@@ -59,10 +59,11 @@ class Validator:
         self.motion = MotionRules(self.plan, self.findings, self.project)
         self.drives = DriveRules(self.plan, self.findings, self.project)
         self._family_of = {row: family for family in self.plan.families for row in family.rows}
-        self._pending = np.zeros(len(self.plan.layouts), np.int64)  # rejected frames since the last valid frame
+        #: Number of rejected frames since the last valid frame, by row.
+        self._pending = np.zeros(len(self.plan.layouts), np.int64)
         self._groups = [row for row, m in enumerate(self.plan.layouts) if m.pgn_mask != _ALL_BITS]
         self._address: dict[int, int] = {}
-        #: Rows of messages that several addresses send; their timing is not checked.
+        #: Rows of J1939 messages with several sender addresses, which the timing rules do not check.
         self.shared: set[int] = set()
         self.frames = 0
         self.counts = np.zeros(len(self.plan.layouts) + len(self.plan.refused), np.int64)
@@ -71,7 +72,7 @@ class Validator:
         self.channels: list[str] = []
 
     def check(self, chunk: Chunk, channels: list[str]) -> None:
-        """Check a chunk.
+        """Check the next chunk of the log with all rules.
 
         Args:
             chunk: next frames of the log.
@@ -136,7 +137,10 @@ class Validator:
         return rejected_before
 
     def _find_shared(self, stream: Stream) -> None:
-        """Exclude J1939 parameter groups with several sender addresses from timing, because each address has its own cycle."""
+        """Exclude J1939 parameter groups with several sender addresses from the timing rules.
+
+        Each sender address has its own cycle.
+        """
         for row in self._groups:
             can_ids = np.unique(stream.frames[stream.of(row)]["can_id"]).tolist()
             if can_ids and (len(can_ids) > 1 or self._address.setdefault(row, can_ids[0]) != can_ids[0]):
@@ -173,7 +177,10 @@ class Validator:
         self.drives.finish()
 
     def expected(self) -> npt.NDArray[np.bool_]:
-        """Return which messages must be in the log: those of the expected node and of the recorded buses. Shape (rows,)."""
+        """Return the mask of the messages that must be in the log. Shape (rows,).
+
+        These are the messages of `node` on the recorded buses.
+        """
         count = len(self.plan.layouts)
         wanted = np.ones(count, np.bool_)
         if self.node is not None:

@@ -14,13 +14,13 @@ from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.plan import UNKNOWN, Plan, Rows
 from atalante_tools.canlog.validate.project import Project
 
-#: Minimum length of an error frame, bits: flag, delimiter, intermission.
+#: Minimum length of an error frame with delimiter and intermission, bits.
 _ERROR_BITS = 17
 
 
 @cache
 def wire_time(extended: bool, fd: bool, switch: bool, length: int, nominal: float, data: float) -> float:
-    """Return the longest time of a frame on the wire [s], with stuff bits and interframe space (ISO 11898-1).
+    """Return the worst-case time of a frame on the wire [s], with stuff bits and interframe space (ISO 11898-1).
 
     Classic CAN follows Davis et al. 2007. CAN FD follows `atalante_dbc.wire_time`; a 29-bit identifier adds 20 bits and their
     stuff bits to the arbitration phase.
@@ -43,10 +43,10 @@ def wire_time(extended: bool, fd: bool, switch: bool, length: int, nominal: floa
 
 
 class LoadRules:
-    """Rule for the bus load; sums the wire time per bus and time window."""
+    """Rule for the bus load: the sum of the wire times per bus and time window."""
 
     def __init__(self, plan: Plan, findings: Findings, project: Project, channel_map: ChannelMap) -> None:
-        self._plan, self._findings, self._homes = plan, findings, channel_map
+        self._plan, self._findings, self._channel_map = plan, findings, channel_map
         catalogue = plan.catalogue
         self._nominal = catalogue.nominal_bitrate or 0.0
         self._data = catalogue.data_bitrate or self._nominal
@@ -54,11 +54,12 @@ class LoadRules:
         self._over, self._limit = project.number("bus-load", "over_nominal"), project.number("bus-load", "limit")
         self._of_row = np.array([self._layout_time(row) for row in range(len(plan.layouts))] + [0.0])
         self._bus_of_row = np.append(plan.bus_of_row, 0)
-        self._numbers: list[npt.NDArray[np.int64]] = []  # number of each window, by chunk
-        self._busy: list[npt.NDArray[np.float64]] = []  # wire time by chunk [s], shape (windows, buses)
-        #: Begin of each window with a frame [s], shape (windows,), and load of each bus, 1 is full, shape (windows, buses). Both
-        #: are set by `finish`. The columns are the buses of the DBC, then the channels without a bus.
+        self._numbers: list[npt.NDArray[np.int64]] = []  # window numbers of each chunk, shape (windows,)
+        self._busy: list[npt.NDArray[np.float64]] = []  # wire time in each chunk [s], shape (windows, buses)
+        #: Start time of each window with a frame [s], set by `finish`. Shape (windows,).
         self.begins: npt.NDArray[np.float64] = np.zeros(0)
+        #: Bus load in each window, 1 at full load, set by `finish`. Shape (windows, buses).
+        #: The columns are the buses of the DBC, then the channels without a bus.
         self.load: npt.NDArray[np.float64] = np.zeros((0, len(plan.buses)))
 
     @property
@@ -74,7 +75,7 @@ class LoadRules:
         return wire_time(layout.extended, fd, switch, layout.length, self._nominal, self._data)
 
     def expected(self, bus: int) -> float | None:
-        """Return the largest load by the messages of the DBC, 1 is full.
+        """Return the largest bus load that the messages of the DBC can cause, 1 at full load.
 
         Args:
             bus: index of the bus in the plan.
@@ -137,12 +138,12 @@ class LoadRules:
             seconds[indices[key == value]] = time
 
     def _bus(self, chunk: Chunk, known: npt.NDArray[np.bool_], rows: npt.NDArray[np.int16]) -> npt.NDArray[np.int64]:
-        """Return the column of `load` for each frame, shape (n,).
+        """Return the column of `load` for each frame. Shape (n,).
 
-        It is the bus of the channel. On a channel with several buses it is the bus of the message.
+        The column is the bus of the channel. On a channel with several buses, it is the bus of the message.
         """
         buses = len(self._plan.buses)
-        of_channel = np.array(self._homes.bus_of_channel, np.int64)
+        of_channel = np.array(self._channel_map.bus_of_channel, np.int64)
         mixed = np.arange(len(of_channel)) + buses
         fixed = np.where(of_channel == UNKNOWN, mixed, of_channel)[chunk.channels]
         if not self._plan.has_buses or not bool((of_channel == UNKNOWN).any()):
@@ -151,11 +152,15 @@ class LoadRules:
         return np.where(by_message, self._bus_of_row[rows], fixed)
 
     def names(self, channels: list[str]) -> list[str]:
-        """Return the name of each column of `load`; `channels` are the names of the channels of the log."""
+        """Return the name of each column of `load`.
+
+        Args:
+            channels: names of the channels of the log.
+        """
         return [*self._plan.buses, *channels][: self.load.shape[1]]
 
     def finish(self, channels: list[str]) -> None:
-        """Check the load of the whole log, without its first and last windows, which are not complete.
+        """Check the bus load in every time window, except in the incomplete first and last windows.
 
         Args:
             channels: names of the channels of the log.

@@ -1,7 +1,7 @@
-"""Reader of CAN logs in chunks of frames: the array parser for candump logs, the readers of python-can for all other formats.
+"""Reader of CAN logs in chunks of frames: an array parser for candump logs, and python-can for all other formats.
 
-The chunk size bounds the memory for a log of any length. Unreadable parts of a log become remarks, which the validator reports
-as findings; all readable frames are returned.
+The chunk size bounds the memory for a log of any length. The reader returns all readable frames. Unreadable parts of a log
+become remarks, which the validator reports as findings.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from atalante_tools.canlog.validate.chunk import Chunk, LogError
 
 __all__ = ["FORMATS", "Log", "LogError", "Remark", "open_log"]
 
-#: Suffix of each log format that python-can reads -> (records the direction, records the CAN FD flags).
+#: Log formats by file suffix: (has the direction of a frame, has the CAN FD flags).
 FORMATS = {
     ".log": (True, True),
     ".asc": (True, True),
@@ -34,7 +34,7 @@ FORMATS = {
     ".trc": (True, True),
     ".csv": (False, False),
 }
-_PIECE_BYTES = 1 << 21  # text parsed in one call; its arrays fit into the processor cache
+_TEXT_BYTES = 1 << 21  # text parsed in one call [byte]; its arrays fit into the processor cache
 _CHUNK_FRAMES = 120_000  # minimum number of frames in a chunk; only the last chunk is smaller
 
 
@@ -42,15 +42,15 @@ _CHUNK_FRAMES = 120_000  # minimum number of frames in a chunk; only the last ch
 class Remark:
     """Defect of a log file."""
 
-    rule: str  # identifier of the rule that reports it
+    rule: str  # identifier of the rule that reports the defect
     sentence: str
     count: int
-    stamp: int  # stamp of the first occurrence [ns]; -1: unknown
+    stamp: int  # time stamp of the first occurrence [ns]; -1: unknown
 
 
 @dataclass
 class Log:
-    """Log file; `remarks` is complete once `chunks` is exhausted."""
+    """Log file. The list `remarks` is complete after all chunks were read."""
 
     path: Path
     suffix: str  # suffix of the format, lower case, without .gz
@@ -101,17 +101,17 @@ class Log:
         """Add a defect of the log to `remarks`.
 
         Args:
-            rule: identifier of the rule that reports it.
+            rule: identifier of the rule that reports the defect.
             sentence: description for the report.
             count: number of occurrences.
-            stamp: stamp of the first occurrence [ns]; -1: unknown.
+            stamp: time stamp of the first occurrence [ns]; -1: unknown.
         """
         self.remarks.append(Remark(rule, sentence, count, stamp))
 
     # -- candump -----------------------------------------------------------------------------------------------------
 
     def _candump(self) -> Iterator[Chunk]:
-        text = np.zeros(_PIECE_BYTES + 2 * MARGIN, np.uint8)
+        text = np.zeros(_TEXT_BYTES + 2 * MARGIN, np.uint8)
         memory = text.data
         unreadable, example = 0, b""
         gathered: list[Chunk] = []
@@ -119,15 +119,15 @@ class Log:
         broken = ""
         with self._open() as file:
             while True:
-                got, broken = _fill(file, memory[MARGIN + kept : MARGIN + _PIECE_BYTES])
+                got, broken = _fill(file, memory[MARGIN + kept : MARGIN + _TEXT_BYTES])
                 self.position = file.tell() if not self.compressed else self.position
                 end = MARGIN + kept + got
                 if not got:
-                    break  # end of the file, or a read error with its reason in `broken`
+                    break  # end of the file, or a read error, described in `broken`
                 stop = _after_last_newline(text, end - got, end)
                 if not stop:
                     kept += got
-                    if kept == _PIECE_BYTES:
+                    if kept == _TEXT_BYTES:
                         kept, line_too_long = 0, True
                     continue
                 parsed = candump.parse(text, MARGIN, stop, self.channels)
@@ -215,7 +215,11 @@ def _joined(chunks: list[Chunk]) -> Chunk:
 
 
 def _fill(file: io.RawIOBase | gzip.GzipFile, memory: memoryview) -> tuple[int, str]:
-    """Read until the memory is full or the file ends; return the number of bytes, and the read error if it is 0."""
+    """Read from the file until the memory is full or the file ends.
+
+    Returns:
+        The number of bytes read, and the read error if no byte was read.
+    """
     if not isinstance(file, gzip.GzipFile):
         return file.readinto(memory) or 0, ""
     total = 0
@@ -231,7 +235,10 @@ def _fill(file: io.RawIOBase | gzip.GzipFile, memory: memoryview) -> tuple[int, 
 
 
 def _after_last_newline(text: npt.NDArray[np.uint8], begin: int, end: int) -> int:
-    """Return the index after the last newline of `text[begin:end]`, or 0 without one; search the last bytes first."""
+    """Return the index after the last newline in `text[begin:end]`, or 0 without a newline.
+
+    The last bytes are searched first.
+    """
     for first in (max(begin, end - 4 * MARGIN), begin):
         newlines = np.flatnonzero(text[first:end] == ord("\n"))
         if len(newlines):

@@ -23,7 +23,7 @@ _ELEMENTS = 4  # elements of a quaternion
 
 
 class MotionRules:
-    """Plausibility check of the values of all families."""
+    """Plausibility rules for the signals of all messages."""
 
     def __init__(self, plan: Plan, findings: Findings, project: Project) -> None:
         self._families = {
@@ -52,14 +52,18 @@ class MotionRules:
             rule.check(decoded, stream, steps)
 
     def finish(self, end: int) -> None:
-        """Apply the rules about the whole log, whose last stamp is `end` [ns]."""
+        """Apply the rules about the whole log.
+
+        Args:
+            end: last time stamp of the log [ns].
+        """
         for rules in self._families.values():
             for rule in rules:
                 if isinstance(rule, _Stuck):
                     rule.finish(end)
 
     def checked(self, family: Family) -> dict[str, list[str]]:
-        """Return the signals of the family that each rule checks, by rule identifier."""
+        """Return the names of the checked signals of a family, by rule identifier."""
         return {
             rule.id: [family.codec.fields[p].name for p in rule.indices] for rule in self._families[family.rows.start]
         }
@@ -117,7 +121,7 @@ class _Velocity:
             return
         ends = np.arange(windows + 1) * width
         duration = np.diff(stamps[ends]) * 1e-9
-        # The velocity of a frame is the motion since the previous frame, so the first frame of a window belongs to the last one.
+        # A frame has the velocity since the previous frame, so the mean excludes the first frame of each window.
         inside = velocity[1 : whole + 1].reshape(windows, width)
         mean = inside.mean(axis=1)
         moved = np.diff(position[ends]) / np.where(duration > 0, duration, np.inf)
@@ -165,7 +169,7 @@ class _Quaternion:
 
 
 class _Columns:
-    """Columns of a family with the values of the previous frame of the same message, across chunks."""
+    """Raw codes of some fields of a family, paired with those of the previous frame of the same message."""
 
     def __init__(self, family: Family, indices: Sequence[int]) -> None:
         self._indices = np.array(indices, np.intp)
@@ -176,7 +180,7 @@ class _Columns:
     def with_before(
         self, decoded: Decoded, stream: Stream
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], list[int]]:
-        """Pair the codes of each frame with those of the previous frame.
+        """Pair the raw codes of each frame with those of the previous frame, which may be in an earlier chunk.
 
         Returns:
             The codes, the codes of the previous frame, shape (fields, n) each, and the indices of the frames without a previous
@@ -199,7 +203,7 @@ class _Columns:
 
 
 class _Steps:
-    """Rule for values that change slowly: the step from one frame to the next is limited."""
+    """Rule that limits the change of a slow value from one frame to the next."""
 
     id = "step"
 
@@ -210,7 +214,7 @@ class _Steps:
         fields = [family.codec.fields[p] for p in self.indices]
         self._limits = np.array([limit / abs(f.factor) for limit, f in zip(limits.values(), fields, strict=True)])
         self._first_row = family.rows.start
-        #: Whether the last value was invalid, shape (fields, rows); the step back to a valid value is then no finding.
+        #: Mask of the invalid last values, shape (fields, rows). A step from an invalid to a valid value is no finding.
         self._was_bad = np.zeros((len(self.indices), len(family.rows)), np.bool_)
 
     @classmethod
@@ -237,7 +241,7 @@ class _Steps:
     def _check_column(
         self, decoded: Decoded, stream: Stream, steps: Steps, at: int, moved: npt.NDArray[np.int64]
     ) -> None:
-        """Check one column.
+        """Check the steps of one field.
 
         Frames after lost frames, invalid values and values directly after an invalid value are not checked.
         """
@@ -259,7 +263,7 @@ class _Steps:
 
 
 class _Stuck:
-    """Rule for measured values: a value without noise, constant to the last bit, is reported as stuck."""
+    """Rule that reports a measured value as stuck if its raw code stays constant, without noise."""
 
     id = "stuck"
 
@@ -267,9 +271,9 @@ class _Stuck:
         self.indices = list(indices)
         self._family, self._findings, self._frames = family, findings, frames
         self._columns = _Columns(family, indices)
-        #: Consecutive frames without a change so far, shape (fields, rows).
+        #: Number of consecutive frames with an unchanged raw code, shape (fields, rows).
         self._run = np.zeros((len(self.indices), len(family.rows)), np.int64)
-        #: Last stamp of each row [ns].
+        #: Time stamp of the last frame of each row [ns].
         self._stamp = np.zeros(len(family.rows), np.int64)
 
     @classmethod
@@ -303,7 +307,11 @@ class _Stuck:
         self._run[at, number] = len(still) - 1 - int(moves[-1])
 
     def finish(self, end: int) -> None:
-        """Report the values that are constant at the end of the log, whose last stamp is `end` [ns]."""
+        """Report the values that are stuck at the end of the log.
+
+        Args:
+            end: last time stamp of the log [ns].
+        """
         for at, number in np.argwhere(self._run >= self._frames).tolist():
             stamp = min(end, int(self._stamp[number]))
             self._report(at, number, np.array([stamp], np.int64), self._run[at, number : number + 1])

@@ -21,16 +21,18 @@ SYNC = "SYNC"
 
 @dataclass
 class _Bus:
-    """One bus with a SYNC message, and its state at the end of the last chunk."""
+    """Bus with a SYNC message, and its last cycles at the end of the last chunk."""
 
     sync: int  # row of the SYNC message
     states: list[int]  # rows of the state messages
     cycle_ns: float
     count: int = 0  # SYNC frames so far
-    stamp: int = 0  # stamp of the last SYNC frame [ns]
-    cycle_of: dict[int, int] = field(default_factory=dict)  # row -> cycle of the last state frame
-    jump_of: dict[int, int] = field(default_factory=dict)  # row -> cycles between the last two state frames
-    doubtful: dict[int, int] = field(default_factory=dict)  # row -> stamp of a second state frame in one cycle [ns]
+    stamp: int = 0  # time stamp of the last SYNC frame [ns]
+    cycle_of: dict[int, int] = field(default_factory=dict)  # cycle of the last state frame, by row
+    jump_of: dict[int, int] = field(default_factory=dict)  # cycles between the last two state frames, by row
+    doubtful: dict[int, int] = field(
+        default_factory=dict
+    )  # time stamp of a second state frame in one cycle [ns], by row
 
 
 class OrderRules:
@@ -51,11 +53,11 @@ class OrderRules:
 
     @property
     def checked(self) -> set[int]:
-        """Return the rows that are checked."""
+        """Return the rows of the messages that the order rules check."""
         return {row for bus in self.buses for row in (bus.sync, *bus.states)}
 
     def check(self, stream: Stream, steps: Steps) -> None:
-        """Check a chunk.
+        """Check the order of SYNC and state frames in a chunk.
 
         Args:
             stream: frames of the chunk by message, shape (n,).
@@ -78,7 +80,10 @@ class OrderRules:
     def _check_lateness(
         self, bus: _Bus, row: int, stamps: npt.NDArray[np.int64], begins: npt.NDArray[np.int64], number: Indices
     ) -> None:
-        """Report states after the deadline of their cycle; `_check_order` reports states in the next cycle."""
+        """Report the state frames after the deadline of their cycle.
+
+        `_check_order` reports the state frames in the next cycle.
+        """
         after = stamps - begins
         late = (after > self._deadline * bus.cycle_ns) & (after < bus.cycle_ns)
         if not bus.count:
@@ -95,19 +100,19 @@ class OrderRules:
         cycles: Indices,
         begins: npt.NDArray[np.int64],
     ) -> None:
-        """Report states in the wrong cycle.
+        """Report the state frames in the wrong cycle.
 
-        If a cycle has two states and the next cycle has none, the second state came before its SYNC. If a cycle has none and the
-        next cycle has two, the first state was late. A SYNC that is missing in the log also gives two states in one cycle, but
-        then the next cycle has one state.
+        If a cycle has two states and the next cycle has none, the second state was received before its SYNC. If a cycle has no
+        state and the next cycle has two, the first state was late. A SYNC that is missing in the log also gives two states in
+        one cycle, but then the next cycle has one state.
 
         Args:
             bus: bus of the state message.
             row: row of the state message.
-            stamps: stamp of each state [ns], shape (n,).
+            stamps: time stamp of each state [ns], shape (n,).
             steps: step of the alive counter of each state, shape (n,).
             cycles: number of the cycle of each state, shape (n,).
-            begins: stamp of the last SYNC of the previous chunk, then of each SYNC of the chunk [ns], shape (m + 1,).
+            begins: time stamps of the last SYNC before the chunk and of each SYNC in the chunk [ns], shape (m + 1,).
         """
         first = bus.cycle_of.get(row)
         jumps = np.diff(cycles, prepend=cycles[0] - 1 if first is None else first)

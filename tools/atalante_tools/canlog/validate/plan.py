@@ -1,4 +1,4 @@
-"""DBC compiled for the validator: one row per message, contiguous rows for equal layouts, and the row of each identifier."""
+"""Plan: the DBC compiled to arrays with one row per message, and a lookup from CAN identifiers to rows."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from atalante_dbc.foreign import Catalogue, Layout, Refused
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_EXTENDED, header_word
-from atalante_tools.canlog.column_codec import BulkCodec, crc_of_zeros
+from atalante_tools.canlog.column_codec import ColumnCodec, crc_of_zeros
 
-#: Row of an identifier that is not in the DBC.
+#: Row number of an identifier that is not in the DBC.
 UNKNOWN = -1
 _STANDARD = 1 << 11
 _ALL_BITS = 0x1FFF_FFFF
@@ -22,10 +22,10 @@ Rows = npt.NDArray[np.int16]
 
 @dataclass(frozen=True)
 class Family:
-    """Messages with equal fields, which are decoded together."""
+    """Group of messages with equal fields, which are decoded together."""
 
     rows: range
-    codec: BulkCodec
+    codec: ColumnCodec
 
     @property
     def length(self) -> int:
@@ -36,8 +36,8 @@ class Family:
 class Plan:
     """Arrays of message properties, indexed by row.
 
-    The rows are ordered by length, then by layout, so that messages which are processed together are contiguous. The messages
-    with an unsupported layout have the last rows. Their frames are counted but not decoded.
+    The rows are ordered by length, then by layout. Therefore the rows of a family are contiguous. The messages with an
+    unsupported layout have the last rows. Their frames are counted but not decoded.
     """
 
     def __init__(self, catalogue: Catalogue) -> None:
@@ -52,8 +52,8 @@ class Plan:
         self._index_identifiers()
         count = len(self.layouts)
         headers = [header_word(_can_id(m), m.length, _flags(m)) for m in self.layouts]
-        #: Expected first word of a frame of each row; 0 for unsupported messages, whose frames are not compared.
-        self.headers = np.array([*headers, *([0] * len(self.refused)), 0], np.uint64)  # the last one is for `UNKNOWN`
+        #: Expected header word of the frames of each row; 0 for unsupported messages and, as last element, for `UNKNOWN`.
+        self.headers = np.array([*headers, *([0] * len(self.refused)), 0], np.uint64)
         self.lengths = np.array([m.length for m in self.layouts], np.int64)
         self.cycle_ns = np.array([1e6 * (m.cycle_ms or 0.0) if m.cyclic else 0.0 for m in self.layouts])
         self.timeout_ns = np.array([1e6 * (m.timeout_ms or 0.0) for m in self.layouts])
@@ -83,7 +83,7 @@ class Plan:
         return self.layouts[row].name if row < count else self.refused[row - count].name
 
     def sender(self, row: int) -> str:
-        """Return the sending node of a row; empty if the DBC names none."""
+        """Return the node that sends the message of a row; empty if the DBC has no sender for the message."""
         return self.layouts[row].sender or "" if row < len(self.layouts) else ""
 
     # -- identifiers -------------------------------------------------------------------------------------------------
@@ -100,7 +100,7 @@ class Plan:
                 continue
             extended[frame_id] = row
             if mask != _ALL_BITS:
-                # Only the whole identifier distinguishes two messages of one parameter group.
+                # With two messages in one parameter group, the masked identifier is ambiguous.
                 known = groups.setdefault(mask, {})
                 known[frame_id & mask] = UNKNOWN if frame_id & mask in known else row
         self._standard = standard
@@ -108,7 +108,11 @@ class Plan:
         self._groups = [(np.uint32(mask), _Table(rows)) for mask, rows in groups.items()]
 
     def rows(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
-        """Return the row of each identifier with flags; `UNKNOWN` for identifiers that are not in the DBC. Shape (n,)."""
+        """Return the row of each identifier; `UNKNOWN` for identifiers that are not in the DBC. Shape (n,).
+
+        Args:
+            can_ids: identifiers with SocketCAN flags, shape (n,).
+        """
         if int(can_ids.max(initial=0)) < _STANDARD:
             return self._standard[can_ids]
         is_standard = can_ids < _STANDARD
@@ -128,7 +132,7 @@ class Plan:
         return rows
 
     def rows_in_other_format(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
-        """Return the row of the same identifier in the other format (11 or 29 bits), otherwise `UNKNOWN`. Shape (n,)."""
+        """Return the row of the same identifier in the other format (11 or 29 bits); `UNKNOWN` without one. Shape (n,)."""
         numbers = can_ids & np.uint32(_ALL_BITS)
         short = self._standard[np.where(numbers < _STANDARD, numbers, 0)]
         short[numbers >= _STANDARD] = UNKNOWN
@@ -137,7 +141,7 @@ class Plan:
 
 
 class _Table:
-    """Rows of identifiers, found by bisection."""
+    """Lookup table from identifiers to rows, searched by bisection."""
 
     def __init__(self, rows: dict[int, int]) -> None:
         self._numbers = np.array(sorted(rows), np.uint32)
@@ -178,6 +182,6 @@ def _families(layouts: Sequence[Layout], keys: Sequence[tuple[object, ...]]) -> 
     begin = 0
     for row in range(1, len(layouts) + 1):
         if row == len(layouts) or keys[row] != keys[begin]:
-            families.append(Family(range(begin, row), BulkCodec(layouts[begin])))
+            families.append(Family(range(begin, row), ColumnCodec(layouts[begin])))
             begin = row
     return tuple(families)

@@ -7,7 +7,7 @@ p99 = 0.4
 
 [[silence]]
 rule = "cycle-gap"
-message = "*_STATUS"          # a name, or a pattern; "*" is every message
+message = "*_STATUS"          # name or pattern; "*" is every message
 reason = "sent by a task of low priority, see TICKET-17"
 
 [channels]
@@ -30,12 +30,12 @@ _SILENCE_KEYS = ("rule", "message", "reason")
 
 
 class ProjectError(ValueError):
-    """Error in a rules file; the message names the key and the valid values."""
+    """Raised if a rules file is invalid. The message names the key and the valid values."""
 
 
 @dataclass(frozen=True)
 class Silence:
-    """Silenced rule, with the reason."""
+    """Entry of a rules file that silences a rule, with the reason."""
 
     rule: str
     message: str  # name or pattern
@@ -48,43 +48,43 @@ class Silence:
 
 @dataclass(frozen=True)
 class Project:
-    """Content of a rules file; thresholds that it lacks have the defaults of `rules.RULES`."""
+    """Content of a rules file. Missing thresholds have the defaults of `rules.RULES`."""
 
     thresholds: Mapping[str, Mapping[str, Threshold]] = field(default_factory=dict)
     silences: tuple[Silence, ...] = ()
-    channels: Mapping[str, str] = field(default_factory=dict)  # channel of the log -> bus of the DBC
+    channels: Mapping[str, str] = field(default_factory=dict)  # bus in the DBC, by channel of the log
 
     def threshold(self, rule: str, name: str) -> Threshold:
         """Return a threshold of a rule."""
         return self.thresholds.get(rule, {}).get(name, RULE_OF[rule].thresholds[name])
 
     def number(self, rule: str, name: str) -> float:
-        """Return a threshold whose value is a number, in the unit of the rule."""
+        """Return a threshold that is a number, in the unit of the rule."""
         value = self.threshold(rule, name)
         assert isinstance(value, float)
         return value
 
     def text(self, rule: str, name: str) -> str:
-        """Return a threshold whose value is a name, e.g. of a signal, as text."""
+        """Return a threshold that is a name, e.g. of a signal."""
         return str(self.threshold(rule, name))
 
     def names(self, rule: str, name: str) -> tuple[str, ...]:
-        """Return a threshold whose value is a list of names."""
+        """Return a threshold that is a list of names."""
         value = self.threshold(rule, name)
         assert isinstance(value, tuple)
         return value
 
     def quantities(self, rule: str) -> dict[str, float]:
-        """Return the thresholds of a rule that has one number per quantity."""
+        """Return the numeric threshold of each quantity of a rule."""
         found = {**RULE_OF[rule].thresholds, **self.thresholds.get(rule, {})}
         return {name: value for name, value in found.items() if isinstance(value, float)}
 
     def silence(self, rule: str, message: str) -> Silence | None:
-        """Return the entry that silences the findings of a rule about a message, or None."""
+        """Return the entry that silences a rule for a message; None if the rule is not silenced."""
         return next((s for s in self.silences if s.covers(rule, message)), None)
 
 
-#: Rules whose thresholds are named by quantities of the DBC; a project may add thresholds to them.
+#: Rules with one threshold per quantity of the DBC. A rules file may add quantities.
 _OPEN = ("step",)
 
 
@@ -103,9 +103,9 @@ def load_project(path: Path) -> Project:
     silences = document.pop("silence", [])
     channels = document.pop("channels", {})
     if not isinstance(silences, list):
-        raise ProjectError(f"{path}: silence must be a list of tables, written as [[silence]]")
+        raise ProjectError(f"{path}: silence must be a list of tables, written as [[silence]], got {silences!r}")
     if not isinstance(channels, dict) or not all(isinstance(bus, str) for bus in channels.values()):
-        raise ProjectError(f"{path}: [channels] must assign the name of a bus to each channel")
+        raise ProjectError(f"{path}: [channels] must assign the name of a bus to each channel, got {channels!r}")
     return Project(
         {rule: _thresholds(path, rule, table) for rule, table in document.items()},
         tuple(_silence(path, entry) for entry in silences),
@@ -117,10 +117,10 @@ def _thresholds(path: Path, rule: str, table: Any) -> dict[str, Threshold]:
     if rule not in RULE_OF:
         raise ProjectError(f"{path}: a rule must be one of {', '.join(RULE_OF)}, got {rule!r}")
     known = RULE_OF[rule].thresholds
-    if not isinstance(table, dict) or not known:
-        raise ProjectError(
-            f"{path}: {rule} {'must be a table of thresholds' if known else 'has no threshold; remove it'}"
-        )
+    if not known:
+        raise ProjectError(f"{path}: {rule} has no threshold; remove it")
+    if not isinstance(table, dict):
+        raise ProjectError(f"{path}: {rule} must be a table of thresholds, got {table!r}")
     found: dict[str, Threshold] = {}
     for name, value in table.items():
         like = known.get(name, 0.0 if rule in _OPEN else None)
@@ -151,12 +151,12 @@ def _silence(path: Path, entry: Any) -> Silence:
         or not all(isinstance(v, str) for v in entry.values())
     ):
         raise ProjectError(
-            f"{path}: a [[silence]] must have only the keys {', '.join(_SILENCE_KEYS)}, each with a text"
+            f"{path}: a [[silence]] must have only the keys {', '.join(_SILENCE_KEYS)}, each with a text, got {entry!r}"
         )
     if entry.get("rule") not in RULE_OF:
         raise ProjectError(
             f"{path}: the rule of a [[silence]] must be one of {', '.join(RULE_OF)}, got {entry.get('rule')!r}"
         )
     if not entry.get("reason", "").strip():
-        raise ProjectError(f"{path}: the [[silence]] of {entry['rule']} must have a reason, which the report prints")
+        raise ProjectError(f"{path}: the [[silence]] of {entry['rule']} must have a reason for the report, got none")
     return Silence(entry["rule"], entry.get("message", "*"), entry["reason"])

@@ -36,7 +36,7 @@ from atalante_tools.canlog.validate.chunk import NO_DIRECTION, RECEIVED, SENT, C
 if TYPE_CHECKING:
     from atalante_tools.canlog.validate.log import Log
 
-#: Formats with one frame per line; a file without a newline at its end is truncated within a frame.
+#: Formats with one frame per line. Without a newline at the end of the file, the last frame is truncated.
 _LINE_FORMATS = (".asc", ".trc", ".csv")
 _BLF_HEADER = struct.Struct("<4sLBBBBBBBBQQ")
 #: First bytes of an MDF file.
@@ -75,7 +75,7 @@ def read(log: Log, chunk_frames: int) -> Iterator[Chunk]:
         except (*UNREADABLE, _mdf_error()) as error:
             broken = " ".join(str(error).split()) or type(error).__name__
         if broken and log.suffix == ".mf4":
-            gc.collect()  # delete the half-opened file while `_quiet_asammdf` suppresses its error
+            gc.collect()  # deletes the half-opened file while `_quiet_asammdf` suppresses its error
     if batch.count:
         yield batch.take()
     _remark(log, count, broken, ends_within, warnings)
@@ -83,10 +83,10 @@ def read(log: Log, chunk_frames: int) -> Iterator[Chunk]:
 
 @contextmanager
 def _messages(log: Log) -> Iterator[tuple[Iterator[Any], Callable[[], int]]]:
-    """Provide the messages of the log, and a function that returns the bytes read so far.
+    """Yield an iterator over the messages of the log, and a function that returns the number of bytes read so far.
 
-    python-can does not close a file that its reader rejects. Therefore this function opens the file, except for .mf4, which
-    asammdf opens.
+    python-can does not close a file that its reader rejects. Therefore this function opens the file. Only .mf4 files are opened
+    by asammdf.
     """
     import can
     from can.io.generic import BinaryIOMessageReader
@@ -130,7 +130,7 @@ def _remark(log: Log, count: int, broken: str, ends_within: bool, warnings: _War
 
 
 class _Batch:
-    """Buffer of frames, filled from python-can messages."""
+    """Buffer of frames that are converted from python-can messages."""
 
     def __init__(self, capacity: int) -> None:
         self._frames = new_frames(capacity)
@@ -197,9 +197,9 @@ class _Warnings(logging.Handler):
 
 @contextmanager
 def _quiet_asammdf() -> Iterator[None]:
-    """Suppress the traceback of a file object of asammdf that failed to open.
+    """Suppress the traceback of asammdf for a file that cannot be opened.
 
-    Its destructor raises an exception, which Python prints.
+    The destructor of the file object raises an exception, which Python prints.
     """
     before = sys.unraisablehook
 
@@ -239,7 +239,7 @@ def _last_byte(path: Path) -> bytes:
 
 
 def _missing_bytes(path: Path) -> int:
-    """Return the number of bytes that a .blf file lacks according to its header."""
+    """Return the number of bytes that are missing in a .blf file according to its header."""
     with path.open("rb") as file:
         header = file.read(_BLF_HEADER.size)
     if len(header) < _BLF_HEADER.size:

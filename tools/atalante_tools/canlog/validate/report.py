@@ -35,7 +35,7 @@ class Report:
 
 
 def report(name: str, validator: Validator, *, live: bool = False) -> Report:
-    """Separate the findings of a finished validator from the silenced ones.
+    """Create the report of a finished validator, with the silenced findings in a separate list.
 
     Args:
         name: name of the log or of the bus.
@@ -56,7 +56,7 @@ def report(name: str, validator: Validator, *, live: bool = False) -> Report:
 
 
 def text(result: Report) -> str:
-    """Return the report as text: the log, the findings, the silenced findings and the items that were not checked."""
+    """Return the report as text: log, findings, silenced findings, and messages and signals that were not checked."""
     validator = result.validator
     channels = ", ".join(name or "without a name" for name in validator.channels) or "none"
     lines = [
@@ -78,7 +78,7 @@ def text(result: Report) -> str:
 
 
 def verdict(result: Report) -> str:
-    """Return the result in one line."""
+    """Return the number of findings and occurrences in one line."""
     if result.findings:
         count = sum(finding.count for finding in result.findings)
         findings = "1 finding" if len(result.findings) == 1 else f"{len(result.findings)} findings"
@@ -145,7 +145,7 @@ def write_junit(results: Sequence[Report], path: Path) -> None:
 
 
 def _skipped(result: Report, rule: str) -> str:
-    """Return why a rule was silenced or not checked; empty if it was checked."""
+    """Return the reason why a rule was silenced or not checked; empty if the rule was checked."""
     reasons = [f"silenced for {_where(f)}: {s.reason}" for f, s in result.silenced if f.rule == rule]
     reasons += [f"not checked: {item.reason}" for item in result.unchecked if rule in item.rules and not item.items]
     return "; ".join(reasons)

@@ -1,9 +1,9 @@
 """Table of all rules: meaning, source in the DBC, unit of the worst value, and default thresholds.
 
 The modules `frame_rules`, `e2e_rules`, `value_rules`, `timing_rules`, `order_rules`, `load_rules`, `motion_rules` and
-`drive_rules` check columns of frames. Each cause is reported by one rule only: a frame with a wrong length is not also reported
-as lost, a timeout is not also a counter jump, and a value outside its range is not also missing in the value table. The rules
-file of a project (`project.py`) changes thresholds and silences rules.
+`drive_rules` check many frames at a time. Only one rule reports each cause: a frame with a wrong length is not also reported as
+lost, a timeout is not also a counter jump, and a value outside its range is not also missing in the value table. The rules file
+of a project (`project.py`) changes thresholds and silences rules.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ Threshold = float | str | Mapping[str, float] | tuple[str, ...]
 
 @dataclass(frozen=True)
 class Rule:
-    """One property of frames or logs that the validator checks."""
+    """Property of frames or logs that the validator checks."""
 
     id: str
     meaning: str  # the violation, in one line
-    source: str  # entry of the DBC, or standard, that defines the correct value
+    source: str  # DBC entry or standard that defines the correct value
     worst: str = ""  # unit of the worst value
     thresholds: Mapping[str, Threshold] = field(default_factory=dict)
 
 
 RULES = (
-    # -- the log itself ----------------------------------------------------------------------------------------------
+    # -- log file ----------------------------------------------------------------------------------------------------
     Rule("log-empty", "The log has no frame", "the log"),
     Rule("log-truncated", "The log is truncated within a record", "the log"),
     Rule("log-unreadable", "Entries of the log are no CAN frame and were not checked", "the log"),

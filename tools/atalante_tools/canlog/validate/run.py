@@ -1,4 +1,4 @@
-"""Loops that pass the frames of a log or a live bus to the validator and return the report."""
+"""Check of a log or a live bus: passes the frames to the validator and returns the report."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from atalante_tools.canlog.validate.plan import Plan
 from atalante_tools.canlog.validate.project import Project
 from atalante_tools.canlog.validate.report import Report, report
 
-#: Period of the checks of a live bus, and longest wait for a frame [s].
+#: Period of the checks on a live bus, and longest wait for a frame [s].
 _CHECK_PERIOD, _RECEIVE_TIMEOUT = 0.5, 0.02
 _LIVE_FRAMES = 4096  # size of the receive buffer
 
@@ -38,7 +38,7 @@ def validate_log(
         path: file of the log.
         plan: compiled DBC.
         project: thresholds, silenced rules and channel names.
-        node: the only node whose messages are expected; None: all nodes.
+        node: require only the messages of this node; None: of all nodes.
         progress: called after each chunk with the share of the log that has been read, 0 to 1, and the frames so far.
 
     Raises:
@@ -102,20 +102,20 @@ def listen(
     node: str | None = None,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> Report:
-    """Check the frames of one or more open buses until `stopped()` or a bus error. Nothing is sent.
+    """Check the frames of one or more open buses until `stopped` returns True or a bus error occurs. Send nothing.
 
     Args:
-        buses: channel name -> open bus.
+        buses: open bus of each channel name.
         plan: compiled DBC.
         project: thresholds, silenced rules and channel names.
         name: name of the report.
-        stopped: called in every iteration; True ends the loop.
-        node: the only node whose messages are expected; None: all nodes.
+        stopped: function that is called in every iteration; True ends the loop.
+        node: require only the messages of this node; None: of all nodes.
         progress: called after each check with the frames so far.
     """
     validator = Validator(plan, project, node=node)
     names, scratch = list(buses), new_frames(_LIVE_FRAMES)
-    pieces: list[Chunk] = []
+    received: list[Chunk] = []
     next_time = time.monotonic() + _CHECK_PERIOD
     failure = ""
     while not stopped() and not failure:
@@ -126,39 +126,39 @@ def listen(
                 failure = str(error)
                 break
             if count:
-                pieces.append(_piece(bus, scratch[:count], channel))
-        if len(buses) > 1 and not pieces:
+                received.append(_chunk(bus, scratch[:count], channel))
+        if len(buses) > 1 and not received:
             time.sleep(_RECEIVE_TIMEOUT / 10)
         if time.monotonic() >= next_time:
             next_time += _CHECK_PERIOD
-            _check_pieces(validator, pieces, names)
+            _check_received(validator, received, names)
             progress(validator.frames)
-    _check_pieces(validator, pieces, names)
+    _check_received(validator, received, names)
     validator.finish((), dropped=sum(bus.dropped for bus in buses.values()))
     if failure:
         validator.findings.add_log("log-truncated", validator.end, 1, f"listening ended with a bus error: {failure}")
     return report(name, validator, live=True)
 
 
-def _piece(bus: Bus, frames: np.ndarray, channel: int) -> Chunk:
+def _chunk(bus: Bus, frames: np.ndarray, channel: int) -> Chunk:
     count = len(frames)
     stamps = bus.stamps[:count].copy()
     return Chunk(frames.copy(), stamps, np.full(count, channel, np.uint8), np.full(count, NO_DIRECTION, np.int8))
 
 
-def _check_pieces(validator: Validator, pieces: list[Chunk], names: list[str]) -> None:
-    if not pieces:
+def _check_received(validator: Validator, received: list[Chunk], names: list[str]) -> None:
+    if not received:
         return
-    frames = new_frames(sum(map(len, pieces)))
-    words = [piece.frames.view("<u8").reshape(-1, WORDS) for piece in pieces]
+    frames = new_frames(sum(map(len, received)))
+    words = [chunk.frames.view("<u8").reshape(-1, WORDS) for chunk in received]
     np.concatenate(words, out=frames.view("<u8").reshape(-1, WORDS))
     chunk = Chunk(
         frames,
-        np.concatenate([piece.stamps for piece in pieces]),
-        np.concatenate([piece.channels for piece in pieces]),
-        np.concatenate([piece.sent for piece in pieces]),
+        np.concatenate([chunk.stamps for chunk in received]),
+        np.concatenate([chunk.channels for chunk in received]),
+        np.concatenate([chunk.sent for chunk in received]),
     )
-    pieces.clear()
+    received.clear()
     validator.check(chunk.select(np.argsort(chunk.stamps, kind="stable")), names)
 
 

@@ -1,4 +1,4 @@
-"""Valid frames of a chunk in one array, sorted by message, so that each message is a slice.
+"""Stream: valid frames of a chunk, sorted by message. The frames of each message are contiguous.
 
 Differences between consecutive frames (counter steps, intervals) are computed for all messages in one operation. The first frame
 of each slice is compared with the last frame of the message in the previous chunks.
@@ -21,21 +21,21 @@ _Column = TypeVar("_Column", bound=npt.NDArray[Any])
 
 @dataclass(frozen=True)
 class Stream:
-    """Frames sorted by row, in the order of the log within a row. Shapes (n,), and (m,) for the m messages in the chunk."""
+    """Frames of a chunk sorted by message row, then in the order of the log; n frames of m messages."""
 
-    rows: Rows  # row of each frame
+    rows: Rows  # row of the message of each frame, shape (n,)
     stamps: npt.NDArray[np.int64]  # ns
-    indices: npt.NDArray[np.intp]  # index of each frame in the chunk
+    indices: npt.NDArray[np.intp]  # index of each frame in the chunk, shape (n,)
     frames: Frames
-    present: npt.NDArray[np.intp]  # rows that have frames, ascending
-    starts: npt.NDArray[np.intp]  # first frame of each present row
-    stops: npt.NDArray[np.intp]  # index after the last frame of each present row
+    present: npt.NDArray[np.intp]  # rows of the messages with frames, ascending, shape (m,)
+    starts: npt.NDArray[np.intp]  # index of the first frame of each message, shape (m,)
+    stops: npt.NDArray[np.intp]  # index after the last frame of each message, shape (m,)
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def before(self, column: _Column, carried: npt.NDArray[Any]) -> _Column:
-        """Return the value of the previous frame of the same message. Shape (n,).
+        """Return for each frame the value of the previous frame of the same message. Shape (n,).
 
         Args:
             column: value of each frame, shape (n,).
@@ -68,7 +68,7 @@ class Stream:
         return self.span(range(row, row + 1))
 
     def bounds(self, family: Family) -> list[tuple[int, int, int]]:
-        """Return (row, first, end) of each message in the chunk, as indices into the frames of the family."""
+        """Return (row, first, end) of each message of a family; `first` and `end` are indices into the family's frames."""
         first, end = self.present.searchsorted((family.rows.start, family.rows.stop)).tolist()
         if first == end:
             return []
@@ -84,7 +84,11 @@ class Stream:
         ]
 
     def select(self, keep: npt.NDArray[np.bool_]) -> Stream:
-        """Return the frames where the mask of shape (n,) is True."""
+        """Return a stream with the selected frames.
+
+        Args:
+            keep: mask of the frames, shape (n,).
+        """
         return _stream(self.rows[keep], self.stamps[keep], self.indices[keep], self.frames[keep])
 
 

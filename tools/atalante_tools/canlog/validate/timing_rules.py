@@ -1,7 +1,7 @@
 """Rules for the time of frames and for lost frames: cycle time, gaps, timeouts, inhibit time, alive counter.
 
-Intervals and alive counters are checked together. A lost frame (counter-lost) is not also reported as late, and a node may
-restart its counter after a timeout.
+Intervals and alive counters are checked together. A lost frame (counter-lost) is not also reported as late. A node may restart
+its counter after a timeout.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from atalante_tools.canlog.validate.stream import Stream
 
 Vector = npt.NDArray[np.float64]
 
-#: Histogram of intervals: bins per cycle, and range in cycles; the last bin counts all longer intervals.
+#: Interval histogram: bins per cycle, and range in cycles. The last bin counts all longer intervals.
 BINS_A_CYCLE, CYCLES = 100, 4
 BINS = BINS_A_CYCLE * CYCLES + 1
 _NEVER = -(1 << 62)
-#: Maximum number of gaps that are kept for the plot of the report.
+#: Maximum number of counter gaps in the plot of the report.
 _MAX_GAPS = 20_000
 
 
 class TimingRules:
-    """Rules for the intervals and alive counters of all messages; keeps the last frame of each message."""
+    """Rules for the intervals and alive counters of all messages."""
 
     def __init__(self, plan: Plan, findings: Findings, project: Project) -> None:
         self._plan, self._findings, self._project = plan, findings, project
@@ -35,25 +35,25 @@ class TimingRules:
         self._inhibit = plan.inhibit_ns * project.number("inhibit", "share")
         default = project.number("timeout", "default_cycles") * plan.cycle_ns
         self._timeout = np.where(plan.cycle_ns > 0, np.where(plan.timeout_ns > 0, plan.timeout_ns, default), 0.0)
-        self._last = np.full(count, _NEVER, np.int64)  # stamp of the last valid frame [ns]
-        self._arrived = np.full(count, _NEVER, np.int64)  # stamp of the last frame, valid or rejected [ns]
+        self._last = np.full(count, _NEVER, np.int64)  # time stamp of the last valid frame [ns], by row
+        self._arrived = np.full(count, _NEVER, np.int64)  # time stamp of the last frame, valid or rejected [ns], by row
         self._first = np.full(count, _NEVER, np.int64)
         self._last_share = np.full(count, np.inf)
         self._last_steps = np.zeros(count, np.int64)
-        #: Histogram, number and sum [ns] of the intervals without lost frames, by row.
+        #: Histogram, number and sum [ns] of the intervals without lost frames, by message row.
         self.histogram = np.zeros((count, BINS), np.int64)
         self.intervals = np.zeros(count, np.int64)
         self._sum = np.zeros(count)
-        #: Lost frames for the plot: (stamp of the next frame [ns], row, number of lost frames).
+        #: Counter gaps for the plot: (time stamp of the next frame [ns], row, number of lost frames).
         self.gaps: list[tuple[int, int, int]] = []
 
     def exclude(self, row: int) -> None:
-        """Exclude a message from timing, because it has several senders."""
+        """Exclude a message with several senders from the timing rules."""
         self._cycle[row] = self._timeout[row] = self._inhibit[row] = 0.0
 
     @property
     def checked(self) -> npt.NDArray[np.bool_]:
-        """Return which messages have a cycle time or inhibit time. Shape (rows,)."""
+        """Return the mask of the messages with a cycle time or inhibit time. Shape (rows,)."""
         checked: npt.NDArray[np.bool_] = (self._cycle > 0) | (self._inhibit > 0)
         return checked
 
@@ -62,16 +62,16 @@ class TimingRules:
         return bool(self._arrived[row] != _NEVER)
 
     def arrived(self, rows: Rows, stamps: npt.NDArray[np.int64]) -> None:
-        """Register rejected frames.
+        """Record the arrival of rejected frames.
 
         Args:
             rows: row of each frame, shape (k,).
-            stamps: stamp of each frame [ns], shape (k,).
+            stamps: time stamp of each frame [ns], shape (k,).
         """
         np.maximum.at(self._arrived, rows, stamps)
 
     def check(self, stream: Stream, steps: Steps, rejected_before: Steps | None) -> None:
-        """Check a chunk.
+        """Check the intervals and alive counters in a chunk.
 
         Args:
             stream: valid frames of the chunk by message, shape (n,).
@@ -102,7 +102,7 @@ class TimingRules:
     def _check_timeouts(
         self, stream: Stream, intervals: Steps, share: Vector, rejected_before: Steps | None
     ) -> npt.NDArray[np.intp]:
-        """Report the frames after a timeout of their message; return their indices."""
+        """Report the messages that were received again after a timeout; return the indices of these frames."""
         timeout = self._timeout[stream.present]
         shortest = float(timeout[timeout > 0].min(initial=np.inf))
         indices = np.flatnonzero(intervals > shortest)
@@ -187,10 +187,10 @@ class TimingRules:
         steps: Steps,
         rejected_before: Steps | None,
     ) -> None:
-        """Add the intervals without lost frames to histogram, number and sum."""
+        """Add the intervals without lost frames to the statistics of each message."""
         bins = np.minimum(np.maximum(share * BINS_A_CYCLE, 0.0), float(BINS - 1)).astype(np.int64)
         bins += (np.arange(len(stream.present)) * BINS).repeat(stream.stops - stream.starts)
-        # A message without a counter has `NO_STEP`, but its interval counts, unless the frame is the first one.
+        # Intervals of a message without a counter (`NO_STEP`) are included.
         incomplete = (
             odd[steps[odd] >= REPEATED]
             if rejected_before is None
@@ -223,15 +223,15 @@ class TimingRules:
                     "inhibit", stream.rows[span][soon], stream.stamps[span][soon], shown=shown, badness=-shown
                 )
 
-    # -- the end of the log ------------------------------------------------------------------------------------------
+    # -- rules about the whole log -----------------------------------------------------------------------------------
 
     def finish(self, begin: int, end: int, expected: npt.NDArray[np.bool_]) -> None:
         """Apply the rules about the whole log.
 
         Args:
-            begin: first stamp of the log [ns].
-            end: last stamp of the log [ns].
-            expected: whether a message must be in the log, shape (rows,).
+            begin: first time stamp of the log [ns].
+            end: last time stamp of the log [ns].
+            expected: mask of the messages that must be in the log, shape (rows,).
         """
         for row in np.flatnonzero(self._cycle > 0).tolist():
             if self.seen(row):
@@ -254,7 +254,7 @@ class TimingRules:
         mean = self._sum[row] / count
         if count >= self._project.number("cycle-mean", "min_intervals"):
             tolerance = self._project.number("cycle-mean", "tolerance")
-            # A long gap changes only the mean and is reported as a gap; a wrong cycle time also changes the median.
+            # A wrong cycle time changes mean and median. A long gap changes only the mean and is reported as a gap.
             if abs(mean / cycle - 1.0) > tolerance and abs(median(self.histogram[row]) - 1.0) > 0.5 * tolerance:
                 self._findings.add_whole("cycle-mean", row, first, last, shown=mean * 1e-6, count=count)
         if count >= self._project.number("cycle-jitter", "min_intervals"):

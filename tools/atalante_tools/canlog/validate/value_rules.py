@@ -1,7 +1,7 @@
 """Rules for payloads: ranges, codes for "no value", value tables, reserved bits, multiplexers.
 
-The messages of a family are checked together. Each field costs two reductions (smallest and largest raw code). Only a column that
-fails is checked value by value.
+The messages of a family are checked together. First, the smallest and largest raw code of each field are checked. Only if one of
+them is wrong, the field is checked value by value.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc.foreign import Field, Layout
-from atalante_tools.canlog.column_codec import BulkCodec, Mask, Words, payload_words, raw_range
+from atalante_tools.canlog.column_codec import ColumnCodec, Mask, Words, payload_words, raw_range
 from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.plan import Family, Plan
 from atalante_tools.canlog.validate.project import Project
 from atalante_tools.canlog.validate.stream import Stream
 
-#: Longest field with a lookup table of its named values, bits.
+#: Longest field for which named values are stored as a lookup table [bit].
 _TABLE_BITS = 16
 _WORD = 64
 _HASH_BITS = 32
@@ -28,12 +28,12 @@ _HASH_BITS = 32
 
 @dataclass
 class Decoded:
-    """Raw codes of the frames of a family, with marks for invalid values."""
+    """Raw codes of the frames of a family, with masks of the invalid values."""
 
     family: Family
     span: slice  # frames of the family in the stream
     raw: Words  # shape (fields, n)
-    bad: dict[int, Mask] = field(default_factory=dict)  # index of a field -> frames with an invalid value
+    bad: dict[int, Mask] = field(default_factory=dict)  # mask of the frames with an invalid value, by field index
 
     @property
     def codes(self) -> npt.NDArray[np.int64]:
@@ -54,7 +54,7 @@ class ValueRules:
         }
 
     def check(self, family: Family, stream: Stream) -> Decoded | None:
-        """Decode and check the frames of a family; return None if the chunk has none."""
+        """Decode and check the frames of a family; return None if the chunk has no frame of the family."""
         span = stream.span(family.rows)
         if span.start == span.stop or not family.codec.fields:
             return None
@@ -118,7 +118,7 @@ class ValueRules:
                 self._check_outside(decoded, stream, index, outside, decoded.codes[index].astype(np.float64))
 
     def _check_limit(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream, index: int) -> None:
-        """Check a column in which at least one code is outside the range."""
+        """Check a field with at least one raw code outside the range."""
         codec, codes = decoded.family.codec, decoded.codes[index]
         low, high = checks.bounds[index]
         outside = (codes < low) | (codes > high)
@@ -137,13 +137,13 @@ class ValueRules:
     def _check_outside(
         self, decoded: Decoded, stream: Stream, index: int, outside: Mask, values: npt.NDArray[np.float64]
     ) -> None:
-        """Report the values outside the range as "no value" or out of range; named special values are valid.
+        """Report values outside the range, as "no value" or as out of range. Values with a name are valid.
 
         Args:
-            decoded: decoded frames of the family; invalid values are marked.
+            decoded: decoded frames of the family, in which invalid values are marked.
             stream: frames of the chunk by message.
             index: index of the field.
-            outside: frames whose value is outside the range, shape (n,).
+            outside: mask of the frames with a value outside the range, shape (n,).
             values: physical values of the field, shape (n,).
         """
         codec, codes = decoded.family.codec, decoded.codes[index]
@@ -200,9 +200,9 @@ class ValueRules:
 
 
 class _FamilyChecks:
-    """Compiled checks of the payloads of a family."""
+    """Limits, lookup tables and bit masks for the payloads of a family, computed once."""
 
-    def __init__(self, codec: BulkCodec, pattern: float, hash_signal: str) -> None:
+    def __init__(self, codec: ColumnCodec, pattern: float, hash_signal: str) -> None:
         fields = list(enumerate(codec.fields))
         ranged = [(p, f) for p, f in fields if is_limited(f)]
         self.special = [p for p, f in ranged if f.kind == "float" or f.length == _WORD]
@@ -210,7 +210,7 @@ class _FamilyChecks:
         self.limited = np.array(list(self.bounds), np.intp)
         self.low = np.array([low for low, _ in self.bounds.values()], np.int64)
         self.high = np.array([high for _, high in self.bounds.values()], np.int64)
-        #: Codes for "no value" of fields without a range.
+        #: Code for "no value" of each field without a range, by field index.
         self.coded = {
             p: _as_signed(f, f.invalid_raw) for p, f in fields if f.invalid_raw is not None and (p, f) not in ranged
         }
@@ -226,7 +226,7 @@ class _FamilyChecks:
 
 
 def reserved_bits(layout: Layout) -> list[int]:
-    """Return the payload bits without a signal, numbered from the least significant bit of byte 0."""
+    """Return the numbers of the payload bits without a signal; bit 0 is the least significant bit of byte 0."""
     used = {bit for f in layout.fields for bit in f.bits}
     return [bit for bit in range(8 * layout.length) if bit not in used]
 
@@ -253,10 +253,11 @@ def raw_bounds(limits: Field) -> tuple[int, int]:
 
 
 def is_enumeration(named: Field) -> bool:
-    """Return whether the value table lists all valid values of the field, not only a few special values of a number.
+    """Return whether the value table names all valid values of the field.
 
-    With a range, the table must have names for both ends of the range. Without a range, it must have at least two names, one of
-    them for 0. A table with a name for every code returns False, because no value can be wrong.
+    Some value tables name only a few special values of a number. With a range, the table must have names for both ends of the
+    range. Without a range, it must have at least two names, and one of them for 0. For a table with a name for every code, the
+    result is False, because no value can be wrong.
     """
     if len(named.choices) < 2 or named.kind == "float" or named.factor != 1 or named.offset != 0:
         return False
@@ -268,7 +269,12 @@ def is_enumeration(named: Field) -> bool:
 
 
 def is_hash(field: Field, signal: str) -> bool:
-    """Return whether a node reports the hash of its DBC in this field; `signal` is the name of such fields."""
+    """Return whether the field contains the hash of the DBC of a node.
+
+    Args:
+        field: field of a message.
+        signal: signal name of the hash.
+    """
     return field.name == signal and field.length == _HASH_BITS and field.kind == "unsigned"
 
 
