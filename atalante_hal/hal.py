@@ -20,16 +20,14 @@ from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, number_of
 from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.plausibility import Plausibility
-from atalante_hal.safety.safety_monitor import DRIVE_NODES, SafetyMonitor
+from atalante_hal.safety.safety_monitor import DRIVE_NODES, SafetyMonitor, Verdict
 from atalante_hal.safety.start import powered
 from atalante_hal.safety.state_machine import Conditions
 from atalante_hal.transceiver import FrameTap, Transceiver
-from atalante_hal.types import Command, State, SupervisorState
+from atalante_hal.types import PERIOD, Command, State, SupervisorState, Vector
 from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_towards_operation
-from atalante_hal.wire.codec import Vector
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-PERIOD = 1e-3  # s, the SYNC period
 #: Consecutive cycles with a limited torque after which TORQUE_SATURATED is confirmed.
 SATURATED_CYCLES = 200
 #: Longest total wait for the nodes' answers while `Hal.stop` puts the robot into HOLD [s].
@@ -82,14 +80,11 @@ class Hal:
         self._safety_monitor = SafetyMonitor(
             network,
             robot,
-            PERIOD,
-            self._parts,
-            self.state,
             self._image,
+            self.state,
+            self._parts.drive_side,
             self._plausibility,
-            self._transceiver,
             self._limiter,
-            self._commands,
         )
         #: Diagnostics and state changes so far, one event for each, raised when it begins.
         self.events = self._safety_monitor.memory.events
@@ -144,16 +139,34 @@ class Hal:
         if foreign:
             in_row = isinstance(foreign, range)
             rows = slice(foreign[0], foreign[-1] + 1) if in_row else list(foreign)
-            self._safety_monitor.accept(transceiver.scratch[rows])
+            others = transceiver.scratch[rows]
+            if unknown := self._safety_monitor.accept(others):
+                transceiver.foreign(others[unknown])
         self._plausibility.check()
         parts = self._parts
         np.multiply(parts.motor_side, self._to_joint, parts.joint_side)
-        self._safety_monitor.judge()
+        verdict = self._safety_monitor.judge(() if transceiver.quiet else transceiver.faults())
+        if verdict is not None:
+            self._apply(verdict)
         header = self._header
         header[0], header[1] = cycle, state.time
         header[7] += count
         header[9] = transceiver.bus.dropped
         return state
+
+    def _apply(self, verdict: Verdict) -> None:
+        """Act on a verdict of the safety monitor: set the commands and the header of the record.
+
+        Args:
+            verdict: Verdict of the present cycle.
+        """
+        self._commands.announce(verdict.supervisor)
+        self._commands.limit[:] = verdict.torque_limit
+        if verdict.acknowledged:
+            self._transceiver.acknowledge()
+        header = self._header
+        header[2], header[3], header[10] = verdict.supervisor, verdict.assistance_factor, verdict.diagnostics
+        header[8] = self.crc_errors
 
     def write(self, command: Command) -> Vector:
         """Limit a command and send it; send HOLD instead while the robot is not `moving`.

@@ -13,9 +13,9 @@ from typing import Protocol
 
 import numpy as np
 
-from atalante_hal.hal import PERIOD, Hal
+from atalante_hal.hal import Hal
 from atalante_hal.safety.diagnostics import Dtc
-from atalante_hal.types import Controller, State
+from atalante_hal.types import PERIOD, Controller, State
 
 #: Consecutive late cycles that lead to HOLD.
 OVERRUNS_TO_HOLD = 3

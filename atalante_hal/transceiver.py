@@ -3,7 +3,7 @@
 `bus -> transceiver -> process image`, and back.
 
 Transmission is denied by default. A batch reaches the bus only if the header of each frame belongs to a message of this node.
-A failing bus raises no exception; `judge` raises its diagnostics.
+A failing bus raises no exception. `faults` returns what was found, and the safety monitor raises the diagnostics.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ from typing import Protocol
 
 from atalante_dbc import Message, Network
 from atalante_hal.bus import Bus, BusError, BusFull
-from atalante_hal.safety.diagnostics import Dtc
-from atalante_hal.safety.fault_memory import FaultMemory
+from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, Frames, as_words, header_word, new_frames
 from atalante_hal.wire.process_image import ReceiveImage
 
@@ -71,7 +70,7 @@ class Outgoing:
 
 
 class Transceiver:
-    """Transceiver of one node; it collects the faults of the bus until `judge` reports them."""
+    """Transceiver of one node; it collects the faults of the bus until `faults` returns them."""
 
     def __init__(
         self, network: Network, node: str, bus: Bus, tap: FrameTap | None, *, cyclic: int, surplus: float
@@ -93,14 +92,13 @@ class Transceiver:
         self._most = cyclic + surplus
         #: Receive buffer, always the same array.
         self.scratch = new_frames(RECEIVE_BUDGET)
-        #: Faults found since the last `judge`: code, whether confirmed, value, sentence.
-        self._found: list[tuple[Dtc, bool, float, str]] = []
+        self._found: list[Finding] = []  # since the last call of `faults`
         self._refused = 0  # consecutive cycles in which the transmit queue was full
         self._full_this_cycle = False
         self._asked = True  # the last batch was sent completely
         self._floods = 0  # consecutive cycles with a flood
         self._bus_off = 0  # error class of the last bus-off frame; 0 after the operator's acknowledgement
-        #: True if the bus has no fault.
+        #: True if the bus has no fault, so that `faults` need not be called.
         self.quiet = True
 
     def grant(self, frames: Frames) -> Outgoing:
@@ -121,7 +119,7 @@ class Transceiver:
         return Outgoing(frames)
 
     def send(self, batch: Outgoing) -> None:
-        """Send a batch; frames that the bus rejects are dropped, and `judge` reports the fault.
+        """Send a batch; frames that the bus rejects are dropped, and `faults` reports it.
 
         Args:
             batch: Batch that `grant` returned.
@@ -221,25 +219,19 @@ class Transceiver:
         """Clear a bus-off after the operator's acknowledgement; it is reported again if the CAN controller reports it again."""
         self._bus_off = 0
 
-    def judge(self, cycle: int, memory: FaultMemory) -> None:
-        """Raise the diagnostics of the faults found since the last call, and of a bus-off that is not acknowledged.
-
-        Args:
-            cycle: Number of the present cycle.
-            memory: Fault memory that receives the diagnostics.
-        """
+    def faults(self) -> list[Finding]:
+        """Return the faults found since the last call, and a bus-off that is not acknowledged; call it once in a cycle."""
         self._refused = self._refused + 1 if self._full_this_cycle else 0
         self._full_this_cycle = False
-        self._floods = self._floods + 1 if any(dtc is Dtc.BUS_FLOOD for dtc, *_ in self._found) else 0
-        for dtc, confirmed, value, text in self._found:
-            memory.raise_dtc(cycle, dtc, self._node, value=value, confirmed=confirmed, text=text)
-        self._found.clear()
+        self._floods = self._floods + 1 if any(finding.dtc is Dtc.BUS_FLOOD for finding in self._found) else 0
         if self._bus_off:
-            memory.raise_dtc(cycle, Dtc.BUS_OFF, self._node, value=self._bus_off)
+            self._find(Dtc.BUS_OFF, True, self._bus_off, "")
+        found, self._found = self._found, []
         self.quiet = not (self._refused or self._floods or self._bus_off)
+        return found
 
     def _find(self, dtc: Dtc, confirmed: bool, value: float, text: str) -> None:
-        self._found.append((dtc, confirmed, value, text))
+        self._found.append(Finding(dtc, self._node, value, confirmed, text))
         self.quiet = False
 
     def _receive_rest(self, first: int, count: int, expected: set[int], patience: float) -> int:

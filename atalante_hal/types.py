@@ -12,6 +12,9 @@ import numpy.typing as npt
 
 Vector = npt.NDArray[np.float64]
 
+#: Period of SYNC, of the HAL and of a controller [s].
+PERIOD = 1e-3
+
 
 class SupervisorState(IntEnum):
     """State of the supervisory state machine; a larger value is a worse state.

@@ -8,6 +8,7 @@ confirmed when the fault exceeds its bound. Only a confirmed code causes a react
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 
 
@@ -118,6 +119,17 @@ class Dtc(StrEnum):
     DBC_INVALID = "DBC_INVALID", _R.NOT_READY, _S.ERROR, "the DBC was rejected"
     CONFIG_INVALID = "CONFIG_INVALID", _R.NOT_READY, _S.ERROR, "the configuration was rejected"
     GAIT_INVALID = "GAIT_INVALID", _R.NOT_READY, _S.ERROR, "the gait was rejected"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Fault that a check finds in one cycle; the fault memory turns it into an active diagnostic."""
+
+    dtc: Dtc
+    node: str  # DBC name of the affected node
+    value: float  # measured value; quantity and unit depend on the code
+    confirmed: bool  # True: the reaction is due; False: pending, the fault is still short
+    text: str  # one sentence for the operator; empty: node name and meaning of the code
 
 
 def number_of(bits: int) -> int:

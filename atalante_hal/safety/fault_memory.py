@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 
-from atalante_hal.safety.diagnostics import Dtc, Reaction, Severity, event_code, worst
+from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction, Severity, event_code, worst
 from atalante_hal.safety.events import Event
 
 #: Shortest time between two events of the same diagnostic, pending and confirmed [cycles]. It keeps a poor connection from
@@ -117,6 +117,16 @@ class FaultMemory:
         if not before or not entry.text:
             entry.text = text or f"{node}: {dtc.meaning}"
             self._note(cycle, dtc, node, entry)
+
+    def raise_finding(self, cycle: int, finding: Finding) -> None:
+        """Mark the diagnostic of a finding as active in this cycle, see `raise_dtc`.
+
+        Args:
+            cycle: number of the current cycle.
+            finding: fault found in this cycle.
+        """
+        value, confirmed, text = finding.value, finding.confirmed, finding.text
+        self.raise_dtc(cycle, finding.dtc, finding.node, value=value, confirmed=confirmed, text=text)
 
     def close_cycle(self, cycle: int) -> None:
         """Remove the diagnostics that were not raised in this cycle, then update `bits` and `confirmed`."""

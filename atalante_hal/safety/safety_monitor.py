@@ -1,21 +1,22 @@
 """Safety monitor: collects the faults of each cycle, runs the state machine, and sets torque limits and assistance factor.
 
-    process image, heartbeats, transceiver, plausibility, loop, controller -> fault memory -> state machine -> state
+    process image, heartbeats, bus faults, plausibility, loop, controller -> fault memory -> state machine -> verdict
 
-The HAL transfers the data of each cycle, and the safety monitor evaluates it. The evaluation is skipped in a perfect cycle in
-which all its inputs are the same as before, because its result could not change.
+The HAL transfers the data of each cycle and acts on the verdict of the safety monitor, which sends nothing itself. The evaluation
+is skipped in a perfect cycle in which all its inputs are the same as before, because its result could not change.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 
 from atalante_dbc import Network
-from atalante_hal.commands import Commands
 from atalante_hal.pendant import Pendant
-from atalante_hal.record import Record
 from atalante_hal.robot import JOINTS, Robot
-from atalante_hal.safety.diagnostics import Dtc, Reaction, worst
+from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction, worst
 from atalante_hal.safety.events import Event
 from atalante_hal.safety.fault_memory import FaultMemory
 from atalante_hal.safety.heartbeats import Heartbeats
@@ -24,8 +25,7 @@ from atalante_hal.safety.message_monitor import MessageMonitor
 from atalante_hal.safety.plausibility import Plausibility
 from atalante_hal.safety.start import refusal
 from atalante_hal.safety.state_machine import MOVING, Conditions, next_state
-from atalante_hal.transceiver import Transceiver
-from atalante_hal.types import State, SupervisorState
+from atalante_hal.types import PERIOD, State, SupervisorState, Vector
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
@@ -47,6 +47,16 @@ _S = SupervisorState
 _STARTABLE = (_S.READY, _S.FULL_ASSIST, _S.HOLD, _S.LOWER, _S.FAULT)
 
 
+class Verdict(NamedTuple):
+    """Result of the evaluation of one cycle, on which the HAL acts."""
+
+    supervisor: SupervisorState  # state of the state machine
+    assistance_factor: float  # Xi in [0, 1]
+    torque_limit: Vector  # (12,) Nm, present torque limit of the drives; owned by the limiter
+    diagnostics: int  # bit set of the active diagnostics, see `diagnostics.dtcs_of`
+    acknowledged: bool  # True: the operator pressed START, which acknowledges a bus-off
+
+
 class SafetyMonitor:
     """Safety monitor of one HAL.
 
@@ -63,32 +73,25 @@ class SafetyMonitor:
         self,
         network: Network,
         robot: Robot,
-        period: float,
-        parts: Record,
-        state: State,
         image: ReceiveImage,
+        state: State,
+        drive_side: Vector,
         plausibility: Plausibility,
-        transceiver: Transceiver,
         limiter: Limiter,
-        commands: Commands,
     ) -> None:
         """Create the safety monitor in state OFF.
 
         Args:
             network: messages and nodes of the DBC.
             robot: limits and thresholds of the robot.
-            period: cycle time [s].
-            parts: record of the HAL; state, assistance factor, CRC errors and active diagnostics are written to its header.
-            state: state of the HAL; supervisor state, assistance factor and message validity are written to it.
             image: process image of the fast messages.
+            state: state of the HAL; supervisor state, assistance factor and message validity are written to it.
+            drive_side: drive states and temperatures [degC] of `state` as one view, shape (24,).
             plausibility: plausibility checks, run by the HAL before `judge`.
-            transceiver: source of bus faults.
             limiter: torque limiter; its limit is derated with the drive temperatures.
-            commands: command frames, which receive the torque limit and the supervisor state.
         """
-        self._robot, self._period, self._parts, self._state, self._image = robot, period, parts, state, image
-        self._plausibility, self._transceiver = plausibility, transceiver
-        self._limiter, self._commands = limiter, commands
+        self._robot, self._image, self._state, self._drive_side = robot, image, state, drive_side
+        self._plausibility, self._limiter = plausibility, limiter
         self._message_monitor = MessageMonitor(network, image)
         self._heartbeats = Heartbeats(network, robot.thresholds)
         self._pendant = Pendant(image)
@@ -103,8 +106,8 @@ class SafetyMonitor:
         self.lowered: set[str] = set()
         #: True if `judge` may skip a cycle with fresh data, no fault, and the same pendant and drive values as before.
         self._steady = False
-        #: Faults that loop and controller reported since the last `judge`: code, confirmed, value, text.
-        self._reports: list[tuple[Dtc, bool, float, str]] = []
+        self._reports: list[Finding] = []  # faults that loop and controller reported since the last `judge`
+        self._acknowledged = False  # True if START was pressed in this cycle
         self._ending = False
         self._barred = False  # True if another HAL was detected in OFF or READY
         self._assistance_factor = state.assistance_factor  # assistance factor set by the operator
@@ -113,30 +116,43 @@ class SafetyMonitor:
         self._finish: tuple[int | None, int] = None, 0
         self._drives_judged = b""  # drive states and temperatures of the last evaluation
 
-    def judge(self) -> None:
-        """Evaluate this cycle unless all inputs are unchanged; call it after the plausibility checks."""
+    def judge(self, bus_faults: Sequence[Finding] = ()) -> Verdict | None:
+        """Evaluate this cycle unless all inputs are unchanged; call it after the plausibility checks.
+
+        Args:
+            bus_faults: faults of the bus in this cycle.
+
+        Returns:
+            The verdict; None if all inputs are unchanged, so that the last verdict is still valid.
+        """
         pendant = self._pendant
-        if not (
+        if (
             self._steady
             and self._image.all_fresh
             and not self._plausibility.findings
-            and self._transceiver.quiet
+            and not bus_faults
             and pendant.signals.tobytes() == pendant.heard
-            and self._parts.drive_side.tobytes() == self._drives_judged
+            and self._drive_side.tobytes() == self._drives_judged
         ):
-            self._judge()
+            return None
+        self._judge(bus_faults)
+        state = self._state
+        limit, diagnostics = self._limiter.limit, self.memory.bits
+        return Verdict(state.supervisor, state.assistance_factor, limit, diagnostics, self._acknowledged)
 
-    def accept(self, frames: Frames) -> None:
+    def accept(self, frames: Frames) -> list[int]:
         """Process the frames that are not fast cyclic messages to the HAL: status, emergencies and unknown frames.
 
         Args:
             frames: received frames, shape (n,).
+
+        Returns:
+            Indices in `frames` of the frames that the DBC does not define as messages to the HAL.
         """
         unknown = self._heartbeats.accept(frames, self._state.cycle, self._state.vibration)
-        if unknown:
-            self._transceiver.foreign(frames[unknown])
         if not self._heartbeats.quiet:
             self._steady = False
+        return unknown
 
     def report(self, dtc: Dtc, text: str, confirmed: bool = True, value: float = 0.0, cycle: int | None = None) -> None:
         """Report a fault of the loop or the controller: log it immediately, and evaluate it in the next `judge`.
@@ -149,8 +165,9 @@ class SafetyMonitor:
             cycle: cycle in which the fault occurred; default: the current cycle.
         """
         cycle = self._state.cycle if cycle is None else cycle
-        self.memory.raise_dtc(cycle, dtc, "HAL", value=value, confirmed=confirmed, text=text)
-        self._reports.append((dtc, confirmed, value, text))
+        finding = Finding(dtc, "HAL", value, confirmed, text)
+        self.memory.raise_finding(cycle, finding)
+        self._reports.append(finding)
         self._steady = False
 
     def end(self) -> None:
@@ -171,7 +188,7 @@ class SafetyMonitor:
         """Return the nodes that prevent READY: timed out, not trusted yet, without a status message, or with a different DBC."""
         return self._message_monitor.missing() | self._heartbeats.missing()
 
-    def _judge(self) -> None:
+    def _judge(self, bus_faults: Sequence[Finding]) -> None:
         """Raise all diagnostics of this cycle, run the state machine, and apply the reactions."""
         state, memory, cycle = self._state, self.memory, self._state.cycle
         message_monitor, pendant = self._message_monitor, self._pendant
@@ -181,11 +198,8 @@ class SafetyMonitor:
         for node in self._heartbeats.booted:
             self._plausibility.reference(node)
         self._heartbeats.booted.clear()
-        self._transceiver.judge(cycle, memory)
-        for f in self._plausibility.findings:
-            memory.raise_dtc(cycle, f.dtc, f.node, value=f.value, confirmed=f.confirmed, text=f.text)
-        for dtc, confirmed, value, text in self._reports:
-            memory.raise_dtc(cycle, dtc, "HAL", value=value, confirmed=confirmed, text=text)
+        for finding in (*bus_faults, *self._plausibility.findings, *self._reports):
+            memory.raise_finding(cycle, finding)
         self._reports.clear()
         nodes_well = message_monitor.nodes_well and self._heartbeats.known
         self._judge_drives(nodes_well)
@@ -213,9 +227,6 @@ class SafetyMonitor:
             self.reason = memory.text_of(reasons)
         self._lead_assistance()
         self._let_down()
-        header = self._parts.header
-        header[3], header[10] = state.assistance_factor, memory.bits
-        header[8] = self.crc_errors
         self._steady = (
             after is before
             and message_monitor.settled
@@ -225,11 +236,10 @@ class SafetyMonitor:
 
     def _judge_drives(self, nodes_well: bool) -> None:
         state, memory = self._state, self.memory
-        said = self._parts.drive_side.tobytes()
-        if said != self._drives_judged:
-            self._drives_judged = said
+        drives = self._drive_side.tobytes()
+        if drives != self._drives_judged:
+            self._drives_judged = drives
             self._limiter.derate(self._robot.torque_limit(state.temperature))
-            self._commands.limit[:] = self._limiter.limit
         self._judge_derating()
         if state.drive_state.tobytes() == _ENABLED:
             return
@@ -264,12 +274,13 @@ class SafetyMonitor:
             nodes_well: True if every required node is trusted and has sent a status message.
         """
         state, pendant = self._state, self._pendant
+        self._acknowledged = False
         if pendant.started and state.supervisor is not _S.ACTIVE and not self._ending:
             faulty = {
                 node for node, drive in zip(DRIVE_NODES, state.drive_state.tolist(), strict=True) if drive in _FAULTY
             }
             self._heartbeats.acknowledge(faulty)
-            self._transceiver.acknowledge()
+            self._acknowledged = True
             self.start_wanted = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
             if state.supervisor is _S.OFF and self.hindered:
                 self._refuse_start(self.memory.text_of(self.memory.worst()))
@@ -321,8 +332,6 @@ class SafetyMonitor:
         self.start_wanted = 0
         self._pendant.forget_press()
         self.moving = after in MOVING
-        self._commands.announce(after)
-        self._parts.header[2] = after
         if Dtc.OPERATOR_STOP in reasons:
             text = "the program is ending" if self._ending else _WORDS[self._pendant.stop_requested]
             memory.raise_dtc(state.cycle, Dtc.OPERATOR_STOP, "PENDANT", text=text)
@@ -345,7 +354,7 @@ class SafetyMonitor:
         led = state.supervisor in (_S.FULL_ASSIST, _S.FINISH_STEP)
         target = 1.0 if led else self._assistance_factor
         if self._leading:
-            step, way = self._period / self._robot.thresholds.full_assist_ramp, target - state.assistance_factor
+            step, way = PERIOD / self._robot.thresholds.full_assist_ramp, target - state.assistance_factor
             state.assistance_factor += max(-step, min(step, way))
             self._leading = state.assistance_factor != target
         elif not led:

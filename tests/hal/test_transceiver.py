@@ -86,7 +86,8 @@ class Desk:
 
     def judge(self) -> dict[str, bool]:
         self.cycle += 1
-        self.transceiver.judge(self.cycle, self.memory)
+        for finding in self.transceiver.faults():
+            self.memory.raise_finding(self.cycle, finding)
         self.memory.close_cycle(self.cycle)
         return {dtc.value: entry.confirmed for (dtc, _), entry in self.memory.active.items()}
 

@@ -1,6 +1,6 @@
 """Plausibility checks: compare the values in intact frames with physical limits, earlier values and other sensors."""
 
-from atalante_hal.safety.plausibility.finding import Finding
+from atalante_hal.safety.diagnostics import Finding
 from atalante_hal.safety.plausibility.plausibility import Plausibility
 
 __all__ = ["Finding", "Plausibility"]

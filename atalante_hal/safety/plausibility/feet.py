@@ -11,8 +11,8 @@ robot is suspended from the start, or after it has been lifted for `LIFTED_CYCLE
 from __future__ import annotations
 
 from atalante_hal.robot import CELLS, FEET, Robot
-from atalante_hal.safety.diagnostics import Dtc
-from atalante_hal.safety.plausibility.finding import FOOT_NODES, Finding, Signals
+from atalante_hal.safety.diagnostics import Dtc, Finding
+from atalante_hal.safety.plausibility.finding import FOOT_NODES, Signals
 
 #: Times after which a cell counts as faulty, the swing of both feet as implausible, and the robot as lifted on purpose [cycles].
 CELL_CYCLES = 256

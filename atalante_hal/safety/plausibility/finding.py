@@ -1,15 +1,13 @@
-"""Result of a plausibility check, and the location of the checked signals in the process image."""
+"""Location of the checked signals in the process image."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, Vector
-from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.wire.codec import Codec
 from atalante_hal.wire.process_image import NEVER
 
@@ -24,17 +22,6 @@ JOINT_NODES, IMU_NODES, FOOT_NODES = (
     tuple(message.removesuffix("_STATE") for message in messages)
     for messages in (JOINT_MESSAGES, IMU_MESSAGES, FOOT_MESSAGES)
 )
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Present implausibility of one node."""
-
-    dtc: Dtc
-    node: str  # DBC name
-    value: float  # measured value; quantity and unit depend on the code
-    confirmed: bool  # False: pending; the value is not used, but the fault is still short
-    text: str  # one sentence for the operator
 
 
 class Signals(NamedTuple):

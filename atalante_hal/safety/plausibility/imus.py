@@ -9,8 +9,8 @@ import math
 
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import IMUS, Robot, Vector
-from atalante_hal.safety.diagnostics import Dtc
-from atalante_hal.safety.plausibility.finding import IMU_NODES, Finding, Signals
+from atalante_hal.safety.diagnostics import Dtc, Finding
+from atalante_hal.safety.plausibility.finding import IMU_NODES, Signals
 from atalante_hal.wire.codec import Codec
 
 #: Time without a good value after which the diagnostic of an IMU is confirmed [cycles].

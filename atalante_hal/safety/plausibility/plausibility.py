@@ -13,9 +13,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from atalante_hal.robot import Robot, Vector
+from atalante_hal.safety.diagnostics import Finding
 from atalante_hal.safety.plausibility.encoders import EncoderChecks
 from atalante_hal.safety.plausibility.feet import FootChecks
-from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Finding, Rows, signals_of
+from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Rows, signals_of
 from atalante_hal.safety.plausibility.imus import Imus
 from atalante_hal.safety.plausibility.legs import Legs
 from atalante_hal.safety.plausibility.stillness import Stillness

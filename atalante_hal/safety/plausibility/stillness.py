@@ -15,13 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, Robot, Vector
-from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import (
     FOOT_NODES,
     IMU_NODES,
     JOINT_NODES,
     Cycles,
-    Finding,
     Signals,
     measured,
 )

@@ -14,9 +14,8 @@ import numpy as np
 
 from atalante_control.airwalk.controller import AirwalkController
 from atalante_control.guide.shapes import CONSTANT
-from atalante_hal.hal import PERIOD
 from atalante_hal.telemetry.ring import RingWriter
-from atalante_hal.types import State, SupervisorState
+from atalante_hal.types import PERIOD, State, SupervisorState
 from atalante_tools.bench.measure import Effort, Measurement, require, timed
 from atalante_tools.bench.nodes import ASSISTANCE, ERROR, ERROR_RATE, walk
 from atalante_tools.bench.stepped import SteppedRollouts

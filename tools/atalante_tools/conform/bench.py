@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from atalante_dbc import Message, Network, Node
 from atalante_hal.bus import Bus, BusFull
-from atalante_hal.hal import PERIOD
 from atalante_hal.robot import Robot
+from atalante_hal.types import PERIOD
 from atalante_hal.wire.frame import Frames, as_words, new_frames
 from atalante_tools.conform.frames import MessageReceiver, MessageSender, ReceivedFrame
 from atalante_tools.conform.technician import Action, Technician

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.hal import PERIOD
+from atalante_hal.types import PERIOD
 from atalante_tools.conform.bench import NodeTester, NotTested
 from atalante_tools.conform.requirement import Outcome, Requirement
 

@@ -10,9 +10,8 @@ import numpy as np
 
 from atalante_hal.bus import Bus, BusDown, BusFull
 from atalante_hal.bus.wrapped import WrappedBus
-from atalante_hal.hal import PERIOD
 from atalante_hal.robot import JOINTS
-from atalante_hal.types import Command, Controller, State, Vector
+from atalante_hal.types import PERIOD, Command, Controller, State, Vector
 from atalante_hal.wire.frame import Frames
 from atalante_tools.faults.scenario import Host
 

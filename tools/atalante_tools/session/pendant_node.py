@@ -16,8 +16,7 @@ from typing import Final
 
 from atalante_dbc import Network
 from atalante_hal.bus import Bus, BusFull
-from atalante_hal.hal import PERIOD
-from atalante_hal.types import SupervisorState
+from atalante_hal.types import PERIOD, SupervisorState
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_hal.wire.process_image import ReceiveImage, TransmitImage

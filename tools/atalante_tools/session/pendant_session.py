@@ -8,8 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from atalante_hal.hal import PERIOD
-from atalante_hal.types import SupervisorState
+from atalante_hal.types import PERIOD, SupervisorState
 from atalante_hal.wire.e2e import REQUALIFY
 from atalante_tools.console.options import Target
 from atalante_tools.console.outcome import Failed

@@ -15,11 +15,11 @@ import numpy as np
 from atalante_dbc import Network
 from atalante_hal.bus import Bus, BusError, Stamps
 from atalante_hal.bus.pair import PairBus, lockstep_pair
-from atalante_hal.hal import PERIOD, Hal
+from atalante_hal.hal import Hal
 from atalante_hal.loop import Clock
 from atalante_hal.robot import Robot
 from atalante_hal.telemetry.can_log import CanLog
-from atalante_hal.types import Command, Controller, State, SupervisorState
+from atalante_hal.types import PERIOD, Command, Controller, State, SupervisorState
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_tools.console.options import Target
 from atalante_tools.session.body import open_body
