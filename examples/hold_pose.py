@@ -1,9 +1,9 @@
-"""Hold the pose that the joints have when the operator presses START: a controller of your own in twenty lines.
+"""Run your own controller: a controller that holds the pose in which the operator presses START.
 
-Run it:  python examples/hold_pose.py                       on an emulated robot, two seconds of robot time
-         python examples/hold_pose.py socketcan vcan0       on a robot or an emulator that is on a CAN bus
+Run it:  python examples/hold_pose.py                       on an emulated robot, for two seconds of robot time
+         python examples/hold_pose.py socketcan vcan0       on a robot or an emulator on a CAN bus
 
-Prints why the robot went to HOLD at the end, and the joint angles [degrees].
+Prints the reason why the robot went to HOLD at the end, and the joint angles [deg].
 """
 
 import sys
@@ -16,7 +16,7 @@ from atalante_tools.session.rig import open_hal
 
 
 class Spring:
-    """A PD controller around the pose at the start."""
+    """PD controller that holds the pose of the start."""
 
     telemetry, telemetry_fields = np.zeros(0), ()
 
@@ -25,7 +25,7 @@ class Spring:
         self.rest = state.position.copy()
 
     def update(self, state):
-        """Return the joint torques [Nm] and vibration levels of this cycle."""
+        """Return the joint torques [Nm] and the levels of the vibration motors for this cycle."""
         return Command(torque=2000 * (self.rest - state.position) - 20 * state.velocity, vibration=np.zeros(8))
 
 

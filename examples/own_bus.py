@@ -1,4 +1,4 @@
-"""Run the HAL on a bus of your own: one that counts the frames of each message.
+"""Run the HAL on your own bus: a bus that counts the frames of each message.
 
 Run it:  python examples/own_bus.py
 
@@ -22,7 +22,7 @@ from atalante_tools.session.pose_hold import PoseHold
 
 
 class CountingBus(WrappedBus):
-    """Count sent and received frames by CAN identifier."""
+    """Bus that counts sent and received frames by CAN identifier."""
 
     def __init__(self, bus):
         super().__init__(bus)
@@ -41,11 +41,11 @@ class CountingBus(WrappedBus):
 
 
 network, robot = atalante_dbc.load(), load_robot()
-ours, theirs = lockstep_pair()  # the two ends of an embedded bus
-bus, controller = CountingBus(ours), PoseHold(robot)
+hal_end, robot_end = lockstep_pair()  # the two ends of a bus in this process
+bus, controller = CountingBus(hal_end), PoseHold(robot)
 with open_body(robot) as body:
-    emulator = Emulator(network, robot, body, theirs, operator=Operator())
-    ours.step = emulator.poll  # the emulated robot answers when the HAL waits for frames
+    emulator = Emulator(network, robot, body, robot_end, operator=Operator())
+    hal_end.step = emulator.poll  # the emulated robot runs when the HAL receives frames
     hal = Hal(network, robot, bus, patience=2.0, controller_fields=controller.telemetry_fields)
     run(hal, controller, LockStep(), until=lambda state: state.time >= 1.0)
     names = {message.frame_id: message.name for message in network.messages}

@@ -1,9 +1,9 @@
-"""Walk inside a virtual guide of your own shape: wide at the ends of the step, 3 degrees at its middle.
+"""Walk inside a virtual guide of your own shape: wide at start and end of the step, 3 degrees in the middle of the step.
 
 Run it:  python examples/own_guide_shape.py
 
-Prints whether the guide is certified at the assistance factor 0.5, then the largest |e| / q_bound of two steps in the air.
-A value below 1 means that hip and knee of the swing leg stayed inside the guide.
+Prints whether the guide is certified for the assistance factor 0.5. Then prints the largest tracking error over half-width of
+the guide, |e| / q_bound, of two steps in the air. Below 1, hip and knee of the swing leg stayed inside the guide.
 """
 
 import numpy as np
@@ -19,11 +19,11 @@ XI = 0.5  # assistance factor
 
 
 def waist(phase, half_width):
-    """Return the upper and the lower bound as fractions of the half-width, each of shape (n,).
+    """Return the upper and the lower bound of the guide as fractions of its half-width, shape (n,) each.
 
     Args:
-        phase: time since the step change over the step duration, 0 to 1, shape (n,).
-        half_width: of the guide at the assistance factor [rad].
+        phase: time since the start of the step over the step duration, 0 to 1, shape (n,).
+        half_width: half-width of the guide at the assistance factor [rad].
     """
     narrowest = min(1.0, np.radians(3.0) / half_width)
     fraction = 1.0 - (1.0 - narrowest) * np.sin(np.pi * phase) ** 2

@@ -1,15 +1,15 @@
-"""Test that four lost frames of a knee drive leave the robot ACTIVE and that five end in HOLD.
+"""Test that four lost frames in a row of a drive leave the robot ACTIVE, and that five lead to HOLD.
 
 Run it:  pytest examples/test_lost_frames.py
 
-`loop` and `faults` are fixtures of the pytest plugin that is installed with the project. Prints the result of pytest.
+The fixtures `loop` and `faults` are in the pytest plugin of this project. Prints the result of pytest.
 """
 
 from atalante_hal.types import SupervisorState
 
 
 def test_five_lost_frames_end_in_hold(loop, faults):
-    """Drop frames of the left knee while the robot is ACTIVE."""
+    """Drop frames of the left knee drive while the robot is ACTIVE."""
     loop.until(SupervisorState.ACTIVE)
     faults.drop("LEFT_SK_STATE", frames=4)
     assert loop.run(20).supervisor is SupervisorState.ACTIVE

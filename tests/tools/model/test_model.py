@@ -85,7 +85,7 @@ def test_asymmetric_model_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checks_module, "links", asymmetric)
     result = model("--mass", "75", "--height", "175")
     assert result.exit_code == 1
-    assert "FAIL  mirror: left_frontal_hip and its right counterpart differ" in result.stdout
+    assert "FAIL  mirror: left_frontal_hip must mirror its right counterpart, but differs" in result.stdout
     assert "the model is inconsistent: mirror" in result.stderr
 
 

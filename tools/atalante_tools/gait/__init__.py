@@ -1,4 +1,4 @@
-"""Command `atalante gait`: solve gaits, collect them in a library, fit the gait network to it and check the network."""
+"""Command `atalante gait`: optimise gaits, collect them in a library, fit the gait network, and check the network."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _FILE = click.Path(dir_okay=False, path_type=Path)
 
 
 def levels_of(text: str) -> tuple[float, ...]:
-    """Return the levels of a grid parameter from comma-separated numbers.
+    """Convert comma-separated numbers to the levels of a grid parameter.
 
     Raises:
         click.BadParameter: If the text is not a list of numbers.
@@ -33,7 +33,7 @@ def levels_of(text: str) -> tuple[float, ...]:
 
 @click.group()
 def command() -> None:
-    """Solve gaits, collect them in a library, and fit and check the gait network of the controller.
+    """Optimise gaits, collect them in a library, fit the gait network of the controller, and check the network.
 
     \b
     Example: atalante gait solve --mass 75 --height 175
@@ -57,7 +57,7 @@ command.add_command(solve)
     "--compile/--no-compile",
     "machine_code",
     default=False,
-    help="Compile the nonlinear program with gcc first. This takes minutes once per machine and halves the time per gait.",
+    help="Compile the nonlinear program with gcc first: takes minutes, once per computer, and halves the time per gait.",
 )
 @click.option("--dask", "cluster", metavar="ADDRESS", help="Solve on the workers of this dask scheduler.")
 @click.option(
@@ -73,7 +73,7 @@ command.add_command(solve)
 def library(
     out: Path, jobs: int, machine_code: bool, cluster: str | None, as_json: bool, **levels: tuple[float, ...] | None
 ) -> None:
-    """Solve the gait of every point of a grid of patients and steps, and write one file per gait to DIR/gaits.
+    """Solve the gaits of a grid of patients, step lengths and step durations, and write a file per gait to DIR/gaits.
 
     After an interruption, the same command solves the missing gaits. Failed gaits are listed on stderr and in DIR/failed,
     and the next call retries them. The exit code is 1 if a gait failed.
@@ -94,7 +94,7 @@ def library(
     say(f"{points} gaits in {out}, {points - todo} of them already solved")
     progress, start = Progress(), time.monotonic()
     solve = solve_compiled if machine_code else solve_subject
-    # The optimiser swallows exceptions, so a signal takes effect after the current gait. Else that gait would count as failed.
+    # The optimiser would report the exception of a signal as a failed gait, so a signal takes effect after the gait.
     with stop_requested() as stop, closing(collection.generate(solve, jobs=jobs, cluster=cluster)) as outcomes:
         for done, (_, solved) in enumerate(outcomes, 1):
             if as_json:
@@ -121,7 +121,7 @@ def library(
 @click.option("--out", type=OutputFile(".npz"), required=True, metavar="FILE", help="File for the network, .npz.")
 @json_option
 def fit(folder: Path, out: Path, as_json: bool) -> None:
-    """Fit the gait network to a library in about a minute. The same library gives the same network.
+    """Fit the gait network to a library, which takes about a minute. Equal libraries give equal networks.
 
     \b
     Example: atalante gait fit --library runs/library --out runs/network.npz
@@ -138,7 +138,8 @@ def fit(folder: Path, out: Path, as_json: bool) -> None:
     gaits = collection.gaits(load_robot())
     if missing := collection.missing():
         say(
-            f"{len(missing)} of {len(gaits) + len(missing)} gaits are missing in {folder}; the network is less accurate there"
+            f"{len(missing)} of {len(gaits) + len(missing)} gaits are missing in {folder}; "
+            "the network is less accurate near the missing gaits"
         )
     say(f"fitting {len(gaits)} gaits")
     start = time.monotonic()
@@ -156,11 +157,11 @@ def fit(folder: Path, out: Path, as_json: bool) -> None:
         show_json(summary)
     say(
         f"{out}: {summary['bytes'] / 1024:.0f} KiB, joint error on the gaits of the library {summary['rms_deg']:.3f} deg rms, "
-        f"{summary['worst_deg']:.3f} deg worst; measure the error between them with `atalante gait check --network {out}`"
+        f"{summary['worst_deg']:.3f} deg at most; measure the error between them with `atalante gait check --network {out}`"
     )
 
 
-@command.command(short_help="Compare the network with freshly solved gaits.")
+@command.command(short_help="Compare the gait network with newly solved gaits.")
 @click.option(
     "--network", "file", type=_FILE, metavar="FILE", help="Network file.  [default: the network of the package]"
 )
@@ -170,7 +171,7 @@ def fit(folder: Path, out: Path, as_json: bool) -> None:
 @click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the random subjects.")
 @json_option
 def check(file: Path | None, count: int, seed: int, as_json: bool) -> None:
-    """Compare the network with newly solved gaits of random subjects; the exit code is 1 if a deviation exceeds its limit.
+    """Compare the gait network with newly solved gaits of random subjects; the exit code is 1 if a deviation is too large.
 
     \b
     Example: atalante gait check

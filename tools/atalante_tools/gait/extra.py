@@ -1,4 +1,4 @@
-"""Optional dependencies of the gait optimisation, which are not needed to walk a gait."""
+"""Optional dependencies of the gait optimisation. The controller does not need them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from atalante_tools.console.outcome import Failed
 
 @contextmanager
 def extra() -> Iterator[None]:
-    """Import optional dependencies inside this context; a missing one becomes an error with the install command.
+    """Replace the import error of an optional dependency with an error that shows the install command.
 
     Raises:
         Failed: If casadi, joblib or scikit-learn is not installed.
@@ -21,5 +21,5 @@ def extra() -> Iterator[None]:
         if error.name is None or error.name.split(".")[0] not in ("casadi", "joblib", "sklearn"):
             raise
         raise Failed(
-            f"solving gaits needs {error.name}: install it with `pip install 'atalante-hal[gaits]'`"
+            f"the gait optimisation needs the package {error.name}: install it with `pip install 'atalante-hal[gaits]'`"
         ) from error

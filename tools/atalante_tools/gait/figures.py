@@ -1,4 +1,4 @@
-"""Figures of a gait: angles, torques, centre of pressure and clearance over the step, and an animated stick figure."""
+"""Figures of a gait: a plot of angles, torques, centre of pressure and clearance, and an animated stick figure."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ _COLOURS = {"left": "tab:orange", "right": "tab:blue"}
 
 
 class _Demands(NamedTuple):
-    """Sampled joint angles, torques, centre of pressure and clearance of a step; n samples."""
+    """Joint angles, torques, centre of pressure and swing clearance of a step with n samples."""
 
-    phase: Vector  # (n,), 0 to 1
-    q: Vector  # (n, 12) rad
-    torque: Vector  # (n, 12) Nm
-    pressure: Vector  # (n, 2) m, centre of pressure relative to the sole centre, in the axes of the stance foot
-    clearance: Vector  # (n,) m, height of the lowest corner of the swing sole above the ground
+    phase: Vector  # time over the step duration, 0 to 1, shape (n,)
+    q: Vector  # joint angles [rad], shape (n, 12)
+    torque: Vector  # joint torques [Nm], shape (n, 12)
+    pressure: Vector  # centre of pressure relative to the sole centre, in the axes of the stance foot [m], shape (n, 2)
+    clearance: Vector  # height of the lowest corner of the swing sole above the ground [m], shape (n,)
 
 
 def draw_plot(gait: Gait, patient: Patient, picture: Path) -> None:
-    """Draw joint angles and torques of both legs, centre of pressure and swing clearance over the step.
+    """Plot joint angles, joint torques, centre of pressure and swing clearance over the time of a step.
 
     Args:
         gait: gait to draw.
@@ -101,7 +101,7 @@ def draw_animation(gait: Gait, patient: Patient, picture: Path) -> None:
         low, high = everything[:, across].min() - 0.1, everything[:, across].max() + 0.1
         axis.set(xlim=(low, high), ylim=(-0.05, everything[:, 2].max() + 0.1), title=title, aspect="equal")
         lines.append({name: axis.plot([], [], "o-", markersize=3, color=_colour(name))[0] for name in poses[0]})
-    axes[1].invert_xaxis()  # the view is from behind, so left is on the left
+    axes[1].invert_xaxis()  # in a view from behind, the left leg is on the left
     figure.suptitle(gait.name, fontsize=9)
     figure.tight_layout()
 
@@ -121,7 +121,7 @@ def _colour(name: str) -> str:
 
 
 class _Sticks:
-    """Points of the body in the walking frame, whose origin is on the ground below the stance ankle."""
+    """Stick figure of the robot. The origin of its coordinates is on the ground below the stance ankle."""
 
     def __init__(self, patient: Patient) -> None:
         self._exo = ExoskeletonParameters()
@@ -130,10 +130,10 @@ class _Sticks:
         self._walking = pinocchio.SE3(
             pinocchio.utils.rotate("z", -self._exo.toe_out), np.array([0.0, 0.0, -self._exo.sole_centre[1]])
         )
-        self._trunk = np.array([[-0.05, 0.0, 0.0], [-0.05, 0.0, 0.55]])  # m, in the pelvis frame
+        self._trunk = np.array([[-0.05, 0.0, 0.0], [-0.05, 0.0, 0.55]])  # in the pelvis frame [m]
 
     def points(self, pose: Vector) -> dict[str, Vector]:
-        """Return the polylines of trunk and legs at a pose of shape (12,) [rad], each of shape (n, 3) [m]."""
+        """Return the polylines of trunk and legs, shape (n, 3) [m], for the joint angles `pose`, shape (12,) [rad]."""
         model, data = self._articulated.model, self._data
         q = pinocchio.neutral(model)
         q[self._articulated.q] = pose

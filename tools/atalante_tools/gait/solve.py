@@ -1,4 +1,4 @@
-"""Command `atalante gait solve`: one gait, its torques and constraints as tables, a plot and an animation."""
+"""Command `atalante gait solve`: optimise a gait, and show it as tables, a plot and an animation."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     type=click.Choice(["periodic", "start", "stop"]),
     default="periodic",
     show_default=True,
-    help="Periodic step, start step from rest into it, or stop step from it to rest.",
+    help="Step to solve: a periodic step, the start step from rest to walking, or the stop step from walking to rest.",
 )
 @click.option("--out", type=OutputFile(".json"), metavar="FILE", help="Write the gait to this .json file.")
 @click.option(
@@ -44,9 +44,9 @@ if TYPE_CHECKING:
 def solve(
     subject: Subject | None, kind: Kind, out: Path | None, plot: Path | None, animate: Path | None, as_json: bool
 ) -> None:
-    """Optimise the gait of a patient. The exit code is 1 if there is no gait; stderr names the constraint that cannot hold.
+    """Optimise the gait of a patient. If there is no gait, the exit code is 1 and stderr names the violated constraint.
 
-    Pinocchio verifies the solved gait independently of the code of the optimiser. Torques are in Nm, angles in degrees.
+    The solved gait is verified with Pinocchio, independently of the optimiser. Torques are in Nm, angles in degrees.
 
     \b
     Example: atalante gait solve --mass 75 --height 175
@@ -54,7 +54,7 @@ def solve(
              atalante gait solve --mass 75 --height 175 --kind start --animate start.gif
     """
     if subject is None:
-        raise click.UsageError("a gait needs a patient: give --mass and --height")
+        raise click.UsageError("mass and height of the patient must be given: add --mass and --height")
     with extra():
         from atalante_control.gait_optimization.solve import solve as optimise
     from atalante_control.gait.gait import write_gait
@@ -68,7 +68,7 @@ def solve(
         if progress.due():
             progress.show(f"{subject}: iteration {iteration}, constraints violated by up to {violation:.1e}")
 
-    # The optimiser swallows an exception and reports that there is no gait, so a signal waits until it has finished.
+    # The optimiser would report the exception of a signal as a missing gait, so a signal takes effect after the gait.
     with stop_requested() as stop:
         solved = optimise(subject, kind=kind, progress=show)
     progress.clear()
@@ -87,7 +87,7 @@ def solve(
         click.echo(_verification(checks))
     say(f"{kind} step of {subject}: {solved.iterations} iterations, {solved.solve_s:.2f} s")
     if failed := [check.name for check in checks if not check.holds]:
-        raise Failed(f"Pinocchio does not confirm the gait: {', '.join(failed)}")
+        raise Failed(f"the gait fails the verification with Pinocchio: {', '.join(failed)}")
     if out is not None:
         write_gait(solved.gait, out)
         say(f"gait in {out}")
@@ -96,7 +96,7 @@ def solve(
 
 
 def _summary(subject: Subject, solved: SolvedGait) -> dict[str, Any]:
-    """Return the JSON object. `status` is "solved" or the reason; `peak_torque` is the largest of `peak_torques` [Nm]."""
+    """Return the JSON object of the result. `status` is "solved" or the reason of the failure; torques are in Nm."""
     from atalante_hal.robot import JOINTS
 
     return {
@@ -111,7 +111,7 @@ def _summary(subject: Subject, solved: SolvedGait) -> dict[str, Any]:
 
 
 def _torques(solved: SolvedGait) -> str:
-    """Return a table of peak torques and angle ranges per joint; the right leg is in stance, the left leg in swing."""
+    """Return a table of peak torques and angle ranges of all joints, for the stance leg (right) and the swing leg (left)."""
     from atalante_hal.robot import LEG_JOINTS, load_robot
 
     limits = load_robot().torque_max
@@ -141,7 +141,9 @@ def _draw(solved: SolvedGait, subject: Subject, plot: Path | None, animate: Path
     try:
         from atalante_tools.gait.figures import draw_animation, draw_plot
     except ModuleNotFoundError as error:
-        raise Failed(f"a picture needs {error.name}: install it with `pip install 'atalante-hal[plot]'`") from error
+        raise Failed(
+            f"the picture needs the package {error.name}: install it with `pip install 'atalante-hal[plot]'`"
+        ) from error
     for draw, file, kind in ((draw_plot, plot, "plot"), (draw_animation, animate, "animation")):
         if file is not None:
             draw(solved.gait, subject.patient, file)

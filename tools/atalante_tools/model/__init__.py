@@ -1,4 +1,4 @@
-"""Command `atalante model`: the patient-exoskeleton model as a table, a URDF and a picture, with consistency checks."""
+"""Command `atalante model`: print, draw, export and check the model of exoskeleton and patient."""
 
 from __future__ import annotations
 
@@ -31,14 +31,15 @@ if TYPE_CHECKING:
     is_flag=False,
     flag_value=Path("model.png"),
     metavar="[FILE]",
-    help="Draw the model from behind and from the side; .png, .svg or .pdf.  [FILE if omitted: model.png]",
+    help="Draw the model from behind and from the side to this .png, .svg or .pdf file.  [FILE if omitted: model.png]",
 )
 @json_option
 def command(patient: Patient | None, urdf_file: Path | None, picture: Path | None, as_json: bool) -> None:  # fmt: skip
-    """Print the links of the patient-exoskeleton model and check its consistency; the exit code is 1 if a check fails.
+    """Print the links of the model and check its consistency; the exit code is 1 if a check fails.
 
-    Without --mass and --height the model is the exoskeleton without a patient, the model of joint idealization. Masses are
-    in kg, centres of mass in m in the frame of the link, moments of inertia in kg m2 about the centre of mass.
+    With --mass and --height the model is the exoskeleton with a patient. Without them it is the exoskeleton without a patient,
+    as used by the joint idealization. Masses are in kg, centres of mass in m in the frame of the link, moments of inertia in
+    kg m2 about the centre of mass.
 
     \b
     Example: atalante model --mass 75 --height 175
@@ -73,7 +74,7 @@ def command(patient: Patient | None, urdf_file: Path | None, picture: Path | Non
 def _numbers(body: Link) -> dict[str, object]:
     return {
         "mass": body.inertia.mass,
-        "centre": [value + 0.0 for value in body.inertia.centre],  # + 0.0 removes a negative zero
+        "centre": [value + 0.0 for value in body.inertia.centre],  # the term + 0.0 replaces -0.0 with 0.0
         "origin": [value + 0.0 for value in body.origin],
         "inertia": {
             name: value + 0.0
@@ -98,6 +99,8 @@ def _draw(picture: Path, bodies: tuple[Link, ...]) -> None:
     try:
         from atalante_tools.model.picture import draw
     except ModuleNotFoundError as error:
-        raise Failed(f"a picture needs {error.name}: install it with `pip install 'atalante-hal[plot]'`") from error
+        raise Failed(
+            f"the picture needs the package {error.name}: install it with `pip install 'atalante-hal[plot]'`"
+        ) from error
     draw(bodies, picture)
     say(f"picture in {picture}")

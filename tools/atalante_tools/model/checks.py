@@ -1,4 +1,4 @@
-"""Consistency checks of the model: `parameters, patient -> checks`. Each check is independent of the others."""
+"""Consistency checks of the model of exoskeleton and patient."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from atalante_control.model import ExoskeletonParameters, Patient, links, pinocc
 from atalante_hal.robot import Robot
 from atalante_tools.session.body import engine_hint, no_banner
 
-#: Number of random states in which two engines are compared, and largest difference relative to the largest entry.
-STATES, AGREEMENT = 100, 1e-6
+#: Number of random states in which Pinocchio and PyBullet are compared.
+STATES = 100
+#: Largest accepted difference between Pinocchio and PyBullet, relative to the largest value.
+AGREEMENT = 1e-6
 
 
 @dataclass(frozen=True)
 class ModelCheck:
-    """Result of one check of the model."""
+    """Name and result of one check of the model."""
 
     name: str
     ok: bool | None  # None: the check could not be run
@@ -27,7 +29,7 @@ class ModelCheck:
 
 
 def model_checks(parameters: ExoskeletonParameters, robot: Robot, patient: Patient | None) -> Iterator[ModelCheck]:
-    """Check total mass, mirror symmetry, physical inertias, and the agreement of two engines on the URDF.
+    """Check total mass, mirror symmetry, positive inertias, and that Pinocchio and PyBullet agree on the URDF.
 
     Args:
         parameters: parameters of the exoskeleton.
@@ -45,9 +47,9 @@ def model_checks(parameters: ExoskeletonParameters, robot: Robot, patient: Patie
     left = [body for body in bodies if body.name.startswith("left_")]
     asymmetric = [body.name for body in left if by_name[body.mirrored().name] != body.mirrored()]
     text = (
-        f"{asymmetric[0]} and its right counterpart differ"
+        f"{asymmetric[0]} must mirror its right counterpart, but differs"
         if asymmetric
-        else f"{len(left)} pairs of links are exact mirror images"
+        else f"all {len(left)} pairs of left and right links are exact mirror images"
     )
     yield ModelCheck("mirror", not asymmetric, text)
 
@@ -80,11 +82,11 @@ def _engines(text: str, robot: Robot) -> ModelCheck:
             state = np.zeros((3, q.size))
             state[0, into], state[1, out_of], state[2, out_of] = q, v, a
             upper = np.triu(pinocchio.crba(model, data, state[0]))
-            for theirs, ours in (
+            for by_engine, by_pinocchio in (
                 (engine.inverse_dynamics(q, v, a), pinocchio.rnea(model, data, *state)[out_of]),
                 (engine.gravity(q), pinocchio.computeGeneralizedGravity(model, data, state[0])[out_of]),
                 (engine.mass_matrix(q), (upper + np.triu(upper, 1).T)[np.ix_(out_of, out_of)]),
             ):
-                largest = max(largest, float(np.abs(theirs - ours).max() / np.abs(ours).max()))
+                largest = max(largest, float(np.abs(by_engine - by_pinocchio).max() / np.abs(by_pinocchio).max()))
     text = f"Pinocchio and PyBullet differ by at most {largest:.1e} (relative, {STATES} random states)"
     return ModelCheck("engines", largest < AGREEMENT, text)

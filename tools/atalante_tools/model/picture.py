@@ -1,4 +1,4 @@
-"""Picture of the model: the boxes of every link at a pose with slightly bent knees, from behind and from the side."""
+"""Picture of the model with slightly bent knees: the boxes of every link, from behind and from the side."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from matplotlib.patches import Polygon
 
 Vector = npt.NDArray[np.float64]
 
-#: Joint angles of the pose [rad].
+#: Joint angles in the picture [rad].
 _POSE = {"SH": -0.25, "SK": 0.5, "SA": -0.25}
 _MACHINE, _PATIENT, _SENSOR = "0.75", "tab:orange", "tab:red"
 
 
 def draw(bodies: Sequence[Link], picture: Path) -> None:
-    """Draw a tree of links.
+    """Draw the links of the model to a file.
 
     Args:
         bodies: links, each after its parent.
@@ -44,7 +44,7 @@ def draw(bodies: Sequence[Link], picture: Path) -> None:
         axis.set_xlabel(name)
         axis.set_aspect("equal")
         axis.autoscale_view()
-    axes[0].invert_xaxis()  # the view is from behind, so left is on the left
+    axes[0].invert_xaxis()  # in a view from behind, the left leg is on the left
     axes[0].set_ylabel("z from the hips [m]")
     figure.suptitle("grey: exoskeleton, orange: patient, red: IMUs and force cells")
     figure.tight_layout()
@@ -53,7 +53,7 @@ def draw(bodies: Sequence[Link], picture: Path) -> None:
 
 
 def _frames(bodies: Sequence[Link]) -> dict[str, tuple[Vector, Vector]]:
-    """Return rotation (3, 3) and origin (3,) [m] of every link in the pelvis frame."""
+    """Return the rotation, shape (3, 3), and the origin, shape (3,) [m], of every link in the pelvis frame."""
     frames: dict[str, tuple[Vector, Vector]] = {"": (np.eye(3), np.zeros(3))}
     for body in bodies:
         rotation, origin = frames[body.parent]
@@ -64,7 +64,7 @@ def _frames(bodies: Sequence[Link]) -> dict[str, tuple[Vector, Vector]]:
 
 
 def _turn(axis: Sequence[float], angle: float) -> Vector:
-    """Return the rotation about a unit axis by an angle [rad] with the formula of Rodrigues."""
+    """Return the rotation matrix for an angle [rad] about a unit axis, by the formula of Rodrigues."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)
@@ -76,7 +76,7 @@ def _corners(box: Box) -> Vector:
 
 
 def _hull(points: Vector) -> Vector:
-    """Return the convex hull of points of shape (n, 2) with the monotone chain of Andrew."""
+    """Return the convex hull of points, shape (n, 2), by Andrew's monotone chain algorithm."""
     ordered = sorted(map(tuple, points.tolist()))
     outline: list[tuple[float, ...]] = []
     for half in (ordered, ordered[::-1]):
