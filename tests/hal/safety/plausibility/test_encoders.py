@@ -63,21 +63,21 @@ class TestEncoderJump:
     @joints
     @pytest.mark.parametrize("lost", [1, 4])
     def test_reach_grows_with_lost_frames(self, joint: int, lost: int):
-        way, noise = ROBOT.velocity_max[joint] * PERIOD, 3.0 * ROBOT.encoder_noise[joint]
+        motion, noise = ROBOT.velocity_max[joint] * PERIOD, 3.0 * ROBOT.encoder_noise[joint]
         for size, refused in ((-1e-9, False), (1e-9, True)):
             robot = SimulatedRobot(amplitude=0.0)
             robot.missing = {row(JOINTS[joint])}
             assert robot.run(lost) == ()
             robot.missing = set()
-            target = (MIDDLE[joint] + (lost + 1) * way + noise + size) * GEAR[joint]
+            target = (MIDDLE[joint] + (lost + 1) * motion + noise + size) * GEAR[joint]
             found = robot.cycle(lambda now, target=target: now.position.__setitem__(joint, target))
             assert bool(found) is refused
             assert robot.rejected == ({row(JOINTS[joint]): lost + 1} if refused else {})
 
     @pytest.mark.parametrize(("before", "after", "cycles"), [(3, 3, 1), (3, 0, 4), (0, 2, 1), (4, 2, 3)])
     def test_reach_depends_on_measurement_time_not_on_arrival_time(self, before: int, after: int, cycles: int):
-        """From data `before` cycles old to data `after` cycles old; where that is less than a cycle, one has to be missed."""
-        way, noise = ROBOT.velocity_max[2] * PERIOD, 3.0 * ROBOT.encoder_noise[2]
+        """The last good values are `before` cycles old on arrival, the new ones `after`; they were measured `cycles` apart."""
+        motion, noise = ROBOT.velocity_max[2] * PERIOD, 3.0 * ROBOT.encoder_noise[2]
         for size, refused in ((-1e-9, False), (1e-9, True)):
             robot = SimulatedRobot(amplitude=0.0)
             robot.late = {row("left_SH"): before}
@@ -87,7 +87,7 @@ class TestEncoderJump:
             robot.late = {}
             robot.run(lost)
             robot.missing, robot.late = set(), {row("left_SH"): after}
-            target = (MIDDLE[2] + cycles * way + noise + size) * GEAR[2]
+            target = (MIDDLE[2] + cycles * motion + noise + size) * GEAR[2]
             found = robot.cycle(lambda now, target=target: now.position.__setitem__(2, target))
             assert bool(found) is refused
             robot.late = {}
@@ -116,7 +116,7 @@ class TestEncoderJump:
     @joints
     @signs
     def test_permanent_offset_is_never_accepted(self, joint: int, sign: float):
-        """Longer than the joint would need to get there, at rest and in motion, which ends where the jump began."""
+        """The joint is at rest, or moves back to where the jump began; the test is longer than the joint needs for the jump."""
         size = 12.0 * REACH[joint]
         for speed in (0.0, 0.5 * ROBOT.velocity_max[joint]):
             robot = SimulatedRobot(amplitude=0.0)
@@ -131,8 +131,8 @@ class TestEncoderJump:
     @joints
     @signs
     def test_encoder_is_used_again_after_jumping_back(self, joint: int, sign: float):
-        way = ROBOT.velocity_max[joint] * PERIOD
-        for left, used in ((0.0, True), (4.9 * way, True), (6.1 * way, False)):
+        motion = ROBOT.velocity_max[joint] * PERIOD
+        for left, used in ((0.0, True), (4.9 * motion, True), (6.1 * motion, False)):
             robot = SimulatedRobot(amplitude=0.0)
 
             def show(gone: float, offset: float, robot: SimulatedRobot = robot) -> tuple[Finding, ...]:
@@ -140,8 +140,8 @@ class TestEncoderJump:
                 return robot.cycle(lambda now: now.position.__setitem__(joint, at))
 
             for cycle in range(40):
-                assert any(f.dtc is Dtc.ENC_JUMP for f in show(0.5 * way * cycle, 30.0 * way))
-            found = show(0.5 * way * 40, left)
+                assert any(f.dtc is Dtc.ENC_JUMP for f in show(0.5 * motion * cycle, 30.0 * motion))
+            found = show(0.5 * motion * 40, left)
             assert any(f.dtc is Dtc.ENC_JUMP for f in found) is not used
             assert bool(robot.rejected) is not used
 
@@ -185,7 +185,7 @@ class TestEncoderJump:
         assert robot.rejected == {row("left_TH"): 1, row("right_TH"): 1}
 
     def test_first_position_is_no_jump(self):
-        image = ReceiveImage(MESSAGES)  # of NaN
+        image = ReceiveImage(MESSAGES)  # all values are NaN
         checks = Plausibility(ROBOT, image, PERIOD)
         image.values[:100] = SimulatedRobot().image.values[:100]
         image.check.fill(Check.OK)
@@ -220,10 +220,10 @@ class TestRange:
             assert (finding.dtc, finding.node, finding.confirmed) == (Dtc.POSITION_RANGE, JOINTS[joint].upper(), True)
             assert finding.value == pytest.approx(angle)
             low, high = (math.degrees(getattr(ROBOT, name)[joint]) for name in ("position_min", "position_max"))
-            said = (
+            expected = (
                 f"{JOINTS[joint]} is at {math.degrees(angle):.1f} degrees, outside its range of {low:.1f} to {high:.1f}"
             )
-            assert said in finding.text
+            assert expected in finding.text
             inside = (angle - outwards * 2e-9 * self.tolerance) * GEAR[joint]
             robot.missing = {row(JOINTS[joint])}
             assert only(robot.cycle()) is finding
@@ -236,7 +236,7 @@ class TestRange:
                 assert robot.cycle(lambda now, inside=inside: now.position.__setitem__(joint, inside)) == ()
 
     def test_first_position_outside_the_range_is_reported(self):
-        image = ReceiveImage(MESSAGES)  # of NaN
+        image = ReceiveImage(MESSAGES)  # all values are NaN
         checks = Plausibility(ROBOT, image, PERIOD)
         image.values[:100] = SimulatedRobot().image.values[:100]
         signals_of(CODEC, image.values).position[4] = 1.0 * GEAR[4]
@@ -287,7 +287,7 @@ class TestVelocity:
         assert only(robot.checks.findings).node == "LEFT_HA"
 
     def test_velocity_error_needs_three_wrong_comparisons_in_a_row(self):
-        """A sample is compared with the one before and with the one after it."""
+        """One wrong sample makes two comparisons wrong: with the sample before it and with the one after it."""
         robot = SimulatedRobot(amplitude=0.0)
 
         def wrong(now: Signals) -> None:
@@ -308,9 +308,9 @@ class TestVelocity:
 
 
 class TestEncodersAlone:
-    """Exactly at their thresholds, which no SimulatedRobot hits: there the joints are somewhere."""
+    """The encoder checks without the schedule, exactly at their thresholds."""
 
-    way = ROBOT.velocity_max * ROBOT.gear * PERIOD
+    motion = ROBOT.velocity_max * ROBOT.gear * PERIOD
     noise = 3.0 * ROBOT.encoder_noise * ROBOT.gear
 
     @staticmethod
@@ -329,7 +329,7 @@ class TestEncodersAlone:
     def test_motion_of_exactly_the_reach_is_accepted(self, sign: float, cycles: int):
         for joint in range(12):
             encoders, now = self.encoders()
-            reach = cycles * self.way[joint] + self.noise[joint]
+            reach = cycles * self.motion[joint] + self.noise[joint]
             for size, good in ((reach, True), (np.nextafter(reach, np.inf), False)):
                 now.position[joint] = sign * size
                 assert encoders.accept(joint, cycles) is good
@@ -342,7 +342,7 @@ class TestEncodersAlone:
             allowed = ROBOT.sensors.velocity_error * ROBOT.gear[joint]
             encoders, now = self.encoders()
             now.velocity[joint] = -np.nextafter(allowed, np.inf) if found else -allowed
-            # One sample, and three that are compared with the one before.
+            # The first sample is not compared; the next three comparisons are wrong.
             assert [encoders.judge_velocity(None) for _ in range(5)] == [False] * 3 + [found] * 2
             assert [f.value for f in encoders.findings()] == pytest.approx([-ROBOT.sensors.velocity_error] * found)
 
@@ -366,7 +366,7 @@ class TestEncodersAlone:
 
     @pytest.mark.parametrize("ages", list(itertools.product((0, 1, 4), repeat=2)))
     def test_velocity_check_uses_measurement_times_of_late_samples(self, ages: tuple[int, int]):
-        """A joint at its highest velocity, whose samples are of ages that change: right is right, and wrong is wrong."""
+        """All joints move at their highest velocity, and the age of their samples alternates."""
         speed = ROBOT.velocity_max * ROBOT.gear
         for error, found in ((0.99, False), (1.01, True)):
             encoders, now = self.encoders()
@@ -381,6 +381,6 @@ class TestEncodersAlone:
         encoders, now = self.encoders()
         now.velocity[4] = now.velocity[9] = 100.0
         assert [encoders.judge_velocity(None) for _ in range(3)] == [False] * 3
-        now.velocity[9] = -100.0  # right on average
+        now.velocity[9] = -100.0  # as wrong as the last sample, with the opposite sign: the mean is right
         assert encoders.judge_velocity(None)
         assert [f.node for f in encoders.findings()] == [JOINTS[4].upper()]

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
-from simulated_robot import CODEC, ROBOT, Change, SimulatedRobot, cells, must_not_be_called, only, row, signs
+from simulated_robot import ROBOT, Change, SimulatedRobot, cells, must_not_be_called, only, row, signals, signs
 
 from atalante_hal.robot import CELLS, FEET
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility import Finding
 from atalante_hal.safety.plausibility.feet import FootChecks
-from atalante_hal.safety.plausibility.finding import Signals, signals_of
+from atalante_hal.safety.plausibility.finding import Signals
 
 
 class TestForceCells:
-    def stick_out(self, foot: int, cell: int, force: float) -> Change:
+    def load(self, foot: int, cell: int, force: float) -> Change:
         return lambda now: now.force[foot, cell].__setitem__(2, force + now.force[foot, cell, 0])
 
     @cells
     @signs
     def test_single_loaded_cell_is_reported(self, foot: int, cell: int, sign: float):
         robot = SimulatedRobot()
-        change = self.stick_out(foot, cell, sign * 200.0)
+        change = self.load(foot, cell, sign * 200.0)
         assert 250 <= robot.until_found(Dtc.FOOT_CELL, 260, change) <= 260
         finding = only(robot.checks.findings)
         assert finding.node == f"FOOT_{FEET[foot].upper()}"
@@ -57,7 +56,7 @@ class TestForceCells:
             for cycle in range(300):
                 exact = force * (1.0 - 1e-12 * (cycle % 3))
                 robot.cycle(lambda now, exact=exact: now.force[1, 2].__setitem__(2, exact))
-            assert bool(robot.checks._feet.cells) is found
+            assert bool(robot.checks.findings) is found
 
     def test_load_on_two_cells_is_accepted(self):
         robot = SimulatedRobot()
@@ -67,51 +66,57 @@ class TestForceCells:
     def test_single_loaded_cell_is_reported_after_lost_frames(self, foot: int, cell: int):
         robot = SimulatedRobot()
         robot.gaps = {row(f"FOOT_{FEET[foot]}")}
-        push = self.stick_out(foot, cell, 200.0)
+        push = self.load(foot, cell, 200.0)
         assert robot.until_found(Dtc.FOOT_CELL, 260, push) >= 250
 
 
-class Plates:
-    """The feet alone, looked at in every cycle."""
+class TwoFeet:
+    """The foot checks without the schedule, run in every cycle."""
 
     def __init__(self) -> None:
-        self.now = signals_of(CODEC, np.zeros(CODEC.size))
-        self.feet = FootChecks(ROBOT, self.now, 1)
+        self.now = signals()
+        self.checks = FootChecks(ROBOT, self.now, 1)
 
-    def judge(self, left: list[float], right: list[float], heard: tuple[bool, bool] = (True, True)) -> bool:
+    def judge(self, left: list[float], right: list[float], new: tuple[bool, bool] = (True, True)) -> bool:
         self.now.force[:, :, 2] = left, right
-        return self.feet.judge(heard)
+        return self.checks.judge(new)
 
 
-NOTHING, EVEN = [0.0] * 4, [100.0] * 4
+class Unreadable:
+    """Forces that must not be read one by one."""
+
+    __getitem__ = must_not_be_called
+
+
+UNLOADED, LOADED = [0.0] * 4, [100.0] * 4  # vertical forces of the cells of a foot [N]
 
 
 class TestFeetAlone:
     def test_cells_of_unloaded_feet_are_not_compared(self):
-        plates = Plates()
-        plates.feet._judge_cells = must_not_be_called  # type: ignore[method-assign]
-        assert not plates.judge(NOTHING, [0.0, ROBOT.sensors.cell_free, 0.0, 0.0])
+        now = signals()
+        checks = FootChecks(ROBOT, now._replace(force=Unreadable()), 1)
+        now.force[1, 1, 2] = ROBOT.sensors.cell_free
+        assert not checks.judge((True, True))
 
     def test_new_foot_checks_have_no_findings(self):
-        feet = Plates().feet
-        assert (feet.swing, feet.cells, feet.findings()) == (None, {}, ())
+        checks = TwoFeet().checks
+        assert (checks.swing, checks.cells, checks.findings()) == (None, {}, ())
 
     @pytest.mark.parametrize("foot", [0, 1])
     @pytest.mark.parametrize("cell", range(4))
     def test_single_loaded_cell_is_reported_after_256_cycles_in_a_row(self, foot: int, cell: int):
-        plates, loads = Plates(), [NOTHING, NOTHING]
+        feet, loads = TwoFeet(), [UNLOADED, UNLOADED]
         loads[foot] = [-200.0 if c == cell else 0.0 for c in range(4)]
         for _ in range(2):
-            assert [plates.judge(*loads) for _ in range(257)] == [False] * 255 + [True] * 2
-            assert plates.feet.cells == {(foot, cell): -200.0}
-            told = f"force cell {CELLS[cell]} of the {FEET[foot]} foot says -200 N, which contradicts the other three"
+            assert [feet.judge(*loads) for _ in range(257)] == [False] * 255 + [True] * 2
+            assert feet.checks.cells == {(foot, cell): -200.0}
+            text = f"force cell {CELLS[cell]} of the {FEET[foot]} foot says -200 N, which contradicts the other three"
             node = f"FOOT_{FEET[foot].upper()}"
-            assert plates.feet.findings() == (Finding(Dtc.FOOT_CELL, node, -200.0, True, told),)
-            # What is not heard is as it was.
-            heard = foot == 1, foot == 0
-            assert plates.judge(NOTHING, NOTHING, heard)
-            assert not plates.judge(NOTHING, NOTHING)
-            assert plates.feet.cells == {}
+            assert feet.checks.findings() == (Finding(Dtc.FOOT_CELL, node, -200.0, True, text),)
+            # The cells of a foot without new values are not checked again.
+            assert feet.judge(UNLOADED, UNLOADED, (foot == 1, foot == 0))
+            assert not feet.judge(UNLOADED, UNLOADED)
+            assert feet.checks.cells == {}
 
     def test_unloaded_cell_is_reported_if_the_others_exceed_cell_loaded(self):
         loaded, free = ROBOT.sensors.cell_loaded, ROBOT.sensors.cell_free
@@ -121,34 +126,34 @@ class TestFeetAlone:
             ([third, third, third + 1.0], True),
             ([loaded, loaded, free], False),
         ):
-            plates = Plates()
+            feet = TwoFeet()
             for _ in range(256):
-                last = plates.judge([*others, free], EVEN)
+                last = feet.judge([*others, free], LOADED)
             assert last is found
 
     def test_foot_stands_with_two_loaded_cells(self):
         free = ROBOT.sensors.cell_free
-        plates = Plates()
+        feet = TwoFeet()
         for forces, stands in (([free + 1.0, free, 0.0, 0.0], False), ([free + 1.0, -free - 1.0, 0.0, 0.0], True)):
-            plates.judge(forces, NOTHING)
-            assert plates.feet.swing == (1 if stands else None)
-        plates.judge(NOTHING, EVEN)
-        assert plates.feet.swing == 0
-        plates.judge(EVEN, EVEN)
-        assert plates.feet.swing is None
+            feet.judge(forces, UNLOADED)
+            assert feet.checks.swing == (1 if stands else None)
+        feet.judge(UNLOADED, LOADED)
+        assert feet.checks.swing == 0
+        feet.judge(LOADED, LOADED)
+        assert feet.checks.swing is None
 
     def test_swing_of_both_feet_is_reported_from_cycle_20_to_99(self):
-        plates = Plates()
+        feet = TwoFeet()
         for _ in range(2):
-            assert not plates.judge(EVEN, NOTHING)
-            assert [plates.judge(NOTHING, NOTHING) for _ in range(100)] == [False] * 19 + [True] * 80 + [False]
-            assert not plates.judge(NOTHING, NOTHING)
-        plates.judge(EVEN, NOTHING)
+            assert not feet.judge(LOADED, UNLOADED)
+            assert [feet.judge(UNLOADED, UNLOADED) for _ in range(100)] == [False] * 19 + [True] * 80 + [False]
+            assert not feet.judge(UNLOADED, UNLOADED)
+        feet.judge(LOADED, UNLOADED)
         for _ in range(20):
-            plates.judge(NOTHING, NOTHING)
-        assert [f.text for f in plates.feet.findings()] == ["both feet say that they swing on the ground"]
-        assert not plates.judge(EVEN, NOTHING)
-        assert plates.feet.findings() == ()
+            feet.judge(UNLOADED, UNLOADED)
+        assert [f.text for f in feet.checks.findings()] == ["both feet say that they swing on the ground"]
+        assert not feet.judge(LOADED, UNLOADED)
+        assert feet.checks.findings() == ()
 
 
 class TestContact:

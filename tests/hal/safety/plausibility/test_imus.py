@@ -30,12 +30,12 @@ class TestImuRange:
         robot.run(5)
         before = {name: getattr(robot.now, name)[imu].copy() for name in ("quaternion", "gyro", "accel")}
 
-        def say(value: float) -> Change:
+        def show(value: float) -> Change:
             return lambda now: getattr(now, quantity)[imu].__setitem__(axis, sign * value)
 
-        assert robot.cycle(say(signal.maximum - signal.factor)) == ()
+        assert robot.cycle(show(signal.maximum - signal.factor)) == ()
         before = {name: getattr(robot.now, name)[imu].copy() for name in before}
-        finding = only(robot.cycle(say(signal.maximum)))
+        finding = only(robot.cycle(show(signal.maximum)))
         assert (finding.dtc, finding.node) == (Dtc.IMU_SATURATED, f"IMU_{IMUS[imu].upper()}")
         assert finding.value == pytest.approx(signal.maximum)
         assert f"the {IMUS[imu]} IMU is at the end of its range, {signal.maximum:.0f}" in finding.text
@@ -106,7 +106,7 @@ class TestQuaternion:
 
 
 class TestImusAlone:
-    """Exactly at their thresholds, with an error of the norm that is a binary fraction."""
+    """The IMU checks without the schedule, exactly at thresholds that are binary fractions."""
 
     robot = replace(ROBOT, sensors=replace(ROBOT.sensors, quaternion_error=0.125))
     ends = tuple(

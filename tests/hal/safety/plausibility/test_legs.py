@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pinocchio
@@ -11,7 +12,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from simulated_robot import (
-    CODEC,
     GEAR,
     MIDDLE,
     PERIOD,
@@ -25,12 +25,68 @@ from simulated_robot import (
     signs,
 )
 
-from atalante_hal.robot import IMUS, JOINTS
+from atalante_hal.robot import IMUS, JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc
-from atalante_hal.safety.plausibility import Finding
-from atalante_hal.safety.plausibility.finding import Ages, Signals, signals_of
-from atalante_hal.safety.plausibility.legs import Legs, _Contradiction, _forgotten, hip_angles
+from atalante_hal.safety.plausibility.finding import Ages, Signals
+from atalante_hal.safety.plausibility.legs import Legs, hip_angles
 from atalante_hal.wire.process_image import NEVER
+
+IDENTITY = [1.0, 0.0, 0.0, 0.0]
+UNIT_GEAR = replace(ROBOT, gear=np.ones(12), polarity=np.ones(12))
+
+
+def tibia_attitude(fh: float, th: float, sagittal: float) -> list[float]:
+    """Return the quaternion wxyz of Rx(fh) Rz(th) Ry(sagittal), the attitude of a tibia whose pelvis is upright."""
+    axes = ((fh, (1.0, 0.0, 0.0)), (th, (0.0, 0.0, 1.0)), (sagittal, (0.0, 1.0, 0.0)))
+    turn = pinocchio.Quaternion.Identity()
+    for angle, axis in axes:
+        turn = turn * pinocchio.Quaternion(pinocchio.AngleAxis(angle, np.array(axis)))
+    x, y, z, w = turn.coeffs().tolist()
+    return [w, x, y, z]
+
+
+class OneLeg:
+    """Checks of the legs, with one leg under test; pelvis and tibiae are upright.
+
+    Args:
+        leg: index of the leg under test.
+        robot: default: the robot with gear ratio and polarity 1, whose joint positions are exact.
+        now: signals; default: all joints at zero, and all IMUs upright.
+        attitude_error: drift threshold [rad]; infinity switches the drift check off.
+    """
+
+    def __init__(
+        self,
+        leg: int,
+        *,
+        robot: Robot = UNIT_GEAR,
+        now: Signals | None = None,
+        attitude_error: float = ROBOT.sensors.attitude_error,
+    ) -> None:
+        self.leg = leg
+        self.now = signals() if now is None else now
+        if now is None:
+            self.now.quaternion[:] = IDENTITY
+        self.standing = np.zeros(12, np.int64)
+        robot = replace(robot, sensors=replace(robot.sensors, attitude_error=attitude_error))
+        self.legs = Legs(robot, self.now, self.standing, PERIOD)
+
+    def show(self, angles: Sequence[float], errors: Sequence[float]) -> None:
+        """Let the IMUs show the angles FH, TH and SH + SK [rad], and the encoders these angles plus the errors."""
+        side = ("left", "right")[self.leg]
+        self.now.quaternion[IMUS.index(f"{side}_tibia")] = tibia_attitude(*angles)
+        self.now.position[6 * self.leg : 6 * self.leg + 3] = np.add(angles, errors)
+
+    def compare(self, samples: int = 1, ages: Ages | None = None) -> None:
+        """Run the check of the leg, as in its turns."""
+        judge = (self.legs.judge_left, self.legs.judge_right)[self.leg]
+        for _ in range(samples):
+            judge(ages)
+
+    def drifts(self) -> list[float]:
+        """Return the errors that are found as a drift [rad]."""
+        return [finding.value for finding in self.legs.findings() if finding.dtc is Dtc.ENC_DRIFT]
+
 
 angles = st.floats(-1.2, 1.2)
 
@@ -49,7 +105,7 @@ class TestDrift:
 
     @pytest.mark.parametrize("heading", [(0.5, 0.5, 0.5, 0.5), (0.5, -0.5, 0.5, 0.5), (0.1, 0.7, -0.1, 0.7)])
     def test_hip_angles_do_not_depend_on_heading(self, heading: tuple[float, ...]):
-        """The robot of the tests hangs with its pelvis straight; a wearer walks where he likes."""
+        """The simulated robot keeps its pelvis upright; a real pelvis has any attitude."""
         position = np.array([0.2, -0.3, 0.5, 0.4, 0.0, 0.0] * 2)
         whole = pinocchio.Quaternion(np.array(heading)).normalized()
         quaternions = []
@@ -77,7 +133,7 @@ class TestDrift:
             robot.cycle(off)
         assert robot.run(200, off) == ()
         offset = sign * allowed * (1.0 + 1e-6)
-        if JOINTS[joint].endswith(("SA", "HA")):  # the promised miss
+        if JOINTS[joint].endswith(("SA", "HA")):  # no IMU beyond this joint: its faults are not detected
             assert robot.run(400, off) == ()
             return
         assert 64 < robot.until_found(Dtc.ENC_DRIFT, 128, off) <= 128
@@ -86,9 +142,9 @@ class TestDrift:
         assert finding.node == named.upper()
         assert finding.value == pytest.approx(offset, rel=1e-5)
         side, axis = JOINTS[joint].split("_")
-        told = f"{side}_SH and {side}_SK" if axis in ("SH", "SK") else JOINTS[joint]
+        named_joints = f"{side}_SH and {side}_SK" if axis in ("SH", "SK") else JOINTS[joint]
         assert finding.text == (
-            f"encoder of {told}: {math.degrees(offset):+.1f} degrees off what pelvis and tibia IMU say"
+            f"encoder of {named_joints}: {math.degrees(offset):+.1f} degrees off what pelvis and tibia IMU say"
         )
         robot.missing = {row("pendant")}
         assert only(robot.run(40, off)) is finding
@@ -99,19 +155,19 @@ class TestDrift:
 
     @pytest.mark.parametrize("leg", [0, 1])
     def test_encoder_angles_agree_modulo_a_full_turn(self, leg: int):
-        now = signals_of(CODEC, np.zeros(CODEC.size))
-        now.quaternion[:, 0] = 1.0
-        legs = Legs(ROBOT, now, np.zeros(12, np.int64), PERIOD)
+        hip, zero = 6 * leg, np.array([0.05, -0.04, 0.03, 0.0])
         for turn in (0.0, 2.0 * math.pi, -2.0 * math.pi):
-            now.position[:] = (turn + np.array([0.05, -0.04, 0.03, 0.0] * 3)) * GEAR
-            hip = 6 * leg
-            now.position[hip : hip + 4] = (turn + np.array([0.05, -0.04, 0.03, -turn])) * GEAR[hip : hip + 4]
-            assert legs._compare(leg, None).errors == pytest.approx((0.05, -0.04, 0.03), abs=1e-9)
+            one_leg = OneLeg(leg, attitude_error=0.0)
+            angles = turn + zero
+            angles[3] = 0.0
+            one_leg.now.position[hip : hip + 4] = angles
+            one_leg.compare(4)
+            assert one_leg.drifts() == pytest.approx([0.05, -0.04, 0.03], abs=1e-9)
 
     @pytest.mark.parametrize("leg", [0, 1])
     @pytest.mark.parametrize("late", ["none", "joints", "pelvis", "tibia", "all"])
     def test_values_of_different_ages_are_extrapolated_to_this_cycle(self, leg: int, late: str):
-        """All joints at their highest velocity, and a pelvis that turns; values up to four cycles old."""
+        """All joints move at their highest velocity and the pelvis turns; the values are up to four cycles old."""
         velocity, turning = ROBOT.velocity_max, np.array([0.5, -0.7, 0.9])
         tibia = IMUS.index(("left_tibia", "right_tibia")[leg])
         ages = Ages(np.zeros(12, np.int64), np.zeros(4, np.int64), np.zeros(2, np.int64))
@@ -121,8 +177,8 @@ class TestDrift:
 
         def attitudes_at(time: float) -> np.ndarray:
             whole = pinocchio.Quaternion(pinocchio.exp3(turning * time))
-            placed = [whole * pinocchio.Quaternion(w, x, y, z) for w, x, y, z in attitudes(MIDDLE + velocity * time)]
-            return np.array([q.coeffs()[[3, 0, 1, 2]] for q in placed])
+            rotated = [whole * pinocchio.Quaternion(w, x, y, z) for w, x, y, z in attitudes(MIDDLE + velocity * time)]
+            return np.array([q.coeffs()[[3, 0, 1, 2]] for q in rotated])
 
         now = signals()
         now.position[:] = (MIDDLE - velocity * PERIOD * ages.joint) * GEAR
@@ -133,29 +189,37 @@ class TestDrift:
             now.gyro[imu] = (
                 pinocchio.log3((pinocchio.Quaternion(w, x, y, z).inverse() * later).toRotationMatrix()) / 1e-6
             )
-        legs = Legs(ROBOT, now, np.zeros(12, np.int64), PERIOD)
-        said = legs._compare(leg, ages)
-        assert said is not None
         cycles = sum(ages.joint[:4]) + sum(ages.imu)
-        assert said.doubt == pytest.approx(ROBOT.sensors.velocity_error * PERIOD * cycles)
-        assert np.abs(said.errors).max() <= 1e-9 + 0.25 * said.doubt  # without being carried up to 32 mrad
+        doubt = ROBOT.sensors.velocity_error * PERIOD * cycles
+
+        def drifts(attitude_error: float) -> list[float]:
+            checked = OneLeg(leg, robot=ROBOT, now=now, attitude_error=attitude_error)
+            checked.compare(4, ages)
+            return checked.drifts()
+
+        # The threshold is extended by `doubt`: a negative `attitude_error` shows every error.
+        assert drifts(1e-9 - 0.75 * doubt) == []  # without extrapolation the errors are up to 32 mrad
+        errors = drifts(-1.0)
+        assert len(errors) == 3
+        threshold = min(map(abs, errors)) - doubt
+        assert len(drifts(threshold - 1e-12)) == 3
+        assert len(drifts(threshold + 1e-12)) < 3
         for values, needed in ((ages.joint, range(6 * leg, 6 * leg + 4)), (ages.imu, (IMUS.index("pelvis"), tibia))):
-            for place in range(len(values)):
-                kept, values[place] = values[place], NEVER
-                assert (legs._compare(leg, ages) is None) is (place in needed)
-                values[place] = kept
+            for index in range(len(values)):
+                kept, values[index] = values[index], NEVER
+                assert (drifts(-1.0) == []) is (index in needed)
+                values[index] = kept
 
     @pytest.mark.parametrize("leg", [0, 1])
     @pytest.mark.parametrize("axis", range(3))
     def test_drift_needs_four_samples_beyond_the_exact_threshold(self, leg: int, axis: int):
-        legs = Legs(ROBOT, signals_of(CODEC, np.zeros(CODEC.size)), np.zeros(12, np.int64), PERIOD)
         allowed = ROBOT.sensors.attitude_error
         for size, found in ((allowed, False), (np.nextafter(allowed, 1.0), True)):
-            errors = [0.0] * 3
-            errors[axis] = -float(size)
+            one_leg = OneLeg(leg)
+            one_leg.now.position[6 * leg + axis] = -float(size)
             for samples in range(1, 6):
-                legs._judge_drift(leg, _Contradiction((0.0, 0.0, 0.0), (errors[0], errors[1], errors[2])))
-                assert bool(legs.findings()) is (found and samples >= 4)
+                one_leg.compare()
+                assert bool(one_leg.drifts()) is (found and samples >= 4)
 
     @pytest.mark.parametrize("rate", [0.035, 0.05, 0.2])
     def test_slow_drift_is_found_within_1000_cycles(self, rate: float):
@@ -169,13 +233,13 @@ class TestDrift:
 
 
 class TestStandingEncoder:
-    """An encoder that stands still while pelvis and tibia IMU say that its leg turns; must_not_be_called drives it."""
+    """The reading of an encoder is constant while pelvis and tibia IMU show that its leg turns; its drive makes no torque."""
 
     allowed = ROBOT.sensors.attitude_change / (1.0 - ROBOT.sensors.misalignment)
 
     @staticmethod
     def standing(joint: int) -> tuple[SimulatedRobot, Callable[[float], None]]:
-        """A robot that stands, and how to turn a joint whose encoder does not show it."""
+        """Return a robot at rest, and a function that turns the joint without its encoder [rad]."""
         robot = SimulatedRobot(amplitude=0.0)
         turned = np.zeros(12)
         robot.position = lambda: MIDDLE + turned  # type: ignore[method-assign]
@@ -197,7 +261,7 @@ class TestStandingEncoder:
             now.position[joint] = stuck
             now.torque[:] = 0.0
 
-        if JOINTS[joint].endswith(("SA", "HA")):  # the promised miss
+        if JOINTS[joint].endswith(("SA", "HA")):  # no IMU beyond this joint: its faults are not detected
             assert robot.run(400, stick) == ()
             return
         robot.until_found(Dtc.ENC_STUCK, 80, stick)
@@ -222,102 +286,98 @@ class TestStandingEncoder:
         assert 16 < robot.until_found(Dtc.ENC_STUCK, 48, self.still) <= 48
         pair = (
             {joint, joint ^ 1} if JOINTS[joint].endswith(("SH", "SK")) else {joint}
-        )  # no attitude tells these two apart
+        )  # the IMUs cannot separate SH from SK
         assert [f.node for f in robot.checks.findings] == [JOINTS[one].upper() for one in sorted(pair)]
         assert [f.value for f in robot.checks.findings] == pytest.approx([sign * 1.01 * self.allowed] * len(pair))
         turn(0.0)
         assert robot.run(33, self.still) == ()
 
     @pytest.mark.parametrize("leg", [0, 1])
-    @pytest.mark.parametrize(("place", "axis"), [(0, 0), (1, 1), (2, 2), (3, 2)])
-    def test_two_samples_of_leg_turn_report_stuck_encoder(self, leg: int, place: int, axis: int):
-        standing = np.zeros(12, np.int64)
-        legs, joint = Legs(ROBOT, signals_of(CODEC, np.zeros(CODEC.size)), standing, PERIOD), 6 * leg + place
+    @pytest.mark.parametrize(("index", "axis"), [(0, 0), (1, 1), (2, 2), (3, 2)])
+    def test_two_samples_of_leg_turn_report_stuck_encoder(self, leg: int, index: int, axis: int):
+        one_leg, joint = OneLeg(leg, attitude_error=math.inf), 6 * leg + index
 
-        def say(turned: float, change: float) -> list[float]:
+        def sample(turned: float, change: float) -> list[float]:
             angles, errors = [0.1, -0.2, 0.3], [0.05, 0.06, -0.07]
             angles[axis] -= turned
             errors[axis] += change
-            legs._judge_standstill(leg, _Contradiction(tuple(angles), tuple(errors)))  # type: ignore[arg-type]
-            found = legs.findings()
+            one_leg.show(angles, errors)
+            one_leg.compare()
+            found = one_leg.legs.findings()
             assert {f.node for f in found} <= {JOINTS[joint].upper()}
             return [f.value for f in found]
 
         for _ in range(2):
-            standing[joint] = 0
-            assert [say(0.5, 0.5), say(0.0, 0.0)] == [[], []]  # it moves
-            standing[joint] = 1
-            assert say(0.02, 0.02) == []
-            assert say(0.02, 0.02) == pytest.approx([-0.02])
-            assert say(-0.03, -0.03) == pytest.approx([0.03])
-            assert [say(0.0, 0.0), say(0.02, 0.02)] == [[], []]
-            # Neither a change without a turn nor a turn without a change is a standstill.
-            assert [say(0.0, 0.5), say(0.0, 0.5), say(0.0, 0.5)] == [[]] * 3
-            assert [say(0.5, 0.0), say(0.5, 0.0), say(0.5, 0.0)] == [[]] * 3
+            one_leg.standing[joint] = 0
+            assert [sample(0.5, 0.5), sample(0.0, 0.0)] == [[], []]  # the encoder moves
+            one_leg.standing[joint] = 1
+            assert sample(0.02, 0.02) == []
+            assert sample(0.02, 0.02) == pytest.approx([-0.02])
+            assert sample(-0.03, -0.03) == pytest.approx([0.03])
+            assert [sample(0.0, 0.0), sample(0.02, 0.02)] == [[], []]
+            # A changed error without a turn of the leg reports nothing, and a turn without a changed error reports nothing.
+            assert [sample(0.0, 0.5), sample(0.0, 0.5), sample(0.0, 0.5)] == [[]] * 3
+            assert [sample(0.5, 0.0), sample(0.5, 0.0), sample(0.5, 0.0)] == [[]] * 3
 
     def test_change_of_exactly_the_allowance_is_accepted(self):
-        sensors, standing = ROBOT.sensors, np.zeros(12, np.int64)
-        for turned in (0.0, 0.125, 0.5):
+        sensors = ROBOT.sensors
+        for angle in (0.0, 0.125, 0.5):
+            turned = hip_angles(IDENTITY, tibia_attitude(0.0, angle, 0.0))[1]
             allowed = sensors.attitude_change + sensors.misalignment * turned
             for change, found in ((allowed, False), (np.nextafter(allowed, 1.0), turned > 0.0)):
-                legs = Legs(ROBOT, signals_of(CODEC, np.zeros(CODEC.size)), standing, PERIOD)
-                standing[0] = 0
-                legs._judge_standstill(0, _Contradiction((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
-                standing[0] = 1
-                for _ in range(2):
-                    legs._judge_standstill(0, _Contradiction((0.0, turned, 0.0), (float(change), 0.0, 0.0)))
-                assert bool(legs.findings()) is found
+                one_leg = OneLeg(0, attitude_error=math.inf)
+                one_leg.standing[0] = 0
+                one_leg.compare()
+                one_leg.standing[0] = 1
+                one_leg.show([0.0, angle, 0.0], [float(change), 0.0, 0.0])
+                one_leg.compare(2)
+                assert bool(one_leg.legs.findings()) is found
 
     @pytest.mark.parametrize("axis", range(3))
     @pytest.mark.parametrize(
-        ("change", "way"), [(0.5, 2e-5), (2.1e-5, 2e-5), (1e-5, 1e-5), (-1e-5, -1e-5), (-0.5, -2e-5)]
+        ("change", "ignored"), [(0.5, 2e-5), (2.1e-5, 2e-5), (1e-5, 1e-5), (-1e-5, -1e-5), (-0.5, -2e-5)]
     )
-    def test_slow_change_of_the_difference_is_ignored(self, axis: int, change: float, way: float):
-        moved = _Contradiction((1.0, 2.0, 3.0), (0.1, 0.2, 0.3))
-        now = _forgotten(moved, axis, change)
-        assert now.angles == moved.angles
-        errors = list(moved.errors)
-        errors[axis] += way
-        assert now.errors == tuple(errors)
+    def test_change_per_sample_is_ignored_up_to_its_limit(self, axis: int, change: float, ignored: float):
+        one_leg = OneLeg(0, attitude_error=math.inf)
+        angles, errors = [0.1, 0.2, 0.3], [0.1, 0.2, 0.3]
 
-    def test_leg_with_constant_encoder_is_compared_in_each_turn(self):
-        standing, looked_at = np.zeros(12, np.int64), []
-        legs = Legs(ROBOT, signals(), standing, PERIOD)
+        def sample(turned: float, change: float) -> None:
+            one_leg.show([angle + turned for angle in angles], [e + change * (i == axis) for i, e in enumerate(errors)])
+            one_leg.compare()
 
-        too_old: set[int] = set()
+        one_leg.standing[:] = 0
+        sample(0.0, 0.0)
+        one_leg.standing[axis] = 1
+        sample(0.0, change)  # without a turn of the leg
+        assert one_leg.legs.findings() == ()
+        for _ in range(2):
+            sample(0.5, 1.0)
+        assert only(one_leg.legs.findings()).value == pytest.approx(ignored - 1.0, abs=1e-12)
 
-        def compare(leg: int, _: object) -> _Contradiction | None:
-            if leg in too_old:
-                return None
-            looked_at.append(leg)
-            return _Contradiction((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    @pytest.mark.parametrize("leg", [0, 1])
+    @pytest.mark.parametrize(
+        ("index", "compared"), [(0, True), (1, True), (2, True), (3, True), (4, False), (5, False)]
+    )
+    def test_leg_with_constant_encoder_is_compared_in_the_other_turn(self, leg: int, index: int, compared: bool):
+        one_leg = OneLeg(leg, attitude_error=math.inf)
+        other = (one_leg.legs.judge_right, one_leg.legs.judge_left)[leg]
+        one_leg.compare()
+        one_leg.standing[6 * leg + index] = 1
+        one_leg.show([0.1, 0.1, 0.1], [-0.1, -0.1, -0.1])
+        assert [other(None), other(None)] == [False, compared]
+        one_leg.standing[:] = 0
+        assert not other(None)  # the encoder moves again
 
-        legs._compare = compare  # type: ignore[method-assign]
-
-        def look(judge: Callable[[None], bool]) -> list[int]:
-            looked_at.clear()
-            assert not judge(None)
-            return looked_at.copy()
-
-        left, right = legs.judge_left, legs.judge_right
-        for stands, orders in (
-            ([], ([0], [1])),
-            ([0], ([0], [1, 0])),
-            ([3], ([0], [1, 0])),
-            ([4, 11], ([0], [1])),  # ankles
-            ([6], ([0, 1], [1])),
-            ([9], ([0, 1], [1])),
-        ):
-            standing[:] = np.isin(range(12), stands)
-            assert (look(left), look(right)) == orders
-        standing[:] = 0
-        for leg, judge in enumerate((right, left)):
-            legs._stuck[leg] = (Finding(Dtc.ENC_STUCK, "", 0.0, True, ""),)
-            assert look(judge) == [1 - leg, leg]
-        standing[:] = 1
-        for leg in (0, 1):
-            too_old = {leg}
-            assert look(left) == look(right) == [1 - leg]
+    def test_legs_with_old_values_are_not_compared(self):
+        one_leg = OneLeg(0, attitude_error=math.inf)
+        ages = Ages(np.zeros(12, np.int64), np.zeros(4, np.int64), np.zeros(2, np.int64))
+        one_leg.compare()
+        one_leg.standing[:] = 1
+        one_leg.show([0.1, 0.0, 0.0], [-0.1, 0.0, 0.0])
+        ages.joint[0] = NEVER
+        for _ in range(4):
+            assert not one_leg.legs.judge_left(ages)
+            assert not one_leg.legs.judge_right(ages)
 
     def test_one_sample_of_leg_turn_reports_nothing(self):
         robot, turn = self.standing(JOINTS.index("left_TH"))
