@@ -197,9 +197,9 @@ class TestDrift:
             checked.compare(4, ages)
             return checked.drifts()
 
-        # The threshold is extended by `doubt`: a negative `attitude_error` shows every error.
+        # The threshold is extended by `doubt`: an `attitude_error` of minus infinity shows every error.
         assert drifts(1e-9 - 0.75 * doubt) == []  # without extrapolation the errors are up to 32 mrad
-        errors = drifts(-1.0)
+        errors = drifts(-math.inf)
         assert len(errors) == 3
         threshold = min(map(abs, errors)) - doubt
         assert len(drifts(threshold - 1e-12)) == 3
@@ -207,7 +207,7 @@ class TestDrift:
         for values, needed in ((ages.joint, range(6 * leg, 6 * leg + 4)), (ages.imu, (IMUS.index("pelvis"), tibia))):
             for index in range(len(values)):
                 kept, values[index] = values[index], NEVER
-                assert (drifts(-1.0) == []) is (index in needed)
+                assert (drifts(-math.inf) == []) is (index in needed)
                 values[index] = kept
 
     @pytest.mark.parametrize("leg", [0, 1])
