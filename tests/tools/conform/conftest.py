@@ -17,8 +17,8 @@ from atalante_emulator.pendant import Operator
 from atalante_hal.bus.pair import PairBus, lockstep_pair
 from atalante_hal.robot import Robot
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, Frames, joined, new_frames
-from atalante_tools.conform.bench import Limits, LockStep, NodeTester
 from atalante_tools.conform.examination import requirements_of
+from atalante_tools.conform.node_tester import Limits, LockStep, NodeTester
 from atalante_tools.conform.requirement import Result, Verdict, examine
 from atalante_tools.conform.technician import EmulatorTechnician
 

@@ -18,9 +18,9 @@ from atalante_hal.wire.frame import new_frames
 from atalante_hal.wire.process_image import TransmitImage
 from atalante_tools.cli import cli
 from atalante_tools.conform.any_node import answers_every_sync
-from atalante_tools.conform.bench import NodeTester, NotTested, WallClock
 from atalante_tools.conform.examination import make_safe, requirements_of
 from atalante_tools.conform.frames import MessageReceiver, MessageSender
+from atalante_tools.conform.node_tester import NodeTester, NotTested, WallClock
 from atalante_tools.conform.requirement import LATE, Outcome, Requirement, Verdict, examine
 from atalante_tools.conform.technician import Action, HumanTechnician
 from atalante_tools.console.outcome import Failed

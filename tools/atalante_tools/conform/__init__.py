@@ -1,4 +1,4 @@
-"""Command `atalante conform`: acceptance test of one node, real or emulated. This computer takes the role of the HAL."""
+"""Command `atalante conform`: acceptance test of one real or emulated node, in which this computer replaces the HAL."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from atalante_tools.console.stop_request import check_stop, ended_by
 from atalante_tools.console.terminal import say, show_json
 
 if TYPE_CHECKING:
-    from atalante_tools.conform.bench import NodeTester
+    from atalante_tools.conform.node_tester import NodeTester
     from atalante_tools.conform.requirement import Requirement
 
 
@@ -82,7 +82,7 @@ def command(
                 else:
                     click.echo(entry(result))
         finally:
-            with ended_by(lambda: None):  # further signals must not interrupt this
+            with ended_by(lambda: None):  # a second stop signal must not interrupt `make_safe`
                 make_safe(tester)
     for skipped in without:
         say(f"skipped on request: {skipped.upper()}")
@@ -104,7 +104,7 @@ def _chosen(requirements: list[Requirement], only: tuple[str, ...], without: tup
 def _open_tester(name: str, target: Target, torque: float, patience: float) -> Iterator[NodeTester]:
     import atalante_dbc
     from atalante_hal.robot import load_robot
-    from atalante_tools.conform.bench import Limits, LockStep, NodeTester, WallClock
+    from atalante_tools.conform.node_tester import Limits, LockStep, NodeTester, WallClock
     from atalante_tools.conform.technician import EmulatorTechnician, HumanTechnician
     from atalante_tools.console.names import find
 

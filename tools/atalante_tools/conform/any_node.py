@@ -10,33 +10,34 @@ from typing import Final
 import numpy as np
 
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_EXTENDED, Frames, new_frames
-from atalante_tools.conform.bench import NodeTester, NotTested
 from atalante_tools.conform.frames import ReceivedFrame
+from atalante_tools.conform.node_tester import NodeTester, NotTested
 from atalante_tools.conform.requirement import Outcome, Requirement
 from atalante_tools.conform.technician import Action
 
 #: NMT states in the heartbeat (CiA 301).
 NMT: Final = {0: "BOOTUP", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE_OPERATIONAL"}
-#: Cycles without any frame after which a node counts as switched off.
+#: Number of cycles without any frame after which a node counts as switched off.
 _OFF: Final = 250
-#: Undisturbed cycles in which the heartbeat and the answers to SYNC are measured.
+#: Number of cycles for the test of the heartbeat, and for the test of the answers to SYNC.
 _HEARTBEAT_CYCLES, _ANSWER_CYCLES = 520, 200
-#: Allowed relative error of the mean heartbeat period, and of a single period, against the DBC.
+#: Largest relative deviation of the mean heartbeat period, and of a single period, from the DBC.
 _MEAN, _SINGLE = 0.1, 0.5
-#: Foreign frames per cycle, and number of cycles, of the flood test. The bus has room for this many besides its cyclic frames.
+#: Random frames per cycle of the flood test, and number of its cycles. The bus load stays below 100 %.
 _FLOOD, _FLOOD_CYCLES = 6, 100
-#: Bits of SYNC that are flipped, one per test: in the CRC, the HAL state and the cycle number.
+#: Bits of SYNC that are flipped, one in each wrong SYNC: bits of the CRC, the HAL state and the cycle number.
 _DAMAGED: Final = (0, 5, 10, 15, *range(24, 32), *range(48, 56))
 #: Number of wrong SYNCs sent for each kind of defect.
 _WRONG: Final = len(_DAMAGED)
-#: Defects listed in a result; more are only counted.
+#: Maximum number of defects that a result names. Further defects are only counted.
 _LISTED: Final = 3
 
 
 def requirements(tester: NodeTester) -> tuple[list[Requirement], list[Requirement]]:
-    """Return the requirements that are tested before and after the requirements for the kind of node.
+    """Return the requirements for every node in two lists: those tested first, and those tested last.
 
     The first list is tested on the node at rest. The second list is evaluated on all frames received in the examination.
+    Requirements for the kind of node are tested between the two.
     """
     node, state = tester.node.name, tester.state_message
     e2e = "AUTOSAR E2E Profile 5"
@@ -53,7 +54,7 @@ def requirements(tester: NodeTester) -> tuple[list[Requirement], list[Requiremen
             "Reports the hash of this network description.",
             "DbcHash of the heartbeat",
             "fault matrix F53",
-            has_our_hash,
+            reports_the_dbc_hash,
         ),
         Requirement(
             "NODE-03",
@@ -180,7 +181,7 @@ def requirements(tester: NodeTester) -> tuple[list[Requirement], list[Requiremen
 
 
 def boots_up(tester: NodeTester) -> Outcome:
-    """Test NODE-01: one BOOTUP heartbeat, then OPERATIONAL."""
+    """Test NODE-01: the node sends one BOOTUP heartbeat after power-up, then OPERATIONAL."""
     if not tester.technician.fresh:
         silent = 0
 
@@ -198,8 +199,8 @@ def boots_up(tester: NodeTester) -> Outcome:
     return Outcome(reported == ["BOOTUP", "OPERATIONAL"], ", then ".join(reported))
 
 
-def has_our_hash(tester: NodeTester) -> Outcome:
-    """Test NODE-02: the node reports the hash of this network description."""
+def reports_the_dbc_hash(tester: NodeTester) -> Outcome:
+    """Test NODE-02: the node reports the hash of the DBC of this computer."""
     received = _statuses(tester) or _statuses(tester, tester.idle(2 * tester.status_message.cycle_ms))
     if not received:
         raise NotTested("no heartbeat received")
@@ -209,7 +210,7 @@ def has_our_hash(tester: NodeTester) -> Outcome:
 
 
 def keeps_its_heartbeat(tester: NodeTester) -> Outcome:
-    """Test NODE-03: the heartbeat keeps its period."""
+    """Test NODE-03: the node sends its heartbeat with the period of the DBC."""
     period = tester.status_message.cycle_ms * 1e-3
     times = [frame.time for frame in _statuses(tester, tester.idle(_HEARTBEAT_CYCLES))]
     gaps = np.diff(times)
@@ -221,12 +222,12 @@ def keeps_its_heartbeat(tester: NodeTester) -> Outcome:
 
 
 def answers_every_sync(tester: NodeTester) -> Outcome:
-    """Test NODE-04: one state frame per SYNC, or one per period."""
+    """Test NODE-04: the node sends one state frame per SYNC, or one per period."""
     return _answered(tester, tester.idle(_ANSWER_CYCLES), _ANSWER_CYCLES)
 
 
 def raises_no_emergency(tester: NodeTester) -> Outcome:
-    """Test NODE-05: no emergency has been received so far."""
+    """Test NODE-05: the node has sent no emergency message so far."""
     raised = [frame for frame in tester.received if frame.message is tester.emergency_message]
     return Outcome(not raised, f"{len(raised)} emergencies" if raised else "no emergency")
 
@@ -235,7 +236,7 @@ def raises_no_emergency(tester: NodeTester) -> Outcome:
 
 
 def is_silent_without_sync(tester: NodeTester) -> Outcome:
-    """Test NODE-06: no state frame without SYNC."""
+    """Test NODE-06: the node sends no state frame without SYNC."""
     tester.silent_cycle()  # the answer to the last SYNC may still arrive
     received = tester.states([frame for _ in range(10) for frame in tester.silent_cycle()])
     tester.idle(2)
@@ -243,7 +244,7 @@ def is_silent_without_sync(tester: NodeTester) -> Outcome:
 
 
 def tolerates_foreign_frames(tester: NodeTester) -> Outcome:
-    """Test NODE-10: foreign frames do not delay or suppress an answer."""
+    """Test NODE-10: the node answers every SYNC while frames with unknown identifiers are on the bus."""
     random = np.random.default_rng(0)
     known = [m.frame_id for m in tester.network.messages]
     received = [frame for _ in range(_FLOOD_CYCLES) for frame in tester.cycle(before=_foreign_frames(random, known))]
@@ -251,7 +252,7 @@ def tolerates_foreign_frames(tester: NodeTester) -> Outcome:
 
 
 def _ignores_sync(wrong: Callable[[NodeTester, int], Frames]) -> Callable[[NodeTester], Outcome]:
-    """Return a test that sends wrong and right SYNCs alternately and requires answers to the right ones only."""
+    """Return a test that sends wrong and right SYNCs alternately. The node must answer only the right ones."""
 
     def test(tester: NodeTester) -> Outcome:
         answers: Counter[bool] = Counter()
@@ -270,7 +271,7 @@ def _sync_of_another_length(tester: NodeTester, number: int) -> Frames:
 
 
 def _foreign_frames(random: np.random.Generator, known: list[int]) -> Frames:
-    """Return random frames that are not in the network. Shape (_FLOOD,). The first has the highest priority on the bus."""
+    """Return random frames with unknown identifiers, of which the first has the highest bus priority. Shape (_FLOOD,)."""
     frames = new_frames(_FLOOD)
     frames["data"][:, :8] = random.integers(0, 256, (_FLOOD, 8), np.uint8)
     for index, frame in enumerate(frames):
@@ -288,7 +289,7 @@ def _foreign_frames(random: np.random.Generator, known: list[int]) -> Frames:
 
 
 def _all(defects_of: Callable[[list[ReceivedFrame]], list[str]]) -> Callable[[NodeTester], Outcome]:
-    """Return a test that every received frame must pass; `defects_of` returns one text per defect."""
+    """Return a test of all received frames, which passes if `defects_of` returns no defect."""
 
     def test(tester: NodeTester) -> Outcome:
         if tester.dropped:
@@ -329,7 +330,7 @@ def _statuses(tester: NodeTester, received: list[ReceivedFrame] | None = None) -
 
 
 def _answered(tester: NodeTester, received: list[ReceivedFrame], cycles: int) -> Outcome:
-    """Return whether the state frames in `received` have the expected number and spacing over `cycles` cycles."""
+    """Return whether the node sent the expected state frames in `cycles` cycles, in number and spacing."""
     period = tester.state_message.cycle_ms
     at = [frame.cycle for frame in received if frame.message is tester.state_message]
     if period == 1:

@@ -1,4 +1,4 @@
-"""Joint of the drive under test, and the CiA 402 state machine required of it, transcribed from IEC 61800-7-201.
+"""Joint of the drive under test, and the CiA 402 state machine that the drive must have (IEC 61800-7-201).
 
 The table of transitions is independent of `atalante_hal.wire.cia402`, because the emulated drive uses that module.
 """
@@ -11,12 +11,13 @@ from typing import Final
 from atalante_hal.robot import JOINTS
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.frame import Frames
-from atalante_tools.conform.bench import NodeTester, NotTested
 from atalante_tools.conform.frames import ReceivedFrame
+from atalante_tools.conform.node_tester import NodeTester, NotTested
 
 _S, _C = DriveState, Controlword
 
-#: (state, command) -> (transition number of the standard, next state). Every other command must leave the state unchanged.
+#: Legal transitions: (state, command) -> (transition number in the standard, next state).
+#: A command without a transition must leave the state unchanged.
 LEGAL: Final[dict[tuple[DriveState, Controlword], tuple[int, DriveState]]] = {
     (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN): (2, _S.READY_TO_SWITCH_ON),
     (_S.READY_TO_SWITCH_ON, _C.SWITCH_ON): (3, _S.SWITCHED_ON),
@@ -33,7 +34,7 @@ LEGAL: Final[dict[tuple[DriveState, Controlword], tuple[int, DriveState]]] = {
     (_S.QUICK_STOP_ACTIVE, _C.DISABLE_VOLTAGE): (12, _S.SWITCH_ON_DISABLED),
     (_S.QUICK_STOP_ACTIVE, _C.ENABLE_OPERATION): (16, _S.OPERATION_ENABLED),
 }
-#: States that can be reached by commands, each with the commands that lead to it from SWITCH ON DISABLED.
+#: Commands that lead from SWITCH ON DISABLED to each state.
 ROUTES: Final[dict[DriveState, tuple[Controlword, ...]]] = {
     _S.SWITCH_ON_DISABLED: (),
     _S.READY_TO_SWITCH_ON: (_C.SHUTDOWN,),
@@ -42,13 +43,13 @@ ROUTES: Final[dict[DriveState, tuple[Controlword, ...]]] = {
     _S.QUICK_STOP_ACTIVE: (_C.SHUTDOWN, _C.SWITCH_ON, _C.ENABLE_OPERATION, _C.QUICK_STOP),
 }
 
-#: Largest number of cycles for a transition.
+#: Largest number of cycles that a drive may take for a transition.
 FOLLOW: Final = 50
-#: Number of cycles for which a command without transition is repeated.
+#: Number of cycles in which a command without a transition is repeated.
 STAY: Final = 8
-#: Largest number of cycles from a command to the state frame that shows its effect, without a transition.
+#: Largest number of cycles from a command to the first state frame that shows its effect.
 SHOWN: Final = 3
-#: Largest difference of measured and commanded torque that counts as noise [Nm].
+#: Largest difference between measured and commanded torque that counts as noise [Nm].
 NOISE: Final = 0.3
 
 
@@ -65,7 +66,7 @@ class Axis:
         )
 
     def signal(self, name: str) -> str:
-        """Return the full name of this joint's signal `name` in the command message."""
+        """Return the name of a signal of this joint in the command message, with the prefix of the joint."""
         return f"{self._prefix}_{name}"
 
     def command(
@@ -108,7 +109,7 @@ class Axis:
         length: int | None = None,
         flip: int | None = None,
     ) -> Frames:
-        """Return a defective command frame that asks for the largest torque of the examination. Shape (1,).
+        """Return a defective command frame with the largest torque of the examination. Shape (1,).
 
         Args:
             counter: alive counter in place of the next one.
@@ -148,7 +149,7 @@ class Axis:
         for controlword in ROUTES[goal]:
             state = LEGAL[state, controlword][1]
             if self.follow(controlword, state) is None:
-                raise NotTested(f"the drive cannot be brought to {state.name}")
+                raise NotTested(f"the drive must reach {state.name} within {FOLLOW} cycles, but it did not")
 
     def enable(self) -> None:
         """Bring the drive to OPERATION ENABLED with a torque command of 0.
@@ -174,17 +175,17 @@ def name_of(state: int) -> str:
 
 
 def torque_of(received: list[ReceivedFrame]) -> float:
-    """Return the measured torque [Nm] with the largest magnitude; 0 without frames."""
+    """Return the measured torque with the largest magnitude [Nm]; 0 without frames."""
     return max((frame.values["Torque"] for frame in received), key=abs, default=0.0)
 
 
 def mean_torque(received: list[ReceivedFrame]) -> float:
-    """Return the mean of the measured torque [Nm]; NaN without frames."""
+    """Return the mean measured torque [Nm]; NaN without frames."""
     return sum(frame.values["Torque"] for frame in received) / len(received) if received else math.nan
 
 
 def names_of(received: list[ReceivedFrame]) -> str:
-    """Return the names of the drive states in the frames, each once, in order of first appearance."""
+    """Return the names of the drive states in the frames, without repetitions, in order of first appearance."""
     return " -> ".join(dict.fromkeys(name_of(state_of(frame)) for frame in received)) or "no state frame"
 
 
@@ -203,5 +204,5 @@ def emergencies_of(tester: NodeTester, first: int) -> list[int]:
 
 
 def codes_of(codes: list[int]) -> str:
-    """Return error codes as text in hexadecimal, as in CiA 301."""
+    """Return error codes as hexadecimal text."""
     return ", ".join(f"{code:#06x}" for code in codes) or "none"

@@ -8,9 +8,9 @@ from atalante_tools.conform import drive_commands as commands
 from atalante_tools.conform import drive_states as states
 from atalante_tools.conform import drive_torque as torques
 from atalante_tools.conform.axis import FOLLOW, LEGAL, ROUTES, STAY
-from atalante_tools.conform.bench import NodeTester
-from atalante_tools.conform.drive_commands import LATCHED, RIDDEN, UNKNOWN, ignores
+from atalante_tools.conform.drive_commands import LATCHED, TOLERATED, UNKNOWN, ignores
 from atalante_tools.conform.drive_states import STOP
+from atalante_tools.conform.node_tester import NodeTester
 from atalante_tools.conform.requirement import Requirement
 
 CIA402: Final = "IEC 61800-7-201"
@@ -100,10 +100,10 @@ def requirements(tester: NodeTester) -> list[Requirement]:
         ),
         Requirement(
             "DRIVE-12",
-            f"Repeats the last command for {RIDDEN} lost commands.",
-            f"{RIDDEN} cycles without command at {torque:g} Nm",
+            f"Repeats the last command for {TOLERATED} lost commands.",
+            f"{TOLERATED} cycles without command at {torque:g} Nm",
             "fault matrix F24",
-            commands.rides_through,
+            commands.tolerates_lost_commands,
         ),
         Requirement(
             "DRIVE-13",
@@ -152,7 +152,7 @@ def requirements(tester: NodeTester) -> list[Requirement]:
             "Ignores a different command with the counter of the last one, or latches the hold: it comes from another sender.",
             "2, then 10 commands with the counter of the last valid command",
             f"{E2E}, fault matrix F05, F51",
-            ignores(lambda axis, _: axis.bad_command(counter=axis.tester.command.counter), or_holds=True),
+            ignores(lambda axis, _: axis.bad_command(counter=axis.tester.command.counter), may_hold=True),
         ),
         Requirement(
             "DRIVE-20",

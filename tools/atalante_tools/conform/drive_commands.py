@@ -1,4 +1,7 @@
-"""Tests of a drive against defective, foreign and lost commands and lost SYNC: no effect at first, then the latched hold."""
+"""Tests of a drive with defective, foreign and lost commands, and with lost SYNC.
+
+A few such cycles must have no effect. More of them must latch the hold.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +25,15 @@ from atalante_tools.conform.axis import (
     state_of,
     torque_of,
 )
-from atalante_tools.conform.bench import NodeTester, NotTested
+from atalante_tools.conform.node_tester import NodeTester, NotTested
 from atalante_tools.conform.requirement import Outcome
 
 _S, _C = DriveState, Controlword
 
-#: Controlwords outside the DBC range: valid ones with the highest bit set, which a wrong mask would accept, and 0xFE.
+#: Controlwords outside the DBC range: four valid controlwords with the highest bit set, and 0xFE.
 UNKNOWN: Final = (0x82, 0x86, 0x87, 0x8F, 0xFE)
-#: Number of lost commands without effect, and number of lost commands after which the drive latches the hold.
-RIDDEN, LATCHED = 4, 5
+#: Number of consecutive lost commands that must have no effect, and number that must latch the hold.
+TOLERATED, LATCHED = 4, 5
 #: CiA 301 emergency code for loss of the HAL command (RPDO timeout).
 COMMAND_TIMEOUT: Final = 0x8250
 
@@ -55,7 +58,7 @@ def ignores_invalid_codes(tester: NodeTester) -> Outcome:
     for quantity in ("Controlword", "TargetTorque", "MaxTorque"):
         code = message.signal(axis.signal(quantity)).invalid_raw
         assert code is not None
-        # The target is above the limit, so a drive that accepts the invalid MaxTorque as a limit makes more torque.
+        # A drive that accepts an invalid MaxTorque as its limit would exceed the last valid limit.
         limit, target = tester.limits.torque / 3.0, tester.limits.torque
         received = axis.run(6, _C.ENABLE_OPERATION, 0.0, limit)[2 * SHOWN :]
         for _ in range(2):
@@ -67,12 +70,12 @@ def ignores_invalid_codes(tester: NodeTester) -> Outcome:
     return Outcome(passed, "; ".join(found))
 
 
-def ignores(bad: Callable[[Axis, int], Frames], *, or_holds: bool = False) -> Callable[[NodeTester], Outcome]:
-    """Return a test that two defective commands have no effect, and that ten of them in a row latch the hold.
+def ignores(bad: Callable[[Axis, int], Frames], *, may_hold: bool = False) -> Callable[[NodeTester], Outcome]:
+    """Return a test with defective commands: two must have no effect, ten consecutive ones must latch the hold.
 
     Args:
         bad: function that returns the defective command number `n` for an axis.
-        or_holds: True if the first two may also latch the hold.
+        may_hold: True if the first two may also latch the hold.
     """
 
     def test(tester: NodeTester) -> Outcome:
@@ -80,7 +83,7 @@ def ignores(bad: Callable[[Axis, int], Frames], *, or_holds: bool = False) -> Ca
         axis.enable()
         received = [frame for number in range(2) for frame in axis.send(bad(axis, number))]
         received += axis.run(2 * SHOWN, _C.ENABLE_OPERATION)
-        holds = [frame for frame in received if or_holds and state_of(frame) == _S.QUICK_STOP_ACTIVE]
+        holds = [frame for frame in received if may_hold and state_of(frame) == _S.QUICK_STOP_ACTIVE]
         others = [frame for frame in received if frame not in holds]
         most = torque_of(others)
         if abs(most) > NOISE or any(state_of(frame) != _S.OPERATION_ENABLED for frame in others) or not received:
@@ -89,8 +92,9 @@ def ignores(bad: Callable[[Axis, int], Frames], *, or_holds: bool = False) -> Ca
             return Outcome(True, f"{most:+.2f} Nm, {names_of(received)}")
         axis.run(4, _C.ENABLE_OPERATION)
         received = [frame for number in range(2 * LATCHED) for frame in axis.send(bad(axis, number))]
-        fed = all_in(received, _S.OPERATION_ENABLED)
-        return Outcome(not fed, f"{most:+.2f} Nm; {'reset the watchdog' if fed else 'latched without a valid command'}")
+        enabled = all_in(received, _S.OPERATION_ENABLED)
+        reaction = "reset the watchdog" if enabled else "latched without a valid command"
+        return Outcome(not enabled, f"{most:+.2f} Nm; {reaction}")
 
     return test
 
@@ -110,12 +114,12 @@ def ignores_a_jump(tester: NodeTester) -> Outcome:
 # -- loss of commands and SYNC ---------------------------------------------------------------------------------------------
 
 
-def rides_through(tester: NodeTester) -> Outcome:
-    """Test DRIVE-12: a few lost commands keep state and torque."""
+def tolerates_lost_commands(tester: NodeTester) -> Outcome:
+    """Test DRIVE-12: a few lost commands change neither state nor torque."""
     axis, target = Axis(tester), tester.limits.torque
     axis.enable()
     before = mean_torque(axis.run(12, _C.ENABLE_OPERATION, target)[2 * SHOWN :])
-    received = tester.states([frame for _ in range(RIDDEN) for frame in tester.cycle()])
+    received = tester.states([frame for _ in range(TOLERATED) for frame in tester.cycle()])
     received += axis.run(2 * SHOWN, _C.ENABLE_OPERATION, target)
     least = min((frame.values["Torque"] for frame in received), default=math.nan)
     passed = all_in(received, _S.OPERATION_ENABLED) and least >= before - NOISE
@@ -133,7 +137,7 @@ def latches(tester: NodeTester) -> Outcome:
 
 
 def releases_only_when_acknowledged(tester: NodeTester) -> Outcome:
-    """Test DRIVE-14: only QUICK_STOP and then ENABLE_OPERATION leave the latched hold."""
+    """Test DRIVE-14: the latched hold ends only on QUICK_STOP followed by ENABLE_OPERATION."""
     axis = Axis(tester)
     _latch(axis)
     for controlword in (_C.ENABLE_OPERATION, _C.SHUTDOWN, _C.SWITCH_ON, _C.FAULT_RESET, _C.ENABLE_OPERATION):
@@ -161,7 +165,7 @@ def reports_the_latch(tester: NodeTester) -> Outcome:
 
 
 def latches_without_sync(tester: NodeTester) -> Outcome:
-    """Test DRIVE-16: a short loss of SYNC has no effect, a long one latches the hold."""
+    """Test DRIVE-16: a short loss of SYNC has no effect, and a long loss of SYNC latches the hold."""
     axis = Axis(tester)
     axis.enable()
     for _ in range(3):
@@ -170,7 +174,7 @@ def latches_without_sync(tester: NodeTester) -> Outcome:
     for _ in range(20):
         tester.silent_cycle()
     long = axis.run(2 * SHOWN, _C.ENABLE_OPERATION)
-    # DRIVE-14 tests that the hold is latched.
+    # Only the state is tested here; DRIVE-14 tests that the hold is latched.
     passed = all_in(short, _S.OPERATION_ENABLED) and any(state_of(frame) == _S.QUICK_STOP_ACTIVE for frame in long)
     return Outcome(passed, f"after 3 ms {names_of(short)}, after 20 ms {names_of(long)}")
 
@@ -184,4 +188,4 @@ def _latch(axis: Axis) -> None:
     axis.enable()
     received = axis.tester.states(axis.tester.idle(4 * LATCHED))
     if not received or state_of(received[-1]) != _S.QUICK_STOP_ACTIVE:
-        raise NotTested("the drive does not latch the hold without commands; see DRIVE-13")
+        raise NotTested("the drive must latch the hold without commands, but it did not; see DRIVE-13")

@@ -21,18 +21,18 @@ from atalante_tools.conform.axis import (
     state_of,
     torque_of,
 )
-from atalante_tools.conform.bench import NodeTester, NotTested
 from atalante_tools.conform.frames import ReceivedFrame
+from atalante_tools.conform.node_tester import NodeTester, NotTested
 from atalante_tools.conform.requirement import Outcome
 from atalante_tools.conform.technician import Action
 
 _S, _C = DriveState, Controlword
 
-#: Largest number of cycles for a quick stop.
+#: Largest number of cycles from QUICK_STOP to QUICK STOP ACTIVE.
 STOP: Final = 5
-#: Largest movement of a joint on hold [rad].
-GIVE: Final = math.radians(1.0)
-#: CiA 301 class of emergency codes for temperature.
+#: Largest movement of a joint in QUICK STOP ACTIVE [rad].
+MOVEMENT: Final = math.radians(1.0)
+#: Class of the CiA 301 emergency codes for temperature.
 TEMPERATURE_CLASS: Final = 0x4000
 
 
@@ -43,7 +43,7 @@ def starts_disabled(tester: NodeTester) -> Outcome:
 
 
 def makes_legal_transitions(tester: NodeTester) -> Outcome:
-    """Test DRIVE-02: every transition of the standard is made."""
+    """Test DRIVE-02: the drive makes every transition of the standard."""
     axis, slowest, wrong = Axis(tester), 0, []
     for (state, controlword), (number, goal) in LEGAL.items():
         axis.go(state)
@@ -57,7 +57,7 @@ def makes_legal_transitions(tester: NodeTester) -> Outcome:
 
 
 def refuses_illegal_transitions(tester: NodeTester) -> Outcome:
-    """Test DRIVE-03: every other command leaves the state unchanged."""
+    """Test DRIVE-03: a command without a transition leaves the state unchanged."""
     axis, wrong, tried = Axis(tester), [], 0
     for state in ROUTES:
         axis.go(state)
@@ -81,16 +81,18 @@ def stops_quickly(tester: NodeTester) -> Outcome:
 
 
 def holds_its_position(tester: NodeTester) -> Outcome:
-    """Test DRIVE-05: the joint moves by at most `GIVE` in QUICK STOP ACTIVE."""
+    """Test DRIVE-05: the joint moves by at most `MOVEMENT` in QUICK STOP ACTIVE."""
     axis = Axis(tester)
     axis.enable()
     axis.run(10, _C.ENABLE_OPERATION, tester.limits.torque)
     if axis.follow(_C.QUICK_STOP, _S.QUICK_STOP_ACTIVE) is None:
-        raise NotTested("the drive cannot be brought to QUICK_STOP_ACTIVE; see DRIVE-02")
+        raise NotTested("the drive must reach QUICK_STOP_ACTIVE, but it did not; see DRIVE-02")
     received = axis.run(100, _C.QUICK_STOP)
     positions = [frame.values["Position"] / tester.robot.gear[axis.joint] for frame in received]
     moved = max(positions) - min(positions) if positions else math.inf
-    return Outcome(moved <= GIVE and all_in(received, _S.QUICK_STOP_ACTIVE), f"moved {math.degrees(moved):.2f} degrees")
+    return Outcome(
+        moved <= MOVEMENT and all_in(received, _S.QUICK_STOP_ACTIVE), f"moved {math.degrees(moved):.2f} degrees"
+    )
 
 
 def trips_when_hot(tester: NodeTester) -> Outcome:
@@ -119,7 +121,7 @@ def leaves_fault_when_reset(tester: NodeTester) -> Outcome:
     axis = Axis(tester)
     received = axis.run(SHOWN, _C.ENABLE_OPERATION)
     if not all_in(received[-1:], _S.FAULT):
-        raise NotTested("the drive is not in FAULT; see DRIVE-22")
+        raise NotTested(f"the drive must be in FAULT, got {names_of(received[-1:])}; see DRIVE-22")
     tester.technician.request(Action.COOL, tester.node.name)
     for controlword in Controlword:
         if controlword is not _C.FAULT_RESET:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_tools.conform.axis import NOISE, SHOWN, Axis, all_in, mean_torque, names_of, torque_of
-from atalante_tools.conform.bench import NodeTester
+from atalante_tools.conform.node_tester import NodeTester
 from atalante_tools.conform.requirement import Outcome
 
 _S, _C = DriveState, Controlword
 
 
 def makes_no_torque_disabled(tester: NodeTester) -> Outcome:
-    """Test DRIVE-06: no torque in any state below OPERATION ENABLED."""
+    """Test DRIVE-06: the drive makes no torque in any state below OPERATION ENABLED."""
     axis, most = Axis(tester), 0.0
     stay = {
         _S.SWITCH_ON_DISABLED: _C.DISABLE_VOLTAGE,
@@ -20,7 +20,7 @@ def makes_no_torque_disabled(tester: NodeTester) -> Outcome:
     }
     for state, controlword in stay.items():
         axis.go(state)
-        axis.run(3, controlword)  # lets the torque of a previous hold decay
+        axis.run(3, controlword)  # time for the torque of a previous hold to decay
         most = max(most, torque_of(axis.run(10, controlword, tester.limits.torque)), key=abs)
     return Outcome(abs(most) <= NOISE, f"at most {most:.2f} Nm")
 
@@ -38,7 +38,7 @@ def follows_torque(tester: NodeTester) -> Outcome:
 
 
 def respects_the_limit(tester: NodeTester) -> Outcome:
-    """Test DRIVE-08: the torque is limited to MaxTorque at the largest targets."""
+    """Test DRIVE-08: the torque stays within MaxTorque for the largest target torques."""
     axis, found, passed = Axis(tester), [], True
     target = tester.command.message.signal(axis.signal("TargetTorque"))
     axis.enable()
@@ -51,7 +51,7 @@ def respects_the_limit(tester: NodeTester) -> Outcome:
 
 
 def takes_the_largest_limit(tester: NodeTester) -> Outcome:
-    """Test DRIVE-09: the largest MaxTorque is accepted as a limit."""
+    """Test DRIVE-09: the drive accepts the largest MaxTorque of the DBC as its limit."""
     axis, target_torque = Axis(tester), tester.limits.torque
     axis.enable()
     usual = mean_torque(axis.run(12, _C.ENABLE_OPERATION, target_torque)[2 * SHOWN :])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from atalante_hal.wire.cia402 import Controlword
 from atalante_tools.conform import any_node, drive, drive_states, haptics, pendant, sensor
 from atalante_tools.conform.axis import Axis
-from atalante_tools.conform.bench import NodeTester
+from atalante_tools.conform.node_tester import NodeTester
 from atalante_tools.conform.requirement import Requirement
 
 _REQUIREMENTS = {
@@ -18,15 +18,18 @@ _REQUIREMENTS = {
 
 
 def requirements_of(tester: NodeTester) -> list[Requirement]:
-    """Return the requirements for the node under test, in test order: start-up and rest, kind of node, all received frames."""
+    """Return the requirements for the node under test, in the order of the tests.
+
+    The order is: start-up and rest, requirements for the kind of node, requirements for all received frames.
+    """
     before, after = any_node.requirements(tester)
     special = _REQUIREMENTS[tester.node.kind](tester)
-    # DRIVE-01 is about the state after start-up, so it comes before the first command.
+    # DRIVE-01 tests the state after start-up, so it is tested before the first command.
     early = 1 if tester.node.kind == "drive" else 0
     return [before[0], *special[:early], *before[1:], *special[early:], *after]
 
 
 def make_safe(tester: NodeTester) -> None:
-    """Bring a drive to QUICK STOP ACTIVE at the end of the examination; other nodes need no action."""
+    """Bring the drive under test to QUICK STOP ACTIVE; do nothing for other nodes."""
     if tester.node.kind == "drive":
         Axis(tester).run(drive_states.STOP, Controlword.QUICK_STOP)

@@ -1,4 +1,4 @@
-"""Frames of one message as sent by the node tester, valid or with one defect, and as received, with every defect recorded."""
+"""Sender of valid or defective test frames of one message, and receiver that records every defect of a frame."""
 
 from __future__ import annotations
 
@@ -76,28 +76,28 @@ class MessageSender:
 
     @property
     def counter(self) -> int:
-        """Return the alive counter of the last frame in sequence."""
+        """Return the alive counter of the last frame that was sent in sequence."""
         return self._counter
 
 
 @dataclass(frozen=True)
 class ReceivedFrame:
-    """Frame of the node under test. Defects are recorded and do not reject the frame."""
+    """Frame received from the node under test, with its defects. A defective frame is not rejected."""
 
     message: Message
-    cycle: int  # number of the cycle in which it was received
-    time: float  # s, receive time
+    cycle: int  # number of the cycle in which the frame was received
+    time: float  # receive time [s]
     length_valid: bool
     format_valid: bool  # CAN FD data frame with bit rate switch
     crc_valid: bool
     counter: int
     reserved_zero: bool
-    out_of_range: tuple[str, ...]  # signals out of range or with their invalid code
+    out_of_range: tuple[str, ...]  # signals with a value out of range or with the invalid code
     values: dict[str, float]  # physical values in DBC units; empty if the length is wrong
 
 
 class MessageReceiver:
-    """Receiver of one message."""
+    """Receiver and decoder of one message of the node under test."""
 
     def __init__(self, message: Message) -> None:
         self.message = message

@@ -1,4 +1,4 @@
-"""Requirements for the haptics node: each of its eight motors follows its level as a first-order lag, and stops on timeout."""
+"""Requirements for the haptics node: its eight motors follow their levels as first-order lags, and stop on timeout."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.wire.frame import Frames
-from atalante_tools.conform.bench import NodeTester, NotTested
 from atalante_tools.conform.frames import ReceivedFrame
+from atalante_tools.conform.node_tester import NodeTester, NotTested
 from atalante_tools.conform.requirement import Outcome, Requirement
 
 Vector = npt.NDArray[np.float64]
 
 E2E: Final = "AUTOSAR E2E Profile 5"
-#: Largest time constant [s].
+#: Largest time constant of a motor [s].
 TIME_CONSTANT = 0.06
-#: Largest deviation from a first-order lag, as a fraction of full amplitude.
+#: Largest deviation of the amplitude from a first-order lag, as a fraction of full amplitude.
 LAG = 0.05
-#: Number of cycles after which every motor has reached its level or stopped.
+#: Largest number of cycles for a motor to reach its level or to stop.
 _SETTLED: Final = 250
 #: Largest amplitude of a motor at rest, as a fraction of full amplitude.
 _STILL: Final = 0.02
@@ -106,13 +106,16 @@ def requirements(tester: NodeTester) -> list[Requirement]:
 
 
 def is_still(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-01: no amplitude without commands."""
+    """Test HAPTICS-01: the amplitude is 0 without commands."""
     most = _amplitudes(tester, tester.idle(50)).max()
     return Outcome(bool(most <= _STILL), f"amplitude {most:.3f} at most")
 
 
 def follows_like_a_lag(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-02: the remaining amplitude shrinks by the same factor from one state frame to the next."""
+    """Test HAPTICS-02: the amplitude approaches the level as a first-order lag.
+
+    The distance to the level shrinks by the same factor from one state frame to the next.
+    """
     _settle(tester, 0.0)
     remaining = 1.0 - _amplitudes(tester, _run(tester, _SETTLED, 1.0))
     period = tester.state_message.cycle_ms * 1e-3
@@ -131,7 +134,7 @@ def follows_like_a_lag(tester: NodeTester) -> Outcome:
 
 
 def reaches_both_ends(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-03: full amplitude at level 1, none at level 0."""
+    """Test HAPTICS-03: the amplitude is 1 at level 1, and 0 at level 0."""
     high = _amplitudes(tester, _run(tester, _SETTLED, 1.0))[-1].min()
     low = _amplitudes(tester, _run(tester, _SETTLED, 0.0))[-1].max()
     return Outcome(
@@ -152,7 +155,7 @@ def moves_one_motor(tester: NodeTester) -> Outcome:
 
 
 def stays_in_range(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-05: the amplitude stays at or below 1 for a level above the range."""
+    """Test HAPTICS-05: the amplitude is at most 1 for a level above the DBC range."""
     found, passed = [], True
     for code in (201, 230, 254):
         _settle(tester, 0.5)
@@ -212,7 +215,7 @@ def _run(tester: NodeTester, cycles: int, level: float, only: str | None = None)
 
 
 def _settle(tester: NodeTester, level: float, only: str | None = None) -> Vector:
-    """Command a level until every motor has reached it, for at most `_SETTLED` cycles; return the amplitudes.
+    """Command a level until every motor reaches it, for at most `_SETTLED` cycles; return the amplitudes.
 
     Args:
         tester: tester of the haptics node.

@@ -1,18 +1,18 @@
-"""Requirements for the pendant: one request per press, state of the dead-man switch, no request without a press."""
+"""Requirements for the pendant: requests on button presses, dead-man switch and assistance dial."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Final
 
-from atalante_tools.conform.bench import NodeTester, NotTested
 from atalante_tools.conform.frames import ReceivedFrame
+from atalante_tools.conform.node_tester import NodeTester, NotTested
 from atalante_tools.conform.requirement import Outcome, Requirement
 from atalante_tools.conform.technician import Action
 
 #: Values of `PENDANT_STATE.Request`.
 START, STOP, HOLD = 1, 2, 3
-#: Number of cycles after a press without another request.
+#: Number of cycles after a press in which the pendant must send no further request.
 _AFTER: Final = 50
 SOURCE: Final = "DBC PENDANT_STATE"
 
@@ -60,7 +60,7 @@ def requirements(_tester: NodeTester) -> list[Requirement]:
 
 
 def sends_no_request(tester: NodeTester) -> Outcome:
-    """Test PENDANT-01: the request counter does not change."""
+    """Test PENDANT-01: the request counter does not change without a press."""
     received = tester.states(tester.idle(200))
     counters = {int(frame.values["RequestCounter"]) for frame in received}
     return Outcome(len(counters) == 1, f"{len(counters) - 1} requests in {len(received)} frames")

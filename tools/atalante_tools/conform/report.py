@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from textwrap import wrap
 from typing import Any
 
-from atalante_tools.conform.bench import NodeTester
+from atalante_tools.conform.node_tester import NodeTester
 from atalante_tools.conform.requirement import Result, Verdict
 
 _WIDTH = 110
@@ -47,7 +47,7 @@ def entry(result: Result) -> str:
 
 
 def conclusion(tester: NodeTester, results: Sequence[Result]) -> str:
-    """Return the last line of the protocol: number of passed requirements, and ids of the others."""
+    """Return the last line of the protocol: the number of passed requirements, and the identifiers of all others."""
     counts = Counter(result.verdict for result in results)
     missed = [r.requirement.id for r in results if r.verdict is not Verdict.PASSED]
     text = f"{tester.node.name}: {counts[Verdict.PASSED]} of {len(results)} requirements passed"

@@ -1,4 +1,4 @@
-"""Requirements, and the examination that tests them one after the other and gives each a verdict."""
+"""Requirement for a node, and examination that tests the requirements in order and gives each a verdict."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from atalante_tools.conform.bench import NodeTester, NotTested
+from atalante_tools.conform.node_tester import NodeTester, NotTested
 
-#: Cycle delay [s]. After a longer delay, a failed test may be the fault of this computer, not of the node.
+#: Delay of a cycle above which this computer may be the cause of a failed test [s].
 LATE: Final = 2e-3
-#: Number of attempts for a test that fails after a longer delay.
+#: Number of attempts for a test that fails while this computer is late.
 ATTEMPTS: Final = 3
 
 
@@ -33,18 +33,18 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Requirement:
-    """One line of the acceptance protocol."""
+    """Required behaviour of a node, with the function that tests it."""
 
     id: str
     text: str  # required behaviour of the node
     how: str  # how it is tested
-    source: str  # document the requirement comes from
+    source: str  # document that contains the requirement
     test: Callable[[NodeTester], Outcome]
 
 
 @dataclass(frozen=True)
 class Result:
-    """Requirement with its verdict and the measured values."""
+    """Tested requirement with its verdict and the measured values."""
 
     requirement: Requirement
     verdict: Verdict
@@ -52,7 +52,7 @@ class Result:
 
 
 def examine(tester: NodeTester, requirements: Sequence[Requirement]) -> Iterator[Result]:
-    """Test the requirements in their order, from start-up on, and yield each result."""
+    """Test the requirements in the given order and yield each result."""
     for requirement in requirements:
         yield _result(tester, requirement)
 

@@ -1,4 +1,4 @@
-"""Requirements for sensors at rest: gravity and no motion for an IMU, no force for a foot in the air, no stuck signal."""
+"""Requirements for sensors at rest: an IMU measures only gravity, a foot in the air measures no force, no signal is stuck."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.types import PERIOD
-from atalante_tools.conform.bench import NodeTester, NotTested
+from atalante_tools.conform.node_tester import NodeTester, NotTested
 from atalante_tools.conform.requirement import Outcome, Requirement
 
 Vector = npt.NDArray[np.float64]
@@ -19,10 +19,10 @@ GRAVITY: Final = 9.81  # m/s2
 #: Number of cycles over which a sensor is measured.
 _MEASURED: Final = 100
 NORM: Final = 1e-3  # largest deviation of a quaternion from unit length
-SPECIFIC_FORCE: Final = 0.3  # m/s2, largest deviation of the mean acceleration from gravity
-TILT: Final = math.radians(3.0)  # rad, largest angle between measured gravity and the vertical of the attitude
-RATE: Final = 0.05  # rad/s, largest deviation of the mean gyro rate from the rate of change of the attitude
-UNLOADED: Final = 10.0  # N, largest mean force on an axis of a cell
+SPECIFIC_FORCE: Final = 0.3  # largest deviation of the mean acceleration from gravity [m/s2]
+TILT: Final = math.radians(3.0)  # largest angle between measured gravity and the vertical of the attitude [rad]
+RATE: Final = 0.05  # largest deviation of the mean gyro rate from the rate of the attitude [rad/s]
+UNLOADED: Final = 10.0  # largest mean force on an axis of an unloaded force cell [N]
 
 _VECTOR: Final = ("X", "Y", "Z")
 _AT_REST: Final = f"mean of {_MEASURED} ms at rest"
@@ -96,20 +96,20 @@ def foot_requirements(tester: NodeTester) -> list[Requirement]:
 
 
 def sends_unit_quaternions(tester: NodeTester) -> Outcome:
-    """Test IMU-01: quaternions have unit length."""
+    """Test IMU-01: the quaternions have unit length."""
     norms = np.linalg.norm(_vectors(tester, "Quaternion", ("W", *_VECTOR)), axis=1)
     worst = float(norms[np.argmax(np.abs(norms - 1.0))])
     return Outcome(abs(worst - 1.0) <= NORM, f"worst norm {worst:.4f}")
 
 
 def measures_gravity(tester: NodeTester) -> Outcome:
-    """Test IMU-02: the mean acceleration equals gravity."""
+    """Test IMU-02: the magnitude of the mean acceleration equals gravity."""
     measured = float(np.linalg.norm(_vectors(tester, "Accel", _VECTOR).mean(axis=0)))
     return Outcome(abs(measured - GRAVITY) <= SPECIFIC_FORCE, f"{measured:.2f} m/s2")
 
 
 def agrees_with_gravity(tester: NodeTester) -> Outcome:
-    """Test IMU-03: the attitude turns the mean acceleration into the vertical."""
+    """Test IMU-03: the mean acceleration is vertical after rotation by the measured attitude."""
     measured = _signals(
         tester, [f"Quaternion{axis}" for axis in ("W", *_VECTOR)] + [f"Accel{axis}" for axis in _VECTOR]
     )
@@ -130,14 +130,14 @@ def agrees_with_attitude(tester: NodeTester) -> Outcome:
     measured = _signals(tester, [f"Quaternion{axis}" for axis in ("W", *_VECTOR)] + [f"Gyro{axis}" for axis in _VECTOR])
     (w0, *v0), (w1, *v1) = measured[0, :4].tolist(), measured[-1, :4].tolist()
     first, last = np.array(v0), np.array(v1)
-    # Vector part of q0* q1: half the rotation vector between the two attitudes in the sensor frame, for small angles.
+    # For small angles, the vector part of conj(q0) q1 is half the rotation vector in the sensor frame.
     turned = 2.0 * (w0 * last - w1 * first - np.cross(first, last))
     deviation = np.abs(measured[:, 4:].mean(axis=0) - turned / max(1, len(measured) - 1) / PERIOD).max()
     return Outcome(bool(deviation <= RATE), f"deviation at most {deviation:.4f} rad/s")
 
 
 def _changes(*vectors: str) -> Callable[[NodeTester], Outcome]:
-    """Return a test that every axis of the named vectors changes."""
+    """Return a test which requires that no axis of the named vectors is constant."""
     names = [f"{vector}{axis}" for vector in vectors for axis in _VECTOR]
 
     def test(tester: NodeTester) -> Outcome:
@@ -149,7 +149,7 @@ def _changes(*vectors: str) -> Callable[[NodeTester], Outcome]:
 
 
 def _has_no_error(name: str) -> Callable[[NodeTester], Outcome]:
-    """Return a test that the state signal `name` is 0 in every frame."""
+    """Return a test which requires that the state signal `name` is 0 in every frame."""
 
     def test(tester: NodeTester) -> Outcome:
         signal = tester.state_message.signal(name)
@@ -160,7 +160,7 @@ def _has_no_error(name: str) -> Callable[[NodeTester], Outcome]:
 
 
 def _is_unloaded(cells: Sequence[str]) -> Callable[[NodeTester], Outcome]:
-    """Return a test that the mean force of every axis of the cells is small."""
+    """Return a test which requires that the mean force on every axis of the cells is at most `UNLOADED`."""
     names = [f"{cell}_Force{axis}" for cell in cells for axis in _VECTOR]
 
     def test(tester: NodeTester) -> Outcome:
@@ -176,7 +176,7 @@ def _vectors(tester: NodeTester, vector: str, axes: Sequence[str]) -> Vector:
 
 
 def _signals(tester: NodeTester, names: Sequence[str]) -> Vector:
-    """Return signals of the state frames over `_MEASURED` cycles. Shape (frames, names)."""
+    """Return the named signals of the state frames in `_MEASURED` cycles. Shape (frames, names)."""
     received = tester.states(tester.idle(_MEASURED))
     if not received:
         raise NotTested("no state frame received")

@@ -1,4 +1,4 @@
-"""Manual actions on the node that no frame can cause: power-up, overheating, buttons."""
+"""Manual actions on the node under test, such as power-up, overheating and button presses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Action(Enum):
-    """Manual action; the value is the instruction for a person."""
+    """Manual action on the node. The value is the instruction for the technician."""
 
     POWER_UP = "switch {node} off and on again"
     OVERHEAT = "set the temperature input of {node} to its trip level"
@@ -28,18 +28,18 @@ class Action(Enum):
 
 
 class Technician(Protocol):
-    """Executor of manual actions, immediately or within `patience`."""
+    """Person or program that carries out manual actions on the node."""
 
-    patience: float  # s, time to wait for the effect of an action
+    patience: float  # longest wait for the effect of an action [s]
     fresh: bool  # True: the node was switched on at the start of the examination
-    certain: bool  # True: the action is carried out even if no effect is measured
+    certain: bool  # True: every requested action is carried out; False: a person may have ignored the request
 
     def request(self, action: Action, node: str) -> None:
-        """Carry the action out, or ask for it."""
+        """Carry out the action, or ask a person for it."""
 
 
 class HumanTechnician:
-    """Person beside the node, asked on the terminal."""
+    """Person beside the node, who gets instructions on the terminal."""
 
     def __init__(self, patience: float) -> None:
         self.patience = patience
@@ -47,12 +47,12 @@ class HumanTechnician:
         self.certain = False
 
     def request(self, action: Action, node: str) -> None:
-        """Ask for the action on stderr."""
+        """Print the instruction for the action on stderr."""
         say(f"please {action.value.format(node=node)}  (waiting {self.patience:.0f} s)")
 
 
 class EmulatorTechnician:
-    """Executor of manual actions on an emulated robot in this process, started for this examination."""
+    """Program that carries out manual actions on an emulated robot, which starts with the examination."""
 
     def __init__(self, emulator: Emulator, operator: Operator) -> None:
         self._emulator, self._operator = emulator, operator
@@ -61,11 +61,11 @@ class EmulatorTechnician:
         self.certain = True
 
     def request(self, action: Action, node: str) -> None:
-        """Carry the action out immediately."""
+        """Carry out the action immediately."""
         operator = self._operator
         match action:
             case Action.POWER_UP:
-                pass  # the emulator was started for this examination
+                pass  # the emulated node was switched on at the start of the examination
             case Action.OVERHEAT | Action.COOL:
                 drive = [joint.upper() for joint in JOINTS].index(node)
                 self._emulator.drives.heat(drive, 150.0 if action is Action.OVERHEAT else 25.0)

@@ -47,7 +47,7 @@ def must_respond(state: int, controlword: int) -> bool:
 
 @dataclass
 class _Drive:
-    """Drive with its messages, and with its state and command at the end of the last chunk."""
+    """Drive with its messages, and with its last state and command in the log so far."""
 
     row: int  # row of the state message
     command_row: int  # row of the command message; -1: the DBC has no command for the drive
@@ -65,7 +65,7 @@ class DriveRules:
         self._plan, self._findings = plan, findings
         self._limit_ns = project.number("cia402-response", "limit_ms") * 1e6
         state, command = project.text("cia402-transition", "state"), project.text("cia402-response", "command")
-        #: Drives with equal state messages, by the first row of their family.
+        #: Drives of each family of state messages, by the first row of the family.
         self.drives: dict[int, list[_Drive]] = {}
         for family in plan.families:
             index = next((p for p, f in enumerate(family.codec.fields) if f.name == state), None)

@@ -121,7 +121,7 @@ class _Velocity:
             return
         ends = np.arange(windows + 1) * width
         duration = np.diff(stamps[ends]) * 1e-9
-        # A frame has the velocity since the previous frame, so the mean excludes the first frame of each window.
+        # The first velocity in a window covers the time before the window, so the mean excludes it.
         inside = velocity[1 : whole + 1].reshape(windows, width)
         mean = inside.mean(axis=1)
         moved = np.diff(position[ends]) / np.where(duration > 0, duration, np.inf)

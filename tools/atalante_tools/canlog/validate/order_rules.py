@@ -21,7 +21,7 @@ SYNC = "SYNC"
 
 @dataclass
 class _Bus:
-    """Bus with a SYNC message, and its last cycles at the end of the last chunk."""
+    """Bus with a SYNC message, with the state of its order check after the last chunk."""
 
     sync: int  # row of the SYNC message
     states: list[int]  # rows of the state messages

@@ -132,7 +132,7 @@ class Plan:
         return rows
 
     def rows_in_other_format(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
-        """Return the row of the same identifier in the other format (11 or 29 bits); `UNKNOWN` without one. Shape (n,)."""
+        """Return the row of the same number in the other identifier format (11 or 29 bits), or `UNKNOWN`. Shape (n,)."""
         numbers = can_ids & np.uint32(_ALL_BITS)
         short = self._standard[np.where(numbers < _STANDARD, numbers, 0)]
         short[numbers >= _STANDARD] = UNKNOWN

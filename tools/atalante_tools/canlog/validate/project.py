@@ -1,4 +1,4 @@
-"""Rules file of a project (TOML): thresholds, silenced rules with a reason, and the buses of channels.
+"""Rules file of a project (TOML): thresholds, silenced rules with a reason, and the bus of each channel.
 
 The loader rejects unknown keys and values of the wrong type.
 

@@ -14,7 +14,7 @@ from atalante_tools.canlog.validate.project import Silence
 from atalante_tools.canlog.validate.rules import RULE_OF, RULES
 from atalante_tools.console.terminal import table
 
-#: Maximum number of names per reason in the text report; the HTML report lists all names.
+#: Maximum number of unchecked items per reason in the text report. The HTML report lists all of them.
 _NAMES = 12
 
 

@@ -1,4 +1,4 @@
-"""Node tester: takes the role of the HAL for one node, cycle by cycle: `SYNC -> answer of the node -> command`.
+"""Node tester, which replaces the HAL for one node. Each cycle is `SYNC -> answer of the node -> command`.
 
 Every frame of the node is recorded. The same examination runs on a real bus in real time, and on the emulator in this
 process in lock-step.
@@ -23,7 +23,7 @@ from atalante_tools.console.outcome import Failed
 if TYPE_CHECKING:
     from atalante_emulator.emulator import Emulator
 
-#: Largest number of frames of one `receive`.
+#: Largest number of frames that one `receive` call returns.
 _RECEIVE_BUDGET: Final = 128
 #: Longest wait for the answer of the node before the command is sent [s].
 _PATIENCE: Final = 0.6e-3
@@ -32,13 +32,13 @@ _LISTEN: Final = 0.2
 
 
 class NotTested(Exception):  # noqa: N818
-    """Requirement could not be tested; the message gives the reason."""
+    """Raised if a requirement cannot be tested. The message gives the reason."""
 
 
 class Clock(Protocol):
     """Clock that starts the cycles."""
 
-    delay: float  # s, longest delay of a cycle since the last reset to 0, caused by this computer
+    delay: float  # longest delay of a cycle start by this computer since the last reset to 0 [s]
 
     def next_cycle(self, *, sync: bool, listen: Callable[[float], None]) -> None:
         """Wait for the start of the next cycle.
@@ -58,7 +58,10 @@ class Clock(Protocol):
 
 
 class LockStep:
-    """Lock-step clock: the emulated node answers without delay. Cycles without SYNC advance it as in `Emulator.run`."""
+    """Lock-step clock for an emulated node, which answers without delay.
+
+    Cycles without SYNC advance the emulated node as in `Emulator.run`.
+    """
 
     def __init__(self, emulator: Emulator) -> None:
         from atalante_emulator.drive import WATCHDOG
@@ -69,7 +72,7 @@ class LockStep:
         self._silent = 0
 
     def next_cycle(self, *, sync: bool, listen: Callable[[float], None]) -> None:
-        """Advance the emulated node if SYNC is missing; do not wait."""
+        """Start the next cycle immediately. Advance the emulated node if SYNC has been missing for several cycles."""
         self._silent = 0 if sync else self._silent + 1
         if self._silent >= self._watchdog:
             self._emulator.idle()
@@ -80,7 +83,7 @@ class LockStep:
 
 
 class WallClock:
-    """Real-time clock at 1 kHz with absolute deadlines. Missed cycles are skipped, because catching up would send SYNC bursts."""
+    """Real-time clock at 1 kHz with absolute deadlines. Missed cycles are skipped to avoid bursts of SYNC frames."""
 
     def __init__(self) -> None:
         self.delay = 0.0
@@ -91,7 +94,7 @@ class WallClock:
         self._deadline += PERIOD
         while (left := self._deadline - time.monotonic()) > 0.0:
             listen(left)
-        listen(0.0)  # after a late wake-up, frames received before this SYNC are not answers to it
+        listen(0.0)  # after a late wake-up, record the frames that arrived before the next SYNC
         delay = -left
         self.delay = max(self.delay, delay)
         if delay > PERIOD:
@@ -106,7 +109,7 @@ class WallClock:
 class Limits:
     """Limits of the commands to the node."""
 
-    torque: float = 3.0  # Nm, largest torque commanded to a drive
+    torque: float = 3.0  # largest torque commanded to a drive [Nm]
 
 
 class NodeTester:
@@ -149,7 +152,7 @@ class NodeTester:
 
     @property
     def command(self) -> MessageSender:
-        """Return the sender of the HAL's command to this node."""
+        """Return the sender of the command message for this node."""
         assert self._command is not None, f"{self.node.name} receives no command"
         return self._command
 
@@ -220,7 +223,7 @@ class NodeTester:
         return self.sync.frame(cycle, counter=counter, length=length, classic=classic, flip=flip)
 
     def _send(self, frames: Frames) -> None:
-        # The same array for every batch of this length, because a bus caches the memory address of each array.
+        # A bus caches the memory address of each array, so all batches of one length share one array.
         outbox = self._outboxes.setdefault(len(frames), new_frames(len(frames)))
         as_words(outbox)[:] = as_words(frames)
         try:
@@ -263,13 +266,13 @@ class NodeTester:
         return self.received[first:]
 
     def states(self, received: list[ReceivedFrame]) -> list[ReceivedFrame]:
-        """Return the state frames with valid length among `received`."""
+        """Return the received state frames with valid length."""
         return [frame for frame in received if frame.message is self.state_message and frame.values]
 
     def run_until(
         self, shows: Callable[[list[ReceivedFrame]], bool], cycle: Callable[[], list[ReceivedFrame]] | None = None
     ) -> bool:
-        """Run cycles until a condition holds; return False if it does not hold within the patience of the technician.
+        """Run cycles until a condition holds. Return False if the patience of the technician ends first.
 
         Args:
             shows: condition on the frames received in a cycle.
