@@ -74,8 +74,7 @@ class Heartbeats:
         self._seen = 0  # cycle up to which the ages of the process image are counted
         #: Node -> diagnostic and error code of its last emergency, until the error is cleared.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
-        #: Nodes whose emergency was cleared in this cycle. Their state frame of the same cycle may still report FAULT.
-        self.cleared: set[str] = set()
+        self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
         #: Emergencies since the last `judge` whose reaction is INFO: node, diagnostic, error code.
         self._notices: list[tuple[str, Dtc, int]] = []
         self._reset: set[str] = set()  # nodes that restarted since the last `judge`
@@ -159,6 +158,16 @@ class Heartbeats:
         """
         self.emergencies = {node: said for node, said in self.emergencies.items() if node in still_faulty}
 
+    def explains_fault(self, node: str) -> bool:
+        """Return whether an emergency explains the drive state FAULT of a node in this cycle.
+
+        The emergency is active, or it was cleared in this cycle, in which the state frame may still report FAULT.
+
+        Args:
+            node: DBC name of the drive.
+        """
+        return node in self.emergencies or node in self._cleared
+
     def missing(self) -> set[str]:
         """Return the required nodes that have sent no status message, and the nodes that use a different DBC."""
         values = self.image.values
@@ -168,7 +177,7 @@ class Heartbeats:
 
     def _age(self, cycle: int) -> None:
         if cycle != self._seen:
-            self.cleared.clear()
+            self._cleared.clear()
             refused = self.image.refused
             self.image.new_cycle(cycle - self._seen)
             self.image.refused = refused
@@ -208,7 +217,7 @@ class Heartbeats:
         self.quiet = False
         if dtc is None:
             if self.emergencies.pop(node, None) is not None:
-                self.cleared.add(node)
+                self._cleared.add(node)
         elif dtc.reaction is Reaction.INFO:
             self._notices.append((node, dtc, code))
         else:

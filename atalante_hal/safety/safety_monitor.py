@@ -16,27 +16,22 @@ import numpy as np
 from atalante_dbc import Network
 from atalante_hal.pendant import Pendant
 from atalante_hal.robot import JOINTS, Robot
-from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction, worst
+from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction
 from atalante_hal.safety.events import Event
 from atalante_hal.safety.fault_memory import FaultMemory
 from atalante_hal.safety.heartbeats import Heartbeats
 from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.message_monitor import MessageMonitor
 from atalante_hal.safety.plausibility import Plausibility
-from atalante_hal.safety.start import refusal
+from atalante_hal.safety.start import ENABLE_CYCLES, Refusal, StartRequest, refusal, stop_text
 from atalante_hal.safety.state_machine import MOVING, Conditions, next_state
 from atalante_hal.types import PERIOD, State, SupervisorState, Vector
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Time from START within which all drives must reach OPERATION ENABLED [cycles].
-ENABLE_CYCLES = 200
 #: Maximum duration of FINISH_STEP [cycles]; longer than a step.
 FINISH_STEP_CYCLES = 2000
-
-#: Prefix of `SafetyMonitor.reason` after a refused START, until the state changes.
-REFUSED = "START refused: "
 
 #: DBC names of the drives, in joint order.
 DRIVE_NODES = tuple(joint.upper() for joint in JOINTS)
@@ -246,8 +241,7 @@ class SafetyMonitor:
         for node, drive in zip(DRIVE_NODES, state.drive_state.tolist(), strict=True):
             if drive in _FAULTY:
                 # If the drive sent an emergency, the reaction follows from the emergency and not from the drive state.
-                explained = node in self._heartbeats.emergencies or node in self._heartbeats.cleared
-                if not explained and (nodes_well or state.supervisor is not _S.OFF):
+                if not self._heartbeats.explains_fault(node) and (nodes_well or state.supervisor is not _S.OFF):
                     memory.raise_dtc(state.cycle, Dtc.DRIVE_FAULT, node, value=drive)
             elif drive != DriveState.OPERATION_ENABLED and self.moving:
                 memory.raise_dtc(state.cycle, Dtc.DRIVE_STATE, node, value=drive)
@@ -282,48 +276,38 @@ class SafetyMonitor:
             self._heartbeats.acknowledge(faulty)
             self._acknowledged = True
             self.start_wanted = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
-            if state.supervisor is _S.OFF and self.hindered:
-                self._refuse_start(self.memory.text_of(self.memory.worst()))
         elif self.start_wanted:
             self.start_wanted -= 1
-            if hindrance := self._hindrance(nodes_well):
-                self._refuse_start(hindrance)
-            elif not self.start_wanted:
-                self._end_start("START_FAILED", f"the drives were not enabled within {ENABLE_CYCLES} cycles", "error")
-        if self.start_wanted and state.supervisor in (_S.READY, _S.HOLD):
-            implausible = refusal(self._robot, state.drive_state, state.torque)
-            if implausible is not None:
-                self._refuse_start(implausible)
+        else:
+            return
+        if ended := refusal(self._robot, self._start_request(nodes_well)):
+            self._end_start(ended)
 
     @property
     def hindered(self) -> bool:
         """Return whether a confirmed diagnostic prevents the drives from being enabled."""
-        return worst(self.memory.confirmed) is not Reaction.INFO
+        return bool(self.memory.worst())
 
-    def _hindrance(self, nodes_well: bool) -> str:
-        """Return the reason why the START being processed must be refused, one sentence; empty if it may continue.
+    def _start_request(self, nodes_well: bool) -> StartRequest:
+        state, pendant = self._state, self._pendant
+        return StartRequest(
+            supervisor=state.supervisor,
+            pressed=self._acknowledged,
+            cycles_left=self.start_wanted,
+            ending=self._ending,
+            stop_requested=pendant.stop_requested,
+            dead_man=pendant.dead_man,
+            diagnostic=self.memory.text_of(self.memory.worst()),
+            nodes_well=nodes_well,
+            missing=self.missing(),
+            drive_state=state.drive_state,
+            torque=state.torque,
+        )
 
-        Args:
-            nodes_well: True if every required node is trusted and has sent a status message.
-        """
-        pendant = self._pendant
-        if self._ending:
-            return "the program is ending"
-        if pendant.stop_requested or not pendant.dead_man:
-            return _WORDS[pendant.stop_requested]
-        if self._state.supervisor in (_S.LOWER, _S.FAULT):
-            return ""  # START acknowledges the fault, which may take some cycles to clear
-        if self.hindered:
-            return self.memory.text_of(self.memory.worst())
-        return "" if nodes_well else f"not heard or not trusted yet: {', '.join(sorted(self.missing()))}"
-
-    def _refuse_start(self, why: str) -> None:
+    def _end_start(self, ended: Refusal) -> None:
         self.start_wanted = 0
-        self._end_start("START_REFUSED", REFUSED + why, "warning")
-
-    def _end_start(self, code: str, text: str, severity: str) -> None:
-        self.memory.events.append(Event(self._state.cycle, code, text, severity))
-        self.reason = text
+        self.memory.events.append(Event(self._state.cycle, ended.code, ended.text, ended.severity))
+        self.reason = ended.text
 
     def _enter(self, before: SupervisorState, after: SupervisorState, reasons: frozenset[Dtc]) -> None:
         state, memory = self._state, self.memory
@@ -333,7 +317,7 @@ class SafetyMonitor:
         self._pendant.forget_press()
         self.moving = after in MOVING
         if Dtc.OPERATOR_STOP in reasons:
-            text = "the program is ending" if self._ending else _WORDS[self._pendant.stop_requested]
+            text = "the program is ending" if self._ending else stop_text(self._pendant.stop_requested)
             memory.raise_dtc(state.cycle, Dtc.OPERATOR_STOP, "PENDANT", text=text)
         if reasons:
             self.reason = memory.text_of(reasons) or self.reason
@@ -367,7 +351,3 @@ class SafetyMonitor:
             self.lowered.update(node for node in self.memory.nodes_of(lower) if node in DRIVE_NODES)
         else:
             self.lowered.clear()
-
-
-#: Reason of an operator stop, indexed by whether STOP or HOLD was requested.
-_WORDS = ("the dead-man was released or the pendant is lost", "the operator asked to stop")

@@ -1,20 +1,32 @@
-"""Start check: the drives may be enabled only if each reported torque is plausible in the state of its drive.
+"""Refusal of a START: one pure function decides in each cycle whether the drives may be enabled.
 
-    drive state, reported torque -> refusal -> safety monitor, event START_REFUSED
+    pendant, diagnostics, nodes, drive state, reported torque -> refusal -> safety monitor, event START_REFUSED or START_FAILED
 
-At a start the HAL first commands the torque that the drives report, so that no joint sags. Without this check it would also
-command a torque that a drive cannot produce.
+At a start the HAL first commands the torque that the drives report, so that no joint sags. Without the check of the reported
+torques it would also command a torque that a drive cannot produce.
 """
 
 from __future__ import annotations
+
+from collections.abc import Collection
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.types import SupervisorState, Vector
 from atalante_hal.wire.cia402 import DriveState
-from atalante_hal.wire.codec import Vector
 
+#: Time from START within which all drives must reach OPERATION ENABLED [cycles].
+ENABLE_CYCLES = 200
+#: Prefix of the text of a refused START.
+REFUSED = "START refused: "
+_S = SupervisorState
+#: States in which START only acknowledges faults, which may take some cycles to clear.
+_ACKNOWLEDGING = (_S.LOWER, _S.FAULT)
+#: States in which START enables the drives.
+_ENABLING = (_S.READY, _S.HOLD)
 #: States in which a drive produces torque. In all other states it can at most brake.
 POWERED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 _NAMES = {float(state): state.name for state in DriveState}
@@ -32,8 +44,75 @@ def powered(drive_state: Vector) -> npt.NDArray[np.bool_]:
     return np.isin(drive_state, POWERED)
 
 
-def refusal(robot: Robot, drive_state: Vector, torque: Vector) -> str | None:
-    """Return the reason why the drives must not be enabled; None if they may be enabled.
+class StartRequest(NamedTuple):
+    """Conditions of a START in one cycle, as the safety monitor has evaluated them."""
+
+    supervisor: SupervisorState  # state of the state machine
+    pressed: bool  # True in the cycle in which START is pressed, False while the drives are being enabled
+    cycles_left: int  # cycles left in which the drives must be enabled
+    ending: bool  # True if the program is ending
+    stop_requested: bool  # True if the operator requests STOP or HOLD
+    dead_man: bool  # True if the dead-man is pressed and the pendant has not timed out
+    diagnostic: str  # text of the worst confirmed diagnostic that demands a reaction; empty: none
+    nodes_well: bool  # True if every required node is trusted and has sent its status
+    missing: Collection[str]  # DBC names of the nodes that are not well
+    drive_state: Vector  # (12,) values of `DriveState`
+    torque: Vector  # (12,) Nm, torque reported by each drive
+
+
+class Refusal(NamedTuple):
+    """Event that ends a START."""
+
+    code: str  # START_REFUSED, or START_FAILED if the drives were not enabled in time
+    severity: str  # one of `events.SEVERITIES`
+    text: str  # one sentence for the operator
+
+
+def refusal(robot: Robot, request: StartRequest) -> Refusal | None:
+    """Return why a START must end in this cycle; None if it may continue.
+
+    In the cycle in which START is pressed, diagnostics count only in OFF, because START may just have acknowledged them.
+
+    Args:
+        robot: source of the torque limits and of the torque that an idle drive may report.
+        request: conditions of the START in this cycle.
+    """
+    if request.pressed:
+        reason = request.diagnostic if request.supervisor is _S.OFF else ""
+    else:
+        reason = _reason(request)
+        if not (reason or request.cycles_left):
+            text = f"the drives were not enabled within {ENABLE_CYCLES} cycles"
+            return Refusal("START_FAILED", "error", text)
+    if not reason and request.supervisor in _ENABLING:
+        reason = implausible_torque(robot, request.drive_state, request.torque) or ""
+    return Refusal("START_REFUSED", "warning", REFUSED + reason) if reason else None
+
+
+def _reason(request: StartRequest) -> str:
+    """Return why the drives must not be enabled further, apart from their torques; empty if they may."""
+    if request.ending:
+        return "the program is ending"
+    if request.stop_requested or not request.dead_man:
+        return stop_text(request.stop_requested)
+    if request.supervisor in _ACKNOWLEDGING:
+        return ""
+    if request.diagnostic or request.nodes_well:
+        return request.diagnostic
+    return f"not heard or not trusted yet: {', '.join(sorted(request.missing))}"
+
+
+def stop_text(stop_requested: bool) -> str:
+    """Return the reason of an operator stop, one sentence.
+
+    Args:
+        stop_requested: True if STOP or HOLD was requested, False if the dead-man is not pressed.
+    """
+    return "the operator asked to stop" if stop_requested else "the dead-man was released or the pendant is lost"
+
+
+def implausible_torque(robot: Robot, drive_state: Vector, torque: Vector) -> str | None:
+    """Return which drive reports a torque that is impossible in its state; None if all torques are plausible.
 
     Args:
         robot: source of the torque limits and of the torque that an idle drive may report.

@@ -326,15 +326,17 @@ def test_a_node_that_booted_is_listed_until_the_reader_clears_it(well: Nodes):
     assert well.heartbeats.booted == {"LEFT_SK"}
 
 
-def test_a_cleared_emergency_is_known_for_the_cycle_in_which_it_was_cleared(well: Nodes):
+def test_an_emergency_explains_a_fault_until_the_cycle_in_which_it_is_cleared(well: Nodes):
+    assert not well.heartbeats.explains_fault("LEFT_SK")
     well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0x7305))
     well.judge()
-    assert well.heartbeats.cleared == set()
+    assert well.heartbeats.explains_fault("LEFT_SK")
+    assert not well.heartbeats.explains_fault("LEFT_SA")
     well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0))
     well.judge()
-    assert well.heartbeats.cleared == {"LEFT_SK"}
+    assert well.heartbeats.explains_fault("LEFT_SK")
     well.now += 1
     well.judge()
-    assert well.heartbeats.cleared == set()
+    assert not well.heartbeats.explains_fault("LEFT_SK")
     well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0))
-    assert well.heartbeats.cleared == set(), "nothing was there to be cleared"
+    assert not well.heartbeats.explains_fault("LEFT_SK"), "no emergency was active"

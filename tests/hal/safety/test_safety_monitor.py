@@ -12,7 +12,8 @@ from atalante_dbc import Message, load
 from atalante_hal.hal import SATURATED_CYCLES
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.limiter import Limited
-from atalante_hal.safety.safety_monitor import ENABLE_CYCLES, FINISH_STEP_CYCLES
+from atalante_hal.safety.safety_monitor import FINISH_STEP_CYCLES
+from atalante_hal.safety.start import ENABLE_CYCLES
 from atalante_hal.types import PERIOD, SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.e2e import crc, data_id_bytes

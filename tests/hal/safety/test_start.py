@@ -7,7 +7,7 @@ import pytest
 
 from atalante_hal.robot import JOINTS, load_robot
 from atalante_hal.safety.diagnostics import Dtc
-from atalante_hal.safety.start import powered, refusal
+from atalante_hal.safety.start import REFUSED, StartRequest, implausible_torque, powered, refusal
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
 
@@ -28,9 +28,9 @@ def test_the_torque_a_drive_may_report_depends_on_its_state(state: DriveState, j
     most = (ROBOT.torque_max[joint] if on else 0.0) + IDLE
     torque = np.zeros(12)
     torque[joint] = sign * most
-    assert refusal(ROBOT, states, torque) is None
+    assert implausible_torque(ROBOT, states, torque) is None
     torque[joint] = sign * np.nextafter(most, np.inf)
-    why = refusal(ROBOT, states, torque)
+    why = implausible_torque(ROBOT, states, torque)
     assert why is not None
     limit = f"its limit of {ROBOT.torque_max[joint]:.0f} Nm" if on else "2 Nm, it makes no torque"
     assert why == f"the drive of {JOINTS[joint]} reports {sign * most:.0f} Nm in {state.name}; must be within {limit}"
@@ -38,14 +38,84 @@ def test_the_torque_a_drive_may_report_depends_on_its_state(state: DriveState, j
 
 @pytest.mark.parametrize("torque", [np.nan, np.inf, -np.inf])
 def test_a_torque_that_is_no_number_is_refused(torque: float):
-    why = refusal(ROBOT, np.full(12, float(D.OPERATION_ENABLED)), np.full(12, torque))
+    why = implausible_torque(ROBOT, np.full(12, float(D.OPERATION_ENABLED)), np.full(12, torque))
     assert why is not None
     assert "left_FH" in why
 
 
 def test_an_unknown_state_makes_no_torque():
-    why = refusal(ROBOT, np.full(12, 99.0), np.full(12, 3.0))
+    why = implausible_torque(ROBOT, np.full(12, 99.0), np.full(12, 3.0))
     assert why == "the drive of left_FH reports 3 Nm in state 99; must be within 2 Nm, it makes no torque"
+
+
+OFF_TORQUE = np.full(12, 3.0)  # Nm, more than a drive without power may report
+ENABLING = StartRequest(
+    supervisor=S.READY,
+    pressed=False,
+    cycles_left=100,
+    ending=False,
+    stop_requested=False,
+    dead_man=True,
+    diagnostic="",
+    nodes_well=True,
+    missing=(),
+    drive_state=np.full(12, float(D.SWITCH_ON_DISABLED)),
+    torque=np.zeros(12),
+)
+PRESSED = ENABLING._replace(pressed=True, cycles_left=200)
+ILL = {"diagnostic": "an encoder is stuck"}
+UNWELL = {"nodes_well": False, "missing": {"LEFT_SK", "IMU_TORSO"}}
+STOP, RELEASED = "the operator asked to stop", "the dead-man was released or the pendant is lost"
+FAILED = "the drives were not enabled within 200 cycles"
+TORQUE = "the drive of left_FH reports 3 Nm in SWITCH_ON_DISABLED; must be within 2 Nm, it makes no torque"
+
+
+@pytest.mark.parametrize(
+    ("request_", "changes", "reason"),
+    [
+        # While the drives are being enabled, in order of precedence.
+        (ENABLING, {}, None),
+        (ENABLING, {"ending": True, "stop_requested": True}, "the program is ending"),
+        (ENABLING, {"stop_requested": True, "dead_man": False, **ILL}, STOP),
+        (ENABLING, {"dead_man": False, **ILL}, RELEASED),
+        (ENABLING, {**ILL, **UNWELL}, ILL["diagnostic"]),
+        (ENABLING, {**UNWELL, "cycles_left": 0}, "not heard or not trusted yet: IMU_TORSO, LEFT_SK"),
+        (ENABLING, {"cycles_left": 0, "torque": OFF_TORQUE}, FAILED),
+        (ENABLING, {"torque": OFF_TORQUE}, TORQUE),
+        (ENABLING, {"supervisor": S.HOLD, "torque": OFF_TORQUE}, TORQUE),
+        (ENABLING, {"supervisor": S.HOLD, **ILL}, ILL["diagnostic"]),
+        (ENABLING, {"supervisor": S.FULL_ASSIST, "torque": OFF_TORQUE}, None),
+        (ENABLING, {"supervisor": S.FULL_ASSIST, **ILL}, ILL["diagnostic"]),
+        # In LOWER and FAULT, START acknowledges a fault that may take some cycles to clear.
+        *(
+            (ENABLING, {"supervisor": state, **changes}, reason)
+            for state in (S.LOWER, S.FAULT)
+            for changes, reason in (
+                ({**ILL, **UNWELL, "torque": OFF_TORQUE}, None),
+                ({"cycles_left": 0, **ILL}, FAILED),
+                ({"dead_man": False}, RELEASED),
+                ({"stop_requested": True}, STOP),
+                ({"ending": True}, "the program is ending"),
+            )
+        ),
+        # In the cycle of the press.
+        (PRESSED, {}, None),
+        (PRESSED, {"torque": OFF_TORQUE}, TORQUE),
+        (PRESSED, {"supervisor": S.HOLD, "torque": OFF_TORQUE, **ILL}, TORQUE),
+        (PRESSED, {**ILL, **UNWELL, "stop_requested": True, "dead_man": False}, None),
+        (PRESSED, {"supervisor": S.OFF, "cycles_left": 0, "torque": OFF_TORQUE, **UNWELL}, None),
+        (PRESSED, {"supervisor": S.OFF, "cycles_left": 0, **ILL}, ILL["diagnostic"]),
+        (PRESSED, {"supervisor": S.FINISH_STEP, "cycles_left": 0, "torque": OFF_TORQUE, **ILL}, None),
+    ],
+)
+def test_a_start_ends_for_the_first_reason_of_the_table(request_: StartRequest, changes: dict, reason: str | None):
+    ended = refusal(ROBOT, request_._replace(**changes))
+    if reason is None:
+        assert ended is None
+    elif reason is FAILED:
+        assert ended == ("START_FAILED", "error", FAILED)
+    else:
+        assert ended == ("START_REFUSED", "warning", REFUSED + reason)
 
 
 class Lie:

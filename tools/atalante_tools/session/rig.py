@@ -21,7 +21,7 @@ from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.hal import Hal
 from atalante_hal.loop import LockStep, Statistics, WallClock, realtime, run
 from atalante_hal.robot import Robot, load_robot
-from atalante_hal.safety.safety_monitor import REFUSED
+from atalante_hal.safety.start import REFUSED
 from atalante_hal.transceiver import FrameTap
 from atalante_hal.types import Controller, State, SupervisorState
 from atalante_tools.console.options import Target
