@@ -1,1 +1,1 @@
-"""Dynamics of the exoskeleton: gravity, on the ground and suspended in the air, and the gait network."""
+"""Dynamics of the exoskeleton on the ground and suspended in the air, its gravity torques, and the gait network."""

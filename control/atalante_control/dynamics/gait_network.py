@@ -1,9 +1,9 @@
-"""Gait network: from a patient and step parameters to a gait. `Subject -> 12 x 8 control points -> Gait`.
+"""Neural network that computes a gait from patient and step parameters: `Subject -> 12 x 8 control points -> Gait`.
 
-`gait library -> fit (training stack) -> weights in a file -> this module (numpy) -> controller`. The network is a perceptron with
-tanh layers. The rows of its last layer satisfy the linear equation c_7 = S c_0, with S the swap and sign change of the legs. The
-angles at the end of a step are therefore those at the start of the next step, for every input and any quality of the training.
-Speeds jump at the step change by the residual of the fit, less than 0.02 rad/s.
+`gait library -> fit (scikit-learn) -> file of weights -> this module (numpy) -> controller`. The network is a perceptron with
+tanh layers. The rows of its last layer satisfy the linear equation c_7 = S c_0, where S swaps and mirrors the legs. The angles
+are therefore continuous at the step change for every input, even if the fit is poor. The speeds jump at the step change by the
+residual of the fit, less than 0.02 rad/s.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from atalante_hal.types import Vector
 
 FORMAT = "atalante-gait-network/2"
 DEFAULT_NETWORK = Path(__file__).parents[1] / "gaits" / "network.npz"
-#: Inputs of the network in their order, with units.
+#: Inputs of the network in their order: name -> unit.
 INPUTS = {"mass": "kg", "height": "m", "step_length": "m", "step_duration": "s"}
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # largest number of neurons of a layer
-_PERIODICITY_DEFECT = 1e-9  # rad, largest jump of the angles at the step change for one input of the last layer
+#: Largest jump of a joint angle at the step change that one unit of an input of the last layer may cause [rad].
+_PERIODICITY_DEFECT = 1e-9
 _ANGLE_MAX = 2.0 * np.pi  # rad, largest absolute value of a control point
-_LEG_TOLERANCE = (
-    1e-3  # m, largest deviation of thigh and shank from the lengths of Winter, for which the network was fitted
-)
+#: Largest difference of thigh and shank from the lengths in Winter's table, with which the network was fitted [m].
+_LEG_TOLERANCE = 1e-3
 
 
 class NetworkError(ValueError):
-    """Error of an invalid network file, or of a subject outside the range of the network. The message gives what is valid."""
+    """Invalid network file, or subject outside the range of the network. The message states the valid values."""
 
 
 class Layer(NamedTuple):
@@ -51,15 +51,17 @@ class Layer(NamedTuple):
 
 @dataclass(frozen=True)
 class GaitNetwork:
-    """Weights of the network, and the range of parameters for which they were fitted."""
+    """Gait network: its weights, and the range of inputs for which they were fitted."""
 
-    low: Vector  # (4,), smallest values of INPUTS
-    high: Vector  # (4,), largest values of INPUTS
-    layers: tuple[Layer, ...]  # with tanh after each layer except the last
-    version: str  # version of the code that fitted the network
+    low: Vector  # smallest valid values of INPUTS, shape (4,)
+    high: Vector  # largest valid values of INPUTS, shape (4,)
+    layers: tuple[Layer, ...]  # layers in order; tanh follows each layer except the last
+    version: str  # version of atalante-hal that fitted the network
 
     def coefficients(self, inputs: Vector) -> Vector:
-        """Return the Bezier control points of a right-stance step, without checks. The result is continuous in the inputs.
+        """Return the Bezier control points of a right-stance step, without a check of the inputs.
+
+        The result is a continuous function of the inputs.
 
         Args:
             inputs: values of INPUTS, shape (4,).
@@ -74,7 +76,7 @@ class GaitNetwork:
         return np.asarray((x @ last.weights + last.bias).reshape(len(JOINTS), DEGREE + 1))
 
     def gait(self, subject: Subject, robot: Robot) -> Gait:
-        """Return the gait of a subject, with the feedforward from inverse dynamics of its trajectory.
+        """Return the gait of a subject. Its feedforward torques are the inverse dynamics of its trajectories.
 
         The limits of the robot are not checked here, see `check_gait`.
 
@@ -101,13 +103,13 @@ class GaitNetwork:
         return Gait(str(subject), subject.step_duration, coefficients, feedforward, subject.parameters(), made)
 
     def check(self, subject: Subject) -> None:
-        """Reject a subject for which the network was not fitted.
+        """Raise `NetworkError` if a subject is outside the range for which the network was fitted.
 
         Args:
             subject: patient and step parameters.
 
         Raises:
-            NetworkError: If a parameter is out of range. The message gives the parameter and its range.
+            NetworkError: If a parameter is out of range. The message states the parameter and its range.
         """
         for name, value, low, high in zip(INPUTS, _inputs(subject), self.low, self.high, strict=True):
             if not low <= value <= high:
@@ -126,14 +128,14 @@ class GaitNetwork:
 
 
 def periodicity() -> Vector:
-    """Return the linear equations on the control points for continuity at the step change, shape (24, 96).
+    """Return the matrix A of the equation A c = 0 for gaits that are continuous at the step change, shape (24, 96).
 
-    The first 12 rows are for the angles, the last 12 rows for the slopes.
+    c contains the control points of all joints, shape (96,). The first 12 rows are for the angles, the last 12 for the slopes.
     """
     points = np.arange(OUTPUTS).reshape(len(JOINTS), DEGREE + 1)
     rows = np.zeros((2, len(JOINTS), OUTPUTS))
     for joint, (other, sign) in enumerate(zip(SWAP, SIGN, strict=True)):
-        # q(T) must equal S q(0) of the next step; the same applies to the slopes at both ends.
+        # The angles must satisfy q(T) = S q(0), where S swaps and mirrors the legs. The same applies to the slopes.
         rows[0, joint, points[joint, DEGREE]] = 1.0
         rows[0, joint, points[other, 0]] = -sign
         rows[1, joint, points[joint, DEGREE]] = 1.0
@@ -144,7 +146,7 @@ def periodicity() -> Vector:
 
 
 def save_network(network: GaitNetwork, path: Path) -> None:
-    """Write a file that `load_network` can read.
+    """Write a network file for `load_network`.
 
     Args:
         network: network to write.
@@ -159,19 +161,19 @@ def save_network(network: GaitNetwork, path: Path) -> None:
     try:
         _network(arrays)
     except ArrayFileError as error:
-        raise NetworkError(f"{path} cannot hold this network: {error}") from error
+        raise NetworkError(f"{path} is not written; the network must be valid: {error}") from error
     write_arrays(path, arrays)
 
 
 def load_network(path: Path | None = None) -> GaitNetwork:
-    """Read a network strictly.
+    """Read a network file and check its content.
 
     Args:
-        path: path of a file of `save_network`; None: the network of this package.
+        path: path of a file written by `save_network`; None: the network file of this package.
 
     Raises:
         NetworkError: If the file cannot be read or is damaged, if an array is unknown, missing or of the wrong shape, if a number
-            is not finite, or if the last layer gives gaits that are not periodic. The message gives the file and the remedy.
+            is not finite, or if the last layer gives gaits that are not periodic. The message states the file and the remedy.
     """
     remedy = "make it with `atalante gait fit`" if path else "install atalante-hal again"
     path = path or DEFAULT_NETWORK
@@ -180,24 +182,24 @@ def load_network(path: Path | None = None) -> GaitNetwork:
     except OSError as error:
         raise NetworkError(f"{path} cannot be read: {error.strerror or error}") from error
     except ArrayFileError as error:
-        raise NetworkError(f"{path} is no gait network: {error}; {remedy}") from error
+        raise NetworkError(f"{path} is not a valid gait network: {error}; {remedy}") from error
 
 
 def _names(depth: int) -> list[str]:
-    """Return the names of the arrays of a network with `depth` layers."""
+    """Return the names of the arrays in the file of a network with `depth` layers."""
     layers = [f"{kind}_{i}" for i in range(depth) for kind in Layer._fields]
     return ["format", "version", "inputs", "low", "high", *layers]
 
 
 def _size_max() -> int:
-    """Return the largest valid file size in bytes, with 512 bytes for the headers and texts of each array."""
+    """Return the largest valid size of a network file [byte]. It includes 512 bytes for header and text of each array."""
     widths = [len(INPUTS), *(LAYERS_MAX - 1) * [WIDTH_MAX], OUTPUTS]
     numbers = 2 * len(INPUTS) + sum((rows + 1) * columns for rows, columns in pairwise(widths))
     return np.dtype(np.float64).itemsize * numbers + 512 * len(_names(LAYERS_MAX))
 
 
 def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
-    """Return the network that the named arrays contain.
+    """Check the arrays of a network file, and return the network.
 
     Raises:
         ArrayFileError: If the arrays are not a valid network.
@@ -218,19 +220,20 @@ def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
         raise ArrayFileError(f"inputs must be {', '.join(INPUTS)}, got {about['inputs'].tolist()!r:.80}")
     for name, array in arrays.items():
         if name not in about and (array.dtype != np.float64 or not np.isfinite(array).all()):
-            raise ArrayFileError(f"{name} must be an array of finite 64-bit floats, got {array.dtype}")
+            found = f"{array.dtype} with a value that is not finite" if array.dtype == np.float64 else array.dtype
+            raise ArrayFileError(f"{name} must be an array of finite 64-bit floats, got {found}")
     layers = tuple(Layer(arrays[f"weights_{i}"], arrays[f"bias_{i}"]) for i in range(depth))
     low, high = arrays["low"], arrays["high"]
     width = len(INPUTS)
     if low.shape != (width,) or high.shape != (width,) or not (low < high).all():
         raise ArrayFileError(f"low and high must be {width} numbers each, low below high, got {low} and {high}")
     if depth > LAYERS_MAX:
-        raise ArrayFileError(f"a network must have at most {LAYERS_MAX} layers, got {depth}")
+        raise ArrayFileError(f"the network must have at most {LAYERS_MAX} layers, got {depth}")
     for i, (weights, bias) in enumerate(layers):
         columns = bias.size
         if weights.shape != (width, columns) or bias.shape != (columns,) or not 1 <= columns <= WIDTH_MAX:
             raise ArrayFileError(
-                f"weights_{i} must have {width} rows, and 1 to {WIDTH_MAX} columns, as many as bias_{i} has numbers, "
+                f"weights_{i} must have shape ({width}, n) and bias_{i} shape (n,), with n from 1 to {WIDTH_MAX}, "
                 f"got shapes {weights.shape} and {bias.shape}"
             )
         width = columns

@@ -1,8 +1,9 @@
-"""Gravity torque of the empty exoskeleton, suspended at a pelvis of known attitude. `q, pelvis attitude -> u_g`.
+"""Gravity torques u_g of the empty exoskeleton, suspended at its pelvis: `joint angles, pelvis attitude -> u_g`.
 
 Statics of a tree of links, as in the recursive Newton-Euler algorithm (Featherstone, Rigid Body Dynamics Algorithms, 5.3). The
-outward pass computes the direction of gravity in each link. The inward pass adds the holding force and moment of each link to
-its parent; the joint torque is the component about the axis. The tree is that of Pinocchio, the reference in the tests.
+outward pass computes the direction of gravity in each link. The inward pass adds the force and moment that hold each link to
+those of its parent. The joint torque is the component of the moment about the joint axis. The tree of links comes from the
+Pinocchio model, which is also the reference in the tests.
 """
 
 from __future__ import annotations
@@ -21,34 +22,35 @@ from atalante_hal.types import Vector
 
 Vector3 = tuple[float, float, float]
 
-#: Record of a link in the frame of the joint that moves it: constants, then the values of a pose.
+#: Data of one link, in the frame of its joint. The last four fields depend on the pose, the others are constant.
 LINK = np.dtype(
     [
         ("joint", np.int64),  # index in JOINTS
         ("parent", np.int64),  # index of the parent link
-        ("offset", np.float64, 3),  # m, position of the joint in the frame of the parent
-        ("turn", np.float64, (3, 3, 3)),  # rotation to the parent: turn[0] + sin(q) turn[1] + (1 - cos(q)) turn[2]
+        ("offset", np.float64, 3),  # m, position of the joint in the frame of the parent link
+        # The rotation matrix from link to parent is turn[0] + sin(q) turn[1] + (1 - cos(q)) turn[2].
+        ("turn", np.float64, (3, 3, 3)),
         ("axis", np.float64, 3),  # unit vector of the joint axis
         ("mass", np.float64),  # kg
         ("lever", np.float64, 3),  # m, centre of mass
-        ("rotation", np.float64, (3, 3)),  # rotation to the parent at the pose
+        ("rotation", np.float64, (3, 3)),  # rotation matrix from link to parent
         ("down", np.float64, 3),  # m/s2, gravitational acceleration
-        ("force", np.float64, 3),  # N, holding force of the link and its descendants
-        ("moment", np.float64, 3),  # Nm, holding moment about the joint
+        ("force", np.float64, 3),  # N, force that holds the link and its descendants
+        ("moment", np.float64, 3),  # Nm, moment about the joint that holds the link and its descendants
     ],
     align=True,
 )
 
 
 class Gravity:
-    """Generalized gravity u_g of the empty exoskeleton, suspended at a pelvis of known attitude.
+    """Gravity torques u_g of the empty exoskeleton, suspended at its pelvis.
 
     Attributes:
         links: tree of links for `hold`, dtype LINK, parents first.
     """
 
     def __init__(self, articulated: ArticulatedModel) -> None:
-        """Prepare the tree of links.
+        """Prepare the tree of links and compile the kernel.
 
         Args:
             articulated: model of the empty exoskeleton with the pelvis fixed.
@@ -58,11 +60,11 @@ class Gravity:
         self.torque(np.zeros(len(JOINTS)), (1.0, 0.0, 0.0, 0.0))
 
     def torque(self, position: Vector, pelvis: Sequence[float]) -> Vector:
-        """Compute the joint torques that hold the exoskeleton at rest.
+        """Compute the joint torques that hold the suspended exoskeleton at rest.
 
         Args:
             position: joint angles, shape (12,) [rad].
-            pelvis: attitude of the pelvis IMU, unit quaternion wxyz, pelvis to world.
+            pelvis: attitude measured by the pelvis IMU, unit quaternion wxyz, pelvis to world.
 
         Returns:
             Torques, shape (12,) [Nm], overwritten by the next call.
@@ -73,7 +75,7 @@ class Gravity:
 
 
 def _links(articulated: ArticulatedModel) -> npt.NDArray[np.void]:
-    """Return the records of the pelvis and the links of a model, parents first."""
+    """Return the data of the links of a model, parents first. Row 0 is the pelvis."""
     model, into, _ = articulated
     data, neutral = model.createData(), pinocchio.neutral(model)
     joint_of = {int(q): joint for joint, q in enumerate(into)}
@@ -90,10 +92,10 @@ def _links(articulated: ArticulatedModel) -> npt.NDArray[np.void]:
 
 
 def hold(links: npt.NDArray[np.void], position: Vector, w: float, x: float, y: float, z: float, torque: Vector) -> None:
-    """Write u_g into `torque`.
+    """Compute the gravity torques u_g and write them into `torque`.
 
     Args:
-        links: tree of links, dtype LINK, parents first; the values of the pose are overwritten.
+        links: tree of links, dtype LINK, parents first; the fields that depend on the pose are overwritten.
         position: joint angles, shape (12,) [rad].
         w: first component of the pelvis attitude, a unit quaternion, pelvis to world.
         x: second component of the pelvis attitude.

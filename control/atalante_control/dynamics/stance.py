@@ -1,13 +1,14 @@
-"""Inverse dynamics on the ground, stance sole flat and at rest: `model, q, q', q'' -> joint torques, ground wrench`.
+"""Inverse dynamics of the robot standing on its right foot: `model, q, q', q'' -> joint torques, ground wrench`.
 
-`gait (solver or network) -> torques of the gait -> feedforward u_f of the gait file`. The module uses only Pinocchio.
+`gait (solver or network) -> torques of the gait -> feedforward u_f of the gait file`. The stance sole is flat on the ground and
+at rest.
 
-The pelvis floats. Its motion follows from the joint motion, because the stance foot does not move: with V the twist of the foot
-in the pelvis frame, the pelvis moves with -V. One recursive Newton-Euler pass gives the wrench f on the floating pelvis. Only
-the ground can apply this wrench, so the ground wrench is f. The joint torques are those of the pass minus J^T f, with J the
-Jacobian of the foot in the pelvis frame (the base rows of the equation of motion, solved exactly).
+The model has a floating pelvis. Its motion follows from the joint motion, because the stance foot does not move: if V is the
+twist of the foot in the pelvis frame, the twist of the pelvis is -V. One recursive Newton-Euler pass gives the wrench f on the
+floating pelvis. Only the ground can apply this wrench, so the ground wrench is f. The joint torques are those of the pass minus
+J^T f, where J is the Jacobian of the foot in the pelvis frame. This solves the equation of motion of the pelvis exactly.
 
-The torque of a gait is the sum u_g + u_f. The gravity torque u_g is that of the *empty* exoskeleton suspended at its pelvis; the
+The torque of a gait is the sum u_g + u_f. The gravity torque u_g is that of the *empty* exoskeleton suspended at its pelvis. The
 controller adds it in every cycle (joint idealization). The feedforward u_f in the gait file is the remainder: the weight of the
 patient, the load of standing on one leg, and the inertia.
 """
@@ -25,9 +26,9 @@ from atalante_control.model import LEG_LINKS, ExoskeletonParameters, Patient, pi
 from atalante_hal.robot import SIDES, Robot
 from atalante_hal.types import Vector
 
-#: Links of the stance foot and the swing foot in the right-stance step of a `Gait`.
+#: Names of the links of stance foot and swing foot in the right-stance step of a `Gait`.
 STANCE_FOOT, SWING_FOOT = (f"{side}_{LEG_LINKS['HA']}" for side in reversed(SIDES))
-#: Number of phases at which the eight control points of a feedforward are fitted.
+#: Number of samples of a step to which the control points of the feedforward are fitted.
 _SAMPLES = 33
 
 
@@ -35,16 +36,16 @@ class GroundForces(NamedTuple):
     """Joint torques and ground wrench of one state, with the attitude of the pelvis."""
 
     torque: Vector  # (12,) Nm, order of JOINTS
-    force: Vector  # (3,) N, force of the ground, in the axes of the stance foot
-    moment: Vector  # (3,) Nm, moment of the ground about the origin of the stance foot (the ankle)
-    pelvis: tuple[float, float, float, float]  # unit quaternion wxyz, pelvis to world
+    force: Vector  # (3,) N, ground force on the stance foot, in the axes of the foot
+    moment: Vector  # (3,) Nm, ground moment about the ankle of the stance foot, in the axes of the foot
+    pelvis: tuple[float, float, float, float]  # attitude of the pelvis, unit quaternion wxyz, pelvis to world
 
 
 class StanceDynamics:
     """Inverse dynamics of the exoskeleton, empty or with a patient, standing on its right foot."""
 
     def __init__(self, urdf_text: str, empty: str) -> None:
-        """Build the Pinocchio models with floating and with fixed pelvis, and the model of u_g.
+        """Build the Pinocchio models with floating and with fixed pelvis, and the gravity model of the empty exoskeleton.
 
         Args:
             urdf_text: URDF of the exoskeleton that walks, empty or with a patient.
@@ -59,7 +60,7 @@ class StanceDynamics:
         self._foot, self._swing_foot = (self._fixed.model.getFrameId(name) for name in (STANCE_FOOT, SWING_FOOT))
         pinocchio.forwardKinematics(self._fixed.model, self._data[1], pinocchio.neutral(self._fixed.model))
         pinocchio.updateFramePlacement(self._fixed.model, self._data[1], self._foot)
-        #: Rotation of the stance foot in the pelvis frame at the zero pose, where the pelvis faces the walking direction.
+        #: Rotation from stance foot to pelvis with all joints at zero; the pelvis then faces the walking direction.
         self._toe_out = self._data[1].oMf[self._foot].rotation.copy()
 
     def forces(self, position: Vector, velocity: Vector, acceleration: Vector) -> GroundForces:
@@ -77,7 +78,7 @@ class StanceDynamics:
         pinocchio.computeJointJacobians(fixed.model, on_pelvis, q)
         pinocchio.forwardKinematics(fixed.model, on_pelvis, q, v, a)
         foot = pinocchio.updateFramePlacement(fixed.model, on_pelvis, self._foot)
-        frame = pinocchio.ReferenceFrame.WORLD  # in this model the world frame is the pelvis frame
+        frame = pinocchio.ReferenceFrame.WORLD  # the pelvis frame, because the pelvis of this model is fixed
         twist = pinocchio.getFrameVelocity(fixed.model, on_pelvis, self._foot, frame).vector
         change = pinocchio.getFrameAcceleration(fixed.model, on_pelvis, self._foot, frame).vector
         jacobian = pinocchio.getFrameJacobian(fixed.model, on_pelvis, self._foot, frame)
@@ -124,7 +125,9 @@ class StanceDynamics:
         return np.array([self.forces(*state).torque for state in zip(q, qd, qdd, strict=True)])
 
     def feedforward(self, coefficients: Vector, duration: float) -> Vector:
-        """Return u_f of a right-stance step, its joint torques less u_g, as control points of shape (12, 8) [Nm].
+        """Return the feedforward u_f of a right-stance step as Bezier control points, shape (12, 8) [Nm].
+
+        u_f is the joint torque minus the gravity torque u_g.
 
         Args:
             coefficients: Bezier control points of the joints, shape (12, 8) [rad].
@@ -140,7 +143,7 @@ class StanceDynamics:
 
 
 def stance_dynamics(robot: Robot, patient: Patient | None = None) -> StanceDynamics:
-    """Build the inverse dynamics of the exoskeleton standing on its right foot.
+    """Build the inverse dynamics for a robot and its patient.
 
     Args:
         robot: limits of the joints.

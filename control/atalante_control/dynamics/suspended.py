@@ -1,7 +1,7 @@
-"""Gait for the exoskeleton suspended in the air: the same trajectories with another feedforward.
+"""Gait for the exoskeleton suspended in the air: the trajectories of a gait on the ground with another feedforward.
 
-`gait (solver or network), exoskeleton -> the same gait with u_f for the air -> AirwalkController`. The feedforward of a gait on
-the ground includes the load of the patient on the stance leg. In the air the exoskeleton is empty and suspended by its pelvis.
+`gait (solver or network), exoskeleton -> gait with u_f for the air -> AirwalkController`. The feedforward of a gait on the ground
+includes the load of the patient on the stance leg. In the air the exoskeleton is empty and suspended at its pelvis.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from atalante_control.model import ArticulatedModel, ExoskeletonParameters, pino
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import Vector
 
-_SAMPLES = 33  # number of phases at which the eight control points are fitted
+_SAMPLES = 33  # number of samples of a step to which the control points are fitted
 _SAGITTAL_ANKLES = np.array([float(joint.endswith("_SA")) for joint in JOINTS])
-_LEVEL = (1.0, 0.0, 0.0, 0.0)  # attitude of the pelvis, unit quaternion wxyz
+_LEVEL = (1.0, 0.0, 0.0, 0.0)  # attitude of a level pelvis, unit quaternion wxyz
 
 
 def suspended_gait(gait: Gait, exoskeleton: ExoskeletonParameters, robot: Robot) -> Gait:
-    """Return the gait with u_f of the suspended empty exoskeleton.
+    """Return a gait with the feedforward u_f of the empty exoskeleton suspended in the air.
 
-    This u_f contains only the inertia torques, because the controller adds u_g.
+    This u_f contains only the inertia torques, because the controller adds the gravity torque u_g.
 
     Args:
         gait: gait of any source.
@@ -36,16 +36,16 @@ def suspended_gait(gait: Gait, exoskeleton: ExoskeletonParameters, robot: Robot)
 
 
 def check_hung(gait: Gait, robot: Robot, articulated: ArticulatedModel, gravity: Gravity, ankle_offset: float) -> None:
-    """Reject a gait that the suspended exoskeleton cannot walk within its limits.
+    """Raise `GaitError` if the suspended exoskeleton would exceed a limit in a gait.
 
-    The torque limits apply to the sum of u_f and u_g with the pelvis level. If the gait has no u_f, that of `suspended_gait`
-    applies.
+    The torque limits apply to the sum of feedforward u_f and gravity torque u_g with a level pelvis. A gait without u_f gets the
+    u_f of `suspended_gait`.
 
     Args:
         gait: right-stance step that repeats, of any source.
         robot: limits of the joints.
         articulated: model of the empty exoskeleton with the pelvis fixed.
-        gravity: gravity of the same exoskeleton.
+        gravity: gravity torques of the same exoskeleton.
         ankle_offset: angle added to both sagittal ankles [rad].
 
     Raises:
@@ -53,7 +53,7 @@ def check_hung(gait: Gait, robot: Robot, articulated: ArticulatedModel, gravity:
     """
     where = f"gait {gait.name!r}"
     check_gait(gait, robot, where)
-    # Adding a constant to all Bezier control points adds the constant to the polynomial.
+    # A constant added to all control points of a Bezier polynomial is added to the polynomial.
     coefficients = gait.coefficients + ankle_offset * _SAGITTAL_ANKLES[:, None]
     feedforward = _feedforward(gait, articulated) if gait.feedforward is None else gait.feedforward
     walked = replace(gait, coefficients=coefficients, feedforward=feedforward)
@@ -61,7 +61,7 @@ def check_hung(gait: Gait, robot: Robot, articulated: ArticulatedModel, gravity:
 
 
 def _feedforward(gait: Gait, articulated: ArticulatedModel) -> Vector:
-    """Return u_f of the suspended empty exoskeleton as control points, shape (12, 8) [Nm]."""
+    """Return the feedforward u_f of the suspended empty exoskeleton as Bezier control points, shape (12, 8) [Nm]."""
     model, into, out_of = articulated
     data = model.createData()
     phase = np.linspace(0.0, 1.0, _SAMPLES)

@@ -1,9 +1,9 @@
-"""Small .npz files, read strictly: `file -> directory, sizes -> checksums -> headers -> named arrays`.
+"""Reader and writer of small .npz files with strict checks: `file -> directory -> checksums -> headers -> named arrays`.
 
-The content of a file cannot cause a large memory allocation. Before a member is read, the directory of the zip archive is
+A damaged or hostile file cannot cause a large memory allocation. Before a member is read, the directory of the zip archive is
 checked against the names and the size that the caller expects. Decompression stops at the declared size. The CRC-32 of the zip
-format covers the bytes of each member but not its name, so an additional member contains a SHA-256 over all names, types, shapes
-and bytes.
+format covers the bytes of each member but not its name. An additional member therefore contains a SHA-256 over all names, types,
+shapes and bytes.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ _FLOAT: Final = np.dtype("<f8")
 
 
 class ArrayFileError(ValueError):
-    """Error of a file without the expected arrays. The message does not contain the path; the caller adds it."""
+    """Invalid content of an array file. The message does not contain the path; the caller adds it."""
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
-    """Write a file that `read_arrays` reads back bit for bit. The file is replaced as a whole or not at all.
+    """Write arrays to a file atomically. `read_arrays` returns the same arrays bit for bit.
 
     Args:
         path: path of the file, replaced if it exists.
@@ -42,7 +42,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
         for name, array in content.items():
             member = io.BytesIO()
             np.lib.format.write_array(member, np.asarray(array, order="C"), version=(1, 0), allow_pickle=False)
-            # A ZipInfo made from a name has a fixed date: the same arrays give the same file.
+            # The default date of a ZipInfo is a constant, so the same arrays give the same file.
             archive.writestr(zipfile.ZipInfo(name + _SUFFIX), member.getvalue(), zipfile.ZIP_DEFLATED)
     unfinished = path.with_name(f"{path.name}.new")
     unfinished.write_bytes(packed.getvalue())
@@ -50,7 +50,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
 
 
 def read_arrays(path: Path, allowed: Collection[str], size_max: int) -> dict[str, Array]:
-    """Read the arrays of a file that `write_arrays` wrote.
+    """Read and check the arrays of a file written by `write_arrays`.
 
     Args:
         path: path of the file.
@@ -67,23 +67,23 @@ def read_arrays(path: Path, allowed: Collection[str], size_max: int) -> dict[str
     with path.open("rb") as stream:
         packed = stream.read(size_max + 1)
     if len(packed) > size_max:
-        raise ArrayFileError(f"it must have at most {size_max} bytes, got more")
+        raise ArrayFileError(f"the file must have at most {size_max} bytes, got more")
     try:
         with zipfile.ZipFile(io.BytesIO(packed)) as archive:
             members = _checked_directory(archive, allowed, size_max)
             arrays = {name: _array(name, _member(archive, member)) for name, member in members.items()}
     except ArrayFileError:
         raise
-    except Exception as error:  # zipfile and numpy raise many types for damaged bytes, for example struct.error
-        raise ArrayFileError(f"its zip archive or an array in it is damaged ({type(error).__name__})") from error
+    except Exception as error:  # zipfile and numpy raise exceptions of many types for damaged bytes
+        raise ArrayFileError(f"the zip archive or one of its arrays is damaged ({type(error).__name__})") from error
     expected = _checksum(arrays | {CHECKSUM: None})
     if (received := str(arrays.pop(CHECKSUM))) != expected:
-        raise ArrayFileError(f"{CHECKSUM} must be that of the other arrays, {expected}, got {received!r:.80}")
+        raise ArrayFileError(f"{CHECKSUM} must be {expected}, the checksum of the other arrays, got {received!r:.80}")
     return arrays
 
 
 def _checked_directory(archive: zipfile.ZipFile, allowed: Collection[str], size_max: int) -> dict[str, zipfile.ZipInfo]:
-    """Return the members by array name after checking their names, compression and declared sizes."""
+    """Check names, compression and declared sizes of the members, and return the members by array name."""
     members: dict[str, zipfile.ZipInfo] = {}
     for member in archive.infolist():
         name = member.filename.removesuffix(_SUFFIX)
@@ -92,21 +92,21 @@ def _checked_directory(archive: zipfile.ZipFile, allowed: Collection[str], size_
                 f"{member.filename[:40]!r} is not a valid member; valid arrays are {', '.join(sorted(allowed))}"
             )
         if name in members:
-            raise ArrayFileError(f"{name} must occur once, got it twice")
+            raise ArrayFileError(f"the archive must have one member {name}, got two")
         if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise ArrayFileError(f"{name} must be stored or deflated, got compression {member.compress_type}")
         members[name] = member
     if CHECKSUM not in members:
         raise ArrayFileError(f"{CHECKSUM} is missing")
     if (declared := sum(member.file_size for member in members.values())) > size_max:
-        raise ArrayFileError(f"its arrays must have at most {size_max} bytes together, got {declared} declared")
+        raise ArrayFileError(f"the declared sizes of the arrays must sum to at most {size_max} bytes, got {declared}")
     return members
 
 
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
-    """Return the bytes of a member, at most the declared size; zipfile checks their CRC-32."""
+    """Return the bytes of a member. Their number must be the declared size; zipfile checks their CRC-32."""
     with archive.open(member) as stream:
-        # `read()` without a size would decompress the whole member before the check of the declared size.
+        # `read()` without a limit would decompress the whole member, even if it is larger than declared.
         content = stream.read(member.file_size + 1)
     if len(content) != member.file_size:
         raise ArrayFileError(f"{member.filename} must have the {member.file_size} bytes declared, got {len(content)}")
@@ -114,7 +114,7 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
 
 
 def _array(name: str, content: bytes) -> Array:
-    """Return the array of a .npy file in memory, read-only; the bytes must match its shape exactly."""
+    """Return the read-only array of .npy bytes. The number of bytes must match the shape."""
     stream = io.BytesIO(content)
     if (version := np.lib.format.read_magic(stream)) != (1, 0):
         raise ArrayFileError(f"{name} must have .npy version 1.0, got {version[0]}.{version[1]}")
@@ -124,21 +124,21 @@ def _array(name: str, content: bytes) -> Array:
     if fortran_order:
         raise ArrayFileError(f"{name} must be in C order")
     data = content[stream.tell() :]
-    # Python integers do not overflow; a NumPy product could.
+    # The size is a product of Python integers, because a NumPy product can overflow.
     size = dtype.itemsize
     for length in shape:
         size *= length
     if len(data) != size:
         raise ArrayFileError(f"{name} must have the {size} bytes of its shape {shape}, got {len(data)}")
     if dtype.kind == "U":
-        data.decode("utf-32")  # raises now; numpy would raise only when the text is used
+        data.decode("utf-32")  # raises for invalid text, which numpy detects only on use
     array = np.frombuffer(data, dtype).reshape(shape).copy()
     array.setflags(write=False)
     return array
 
 
 def _checksum(arrays: Mapping[str, Array | None]) -> str:
-    """Return the SHA-256 over name, type, shape and bytes of each array except the checksum, in hexadecimal digits."""
+    """Return the SHA-256 over name, type, shape and bytes of each array that is not None, in hexadecimal digits."""
     digest = hashlib.sha256()
     for name, array in sorted(arrays.items()):
         if array is not None:

@@ -1,4 +1,4 @@
-"""Gait: twelve joint trajectories of one right-stance step as Bezier polynomials, read strictly from a file.
+"""Gait: twelve joint trajectories of one right-stance step as Bezier polynomials, read from a file.
 
 `gait file -> Gait -> StepTables (1 ms) -> baseline controller, guide filter`. The left-stance step is the right-stance
 step of the mirrored robot: the legs are swapped and each joint angle is multiplied by its MIRROR_SIGN. A gait that is not
@@ -24,48 +24,48 @@ from atalante_hal.types import Vector
 
 FORMAT = "atalante-gait/1"
 DEGREE = 7
-PERIOD = 1e-3  # s, control cycle; step durations are multiples of it
+PERIOD = 1e-3  # s, period of the control cycle; a step lasts a whole number of cycles
 AIRWALK_GAIT = Path(__file__).parents[1] / "gaits" / "airwalk.json"
 
-#: Index and sign of mirroring: the angle of joint i of the mirrored robot is SIGN[i] times the angle of joint SWAP[i].
+#: Index and sign for mirroring: the angle of joint i of the mirrored robot is SIGN[i] times the angle of joint SWAP[i].
 SWAP = np.r_[len(LEG_JOINTS) : len(JOINTS), 0 : len(LEG_JOINTS)]
 SIGN = np.array(MIRROR_SIGN * len(SIDES), dtype=np.float64)
 
-POSITION_JUMP = math.radians(0.1)  # rad, largest discontinuity accepted at the step change
-VELOCITY_JUMP = 0.05  # rad/s, largest discontinuity accepted at the step change
+POSITION_JUMP = math.radians(0.1)  # rad, largest accepted jump of a joint angle at the step change
+VELOCITY_JUMP = 0.05  # rad/s, largest accepted jump of a joint speed at the step change
 DURATION_RANGE = (0.3, 3.0)  # s, shortest and longest step
-ROUNDING = 1e-9  # rounding error of a table entry, so that a gait may reach a limit exactly
+ROUNDING = 1e-9  # rad, rad/s or Nm, tolerance of the limit checks for rounding errors
 
 _REQUIRED = ("format", "name", "duration", "joints")
 _OPTIONAL = ("feedforward", "parameters", "solver")
 
 
 class GaitError(ValueError):
-    """Error of a gait that is not valid for this robot. The message gives the key and the valid values."""
+    """Invalid gait, or gait beyond a limit of the robot. The message states the key and the valid values."""
 
     code = "GAIT_INVALID"
 
 
 @dataclass(frozen=True)
 class StepTables:
-    """Step sampled at every cycle from 0 to T, both included: arrays of shape (N + 1, 12), read-only."""
+    """Step sampled in every control cycle from 0 to T, both included. The arrays have shape (N + 1, 12) and are read-only."""
 
     q: Vector  # rad
     qd: Vector  # rad/s
     qdd: Vector  # rad/s2
-    uf: Vector  # Nm, feedforward without gravity; zero if the gait has none
+    uf: Vector  # Nm, feedforward torque without gravity; zero for a gait without feedforward
 
 
 @dataclass(frozen=True)
 class Gait:
-    """Gait given by its right-stance step, in which the left leg swings. The left-stance step is `mirrored()`."""
+    """Periodic gait, described by its right-stance step. `mirrored()` returns the left-stance step."""
 
     name: str
     duration: float  # s, T
     coefficients: Vector  # (12, 8) rad, Bezier control points in the order of JOINTS
-    feedforward: Vector | None = None  # (12, 8) Nm, Bezier control points of u_f without gravity
-    parameters: Mapping[str, float] = field(default_factory=dict)  # parameters of patient and step
-    solver: Mapping[str, Any] = field(default_factory=dict)  # record of the solver, stored but not used
+    feedforward: Vector | None = None  # (12, 8) Nm, Bezier control points of the feedforward u_f, without gravity
+    parameters: Mapping[str, float] = field(default_factory=dict)  # parameters of patient and step by name
+    solver: Mapping[str, Any] = field(default_factory=dict)  # report of the solver, for information only
 
     @property
     def cycles(self) -> int:
@@ -74,19 +74,19 @@ class Gait:
 
     @property
     def hash32(self) -> int:
-        """Return the CRC-32 of duration, trajectories and feedforward."""
+        """Return the CRC-32 of duration, trajectories and feedforward, which identifies the gait."""
         content = np.float64(self.duration).tobytes() + np.ascontiguousarray(self.coefficients).tobytes()
         if self.feedforward is not None:
             content += np.ascontiguousarray(self.feedforward).tobytes()
         return zlib.crc32(content)
 
     def mirrored(self) -> Gait:
-        """Return the step with the other stance leg. Mirroring twice gives the same gait."""
+        """Return the step with the other stance leg."""
         feedforward = None if self.feedforward is None else _mirror(self.feedforward)
         return Gait(self.name, self.duration, _mirror(self.coefficients), feedforward, self.parameters, self.solver)
 
     def tables(self) -> StepTables:
-        """Return the step sampled at every cycle."""
+        """Return the step sampled in every control cycle."""
         phase = _cycle_phases(self)
         uf = np.zeros_like(self.coefficients) if self.feedforward is None else self.feedforward
         tables = (*motion(self.coefficients, self.duration, phase), bezier(uf, phase))
@@ -143,7 +143,7 @@ def motion(coefficients: Vector, duration: float, phase: Vector) -> tuple[Vector
 
 
 def control_points(phase: Vector, values: Vector) -> Vector:
-    """Return the control points of the polynomials of degree 7 that fit samples best (least squares).
+    """Fit polynomials of degree 7 to samples (least squares), and return their Bezier control points.
 
     Args:
         phase: phases in [0, 1], shape (n,).
@@ -174,11 +174,11 @@ def power_basis(coefficients: Vector) -> Vector:
 
 
 def load_gait(path: Path, robot: Robot) -> Gait:
-    """Read a gait file (JSON) strictly and check it against the robot.
+    """Read a gait file (JSON) and check it against the limits of the robot.
 
-    Keys: `format` ("atalante-gait/1"), `name`, `duration` [s], `joints` (each of JOINTS: 8 Bezier control points [rad]
-    of the right-stance step); optional `feedforward` (the same form, [Nm], without gravity), `parameters` (name: number),
-    `solver` (anything).
+    Required keys: `format` ("atalante-gait/1"), `name`, `duration` [s], and `joints` with 8 Bezier control points [rad] of the
+    right-stance step for each of JOINTS. Optional keys: `feedforward` with 8 control points [Nm] for each of JOINTS, without
+    gravity; `parameters`, an object of numbers; `solver`, any object.
 
     Args:
         path: path of the gait file.
@@ -190,14 +190,17 @@ def load_gait(path: Path, robot: Robot) -> Gait:
     """
     try:
         document = json.loads(
-            path.read_text(encoding="utf-8"), parse_constant=_refuse_constant, object_pairs_hook=_without_twins
+            path.read_text(encoding="utf-8"), parse_constant=_reject_constant, object_pairs_hook=_unique_keys
         )
     except OSError as error:
         raise GaitError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
         raise GaitError(f"{path}: {error}") from error
     if not isinstance(document, dict):
-        raise GaitError(f"{path}: a gait file must be a JSON object with the keys {', '.join(_REQUIRED)}")
+        raise GaitError(
+            f"{path}: a gait file must be a JSON object with the keys {', '.join(_REQUIRED)}, "
+            f"got {type(document).__name__}"
+        )
     if unknown := sorted(set(document) - {*_REQUIRED, *_OPTIONAL}):
         raise GaitError(f"{path}: {unknown[0]} is unknown; valid keys are {', '.join(_REQUIRED + _OPTIONAL)}")
     if missing := [key for key in _REQUIRED if key not in document]:
@@ -224,7 +227,7 @@ def load_gait(path: Path, robot: Robot) -> Gait:
 
 
 def write_gait(gait: Gait, path: Path) -> None:
-    """Write a gait file that `load_gait` reads back bit for bit. The file is replaced as a whole or not at all.
+    """Write a gait file atomically. `load_gait` returns the same numbers bit for bit.
 
     Args:
         gait: gait to write.
@@ -243,19 +246,19 @@ def write_gait(gait: Gait, path: Path) -> None:
 def check_gait(
     gait: Gait, robot: Robot, where: str = "gait", gravity: Callable[[Vector], Vector] | None = None
 ) -> None:
-    """Reject a gait that is malformed, jumps at the step change or exceeds the limits of the robot.
+    """Raise `GaitError` if a gait is malformed, discontinuous at the step change or beyond a limit of the robot.
 
-    Angles, speeds and torques are compared with their limits at every cycle and at every extremum between cycles.
+    Angles, speeds and torques are compared with their limits in every cycle and at every extremum between cycles.
 
     Args:
-        gait: right-stance step that repeats; its mirror image is checked too.
+        gait: gait to check; its left-stance step is checked too.
         robot: limits of the joints.
         where: first words of the message, for example the name of the file.
         gravity: function from a pose (12,) [rad] to the torque (12,) [Nm] that the controller adds to the feedforward. The torque
             limits apply to the sum. None: they apply to the feedforward.
 
     Raises:
-        GaitError: If the gait is rejected. The message gives the joint, the limit, the value and the phase.
+        GaitError: If the gait is rejected. The message states the joint, the limit, the value and the phase.
     """
     _check_form(gait, where)
     steps = {"right": gait, "left": gait.mirrored()}
@@ -268,17 +271,17 @@ def check_gait(
         worst = int(jump.argmax())
         if not jump[worst] <= limit:
             raise GaitError(
-                f"{where}: jump of joints.{JOINTS[worst]} at the step change must be at most {limit:.4g} {unit} to the "
-                f"mirrored start, got {jump[worst]:.4g} {unit}"
+                f"{where}: jump of joints.{JOINTS[worst]} at the step change must be at most {limit:.4g} {unit}, "
+                f"got {jump[worst]:.4g} {unit}"
             )
-    # The limits of left and right joints may differ, so both steps are checked.
+    # The limits of left and right joints can differ, so both steps are checked.
     for stance, step in steps.items():
         for phases in (_cycle_phases, _turning_points):
             _check_limits(step, phases(step), robot, gravity, where, stance)
 
 
 def _check_form(gait: Gait, where: str) -> None:
-    """Reject arrays of another shape or type, numbers that are not finite, and durations that are not whole cycles."""
+    """Raise `GaitError` if the shape or type of an array, a number or the duration is not valid."""
     shape = len(JOINTS), DEGREE + 1
     for key, array in (("joints", gait.coefficients), ("feedforward", gait.feedforward)):
         if array is None and key == "feedforward":
@@ -292,15 +295,14 @@ def _check_form(gait: Gait, where: str) -> None:
             raise GaitError(
                 f"{where}: {key}.{JOINTS[joint]} must be finite, got {array[joint, point]} as control point {point}"
             )
-    _check_duration(
-        float(gait.duration) if isinstance(gait.duration, float) else gait.duration, where
-    )  # converts a NumPy float, which is a subclass of float
+    # `_check_duration` accepts only built-in numbers, so a NumPy float is converted.
+    _check_duration(float(gait.duration) if isinstance(gait.duration, float) else gait.duration, where)
 
 
 def _check_limits(
     gait: Gait, phase: Vector, robot: Robot, gravity: Callable[[Vector], Vector] | None, where: str, stance: str
 ) -> None:
-    """Reject a step with an angle, speed or torque beyond its limit at one of the phases (n,)."""
+    """Raise `GaitError` if an angle, speed or torque of a step is beyond its limit at one of the given phases."""
     q, qd, _ = motion(gait.coefficients, gait.duration, phase)
     torque = np.zeros_like(q) if gait.feedforward is None else bezier(gait.feedforward, phase)
     if gravity is not None:
@@ -323,14 +325,15 @@ def _check_limits(
 
 
 def _cycle_phases(gait: Gait) -> Vector:
-    """Return the phases of the cycles of a step, both ends included, shape (N + 1,)."""
+    """Return the phase of each control cycle of a step, both ends included, shape (N + 1,)."""
     return np.arange(gait.cycles + 1) / gait.cycles
 
 
 def _turning_points(gait: Gait) -> Vector:
     """Return the phases in [0, 1] at which the angle, speed or feedforward of a joint has an extremum, shape (n,).
 
-    Rounding can turn a double root into a complex pair, so the real part of every root is used. An extra phase does no harm.
+    Rounding can turn a double root into a complex pair, so the real part of every root is used. This can add phases without an
+    extremum, which are harmless.
     """
     slope = derivative(gait.coefficients)
     slopes = [slope, derivative(slope)]
@@ -342,7 +345,7 @@ def _turning_points(gait: Gait) -> Vector:
 
 
 def _check_duration(value: Any, where: str) -> float:
-    """Return a duration [s] after checking that it is a whole number of cycles in `DURATION_RANGE`."""
+    """Check that a duration [s] is a whole number of cycles within `DURATION_RANGE`, and return it."""
     low, high = DURATION_RANGE
     if not (_is_number(value) and low <= value <= high):
         raise GaitError(f"{where}: duration must be a number of seconds from {low} to {high}, got {value!r}")
@@ -354,7 +357,9 @@ def _check_duration(value: Any, where: str) -> float:
 
 def _control_points(path: Path, key: str, table: Any) -> Vector:
     if not isinstance(table, dict):
-        raise GaitError(f"{path}: {key} must be an object with one list for each of {', '.join(JOINTS)}")
+        raise GaitError(
+            f"{path}: {key} must be an object with one list for each of {', '.join(JOINTS)}, got {type(table).__name__}"
+        )
     if unknown := sorted(set(table) - set(JOINTS)):
         raise GaitError(f"{path}: {key}.{unknown[0]} is unknown; valid joints are {', '.join(JOINTS)}")
     for joint in JOINTS:
@@ -365,21 +370,20 @@ def _control_points(path: Path, key: str, table: Any) -> Vector:
 
 
 def _is_number(value: Any) -> bool:
-    return (
-        type(value) in (int, float) and abs(value) <= sys.float_info.max
-    )  # false for NaN; an integer beyond the float range is compared without overflow
+    # The comparison is false for NaN, and it cannot overflow for large integers.
+    return type(value) in (int, float) and abs(value) <= sys.float_info.max
 
 
-def _refuse_constant(text: str) -> float:
+def _reject_constant(text: str) -> float:
     raise ValueError(f"every number in a gait file must be finite, got {text}")
 
 
-def _without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
         names = [name for name, _ in pairs]
-        twin = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"every key must occur once, got {twin} twice")
+        repeated = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"every key must occur once, got {repeated} {names.count(repeated)} times")
     return found
 
 
@@ -393,10 +397,10 @@ def _read_only(array: Vector) -> Vector:
 
 
 def step_over(cycle: int, cycles: int) -> bool:
-    """Return whether a step has ended by time.
+    """Return whether the nominal duration of a step has passed.
 
     Args:
         cycle: cycles since the step change.
-        cycles: length of the step in cycles.
+        cycles: nominal duration of the step in cycles.
     """
     return cycle >= cycles

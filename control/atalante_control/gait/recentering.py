@@ -1,8 +1,9 @@
-"""Re-centring ("deadbeat" in the paper): cubic from the measured pose at a step change to the nominal trajectory.
+"""Re-centring ("deadbeat" in the paper): a cubic that leads from the pose at a step change to the nominal trajectory.
 
 `step change -> (q - q_nom, q' - q_nom') -> s(t) -> q_des(t) = q_nom(t) + s(t)`. The tracking error is exactly zero at the step
-change. The desired trajectory reaches the nominal one, with its velocity, alpha T later. s is linear in the two deviations:
-s(t) = s(0) c0(t) + s'(0) c1(t). The guide filter therefore prepares every response once, from the basis cubics c0 and c1.
+change. After the time alpha T the desired trajectory has the angle and the velocity of the nominal trajectory. s is linear in the
+two deviations: s(t) = s(0) c0(t) + s'(0) c1(t). The guide filter therefore prepares its responses in advance, for the basis
+cubics c0 and c1.
 
 The paper calls this polynomial a deadbeat. It is a reference trajectory, not a finite-time (deadbeat) control law.
 """
@@ -19,14 +20,14 @@ from atalante_hal.types import Vector
 
 @dataclass(frozen=True)
 class Deadbeat:
-    """Re-centring ("deadbeat" in the paper) of one gait; a reference trajectory, not a finite-time control law.
+    """Re-centring ("deadbeat" in the paper) of one gait: an offset of the reference trajectory after a step change.
 
     Raises:
         ValueError: If alpha is outside (0, 1], or the duration is not positive.
     """
 
     duration: float  # s, nominal duration of a step, T
-    alpha: float = 0.3  # fraction of T after which the nominal trajectory is reached
+    alpha: float = 0.3  # fraction of T after which the offset is zero
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.duration) and self.duration > 0.0):
@@ -36,18 +37,18 @@ class Deadbeat:
 
     @property
     def end(self) -> float:
-        """Return the time alpha T from which s and s' are zero [s]."""
+        """Return the time alpha T after the step change at which the re-centring ends [s]."""
         return self.alpha * self.duration
 
     def polynomials(self) -> Vector:
-        """Return the coefficients of c0 and c1 [s] in powers of x = t / (alpha T), shape (2, 4).
+        """Return the coefficients of the basis cubics c0 and c1 in powers of x = t / (alpha T), shape (2, 4).
 
-        c0(0) = 1, c0'(0) = 0 and c1(0) = 0, c1'(0) = 1. At x = 1 the value and slope of both are zero.
+        c0(0) = 1, c0'(0) = 0 and c1(0) = 0, c1'(0) = 1. At x = 1 the values and slopes are zero. c0 has no unit, c1 is in s.
         """
         return np.array([[1.0, 0.0, -3.0, 2.0], [0.0, self.end, -2.0 * self.end, self.end]])
 
     def basis(self, time: Vector) -> tuple[Vector, Vector, Vector]:
-        """Return the values and the first and second time derivatives of c0 and c1, zero from alpha T on.
+        """Return c0 and c1 with their first and second time derivatives; all are zero from alpha T on.
 
         Args:
             time: time since the step change, shape (n,) [s], at least 0.
@@ -62,7 +63,7 @@ class Deadbeat:
         return tuple(np.where(inside, _values(p, x), 0.0) for p in (c, first, second))  # type: ignore[return-value]
 
     def s(self, time: Vector, deviation: Vector, rate: Vector) -> Vector:
-        """Return the cubic s of the paper for given deviations at the step change.
+        """Return the offset s of the re-centring for given deviations at the step change.
 
         Args:
             time: time since the step change, shape (n,) [s].

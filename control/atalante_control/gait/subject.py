@@ -7,21 +7,21 @@ from dataclasses import dataclass
 from atalante_control.gait.gait import PERIOD
 from atalante_control.model import Patient
 
-STEP_LENGTH_RANGE = (0.05, 0.40)  # m, accepted input; not every step in this range has a feasible gait
-STEP_DURATION_RANGE = (0.4, 2.0)  # s, accepted input
+STEP_LENGTH_RANGE = (0.05, 0.40)  # m, accepted step lengths; some of them have no feasible gait
+STEP_DURATION_RANGE = (0.4, 2.0)  # s, accepted step durations; some of them have no feasible gait
 
 
 @dataclass(frozen=True)
 class Subject:
-    """Patient and step parameters.
+    """Patient and step parameters for which a gait is computed.
 
     Raises:
         ValueError: If the step is out of range, or the duration is not a whole number of cycles.
     """
 
     patient: Patient
-    step_length: float  # m, from one landing to the next, along the walking direction
-    step_duration: float  # s, a whole number of milliseconds
+    step_length: float  # m, distance from one landing to the next along the walking direction
+    step_duration: float  # s, duration of one step, a whole number of milliseconds
 
     def __post_init__(self) -> None:
         for name, value, (low, high), unit in (
@@ -35,7 +35,7 @@ class Subject:
             raise ValueError(f"step duration must be a whole number of milliseconds, got {self.step_duration!r} s")
 
     def parameters(self) -> dict[str, float]:
-        """Return the entry `parameters` of a gait file."""
+        """Return patient and step parameters by name, for the key `parameters` of a gait file."""
         return {
             "patient_mass": self.patient.mass,
             "patient_height": self.patient.height,
@@ -46,6 +46,6 @@ class Subject:
         }
 
     def __str__(self) -> str:
-        """Return one line of text for messages."""
+        """Return patient and step parameters as one line of text."""
         patient = self.patient
         return f"{patient.mass:g} kg, {patient.height:g} m, step {self.step_length:g} m in {self.step_duration:g} s"

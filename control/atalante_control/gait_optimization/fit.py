@@ -1,4 +1,4 @@
-"""Fit of the gait network to a library: `gaits -> principal directions -> perceptron -> GaitNetwork`.
+"""Fit of the gait network to a library of gaits: `gaits -> principal directions -> perceptron -> GaitNetwork`.
 
 The 96 control points depend on each other, so the perceptron does not learn them directly. It learns the coordinates along the
 few directions in which the library varies. The linear map back to the control points is multiplied into the last layer.
@@ -6,9 +6,9 @@ few directions in which the library varies. The linear map back to the control p
 1. *Periodic gaits.* The angles are exactly continuous at the step change, which leaves 84 dimensions. The speeds jump slightly
    at the impact. The fit keeps the fraction `JUMP_KEPT` of this jump, as a compromise between a smooth walk and the accelerations
    of the solved gait.
-2. *Weighted errors.* The distance of two gaits is the deviation of the angles along the step and of the accelerations, which
-   determine the feedforward. The ends of the step have a larger weight, because the foot lands there. The perceptron learns the
-   principal directions of the library in this metric, down to `RESOLUTION`.
+2. *Weighted errors.* The distance of two gaits is the deviation of their angles and accelerations along the step. The
+   accelerations determine the feedforward. The ends of the step have a larger weight, because the foot lands there. The
+   perceptron learns the principal directions of the library in this metric. Directions below `RESOLUTION` are omitted.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
 
 HIDDEN = (64, 64)
-ITERATIONS = 3000  # largest number of L-BFGS iterations in a round
-ROUNDS = 2  # number of optimiser runs; each continues from the result of the last one
-RESOLUTION = math.radians(0.003)  # rad, rms of the library outside the learned directions
-JUMP_KEPT = 0.45  # fraction of the speed jumps of the library
-END_WEIGHT = 20.0  # weight of a sample at either end of the step, relative to the other samples
-ACCELERATION_WEIGHT = 5e-2  # s2, weight of acceleration (rad/s2) relative to angle (rad)
-ALPHA = 1e-7  # factor of the squared weights in the cost; makes the result smooth between the points of the grid
+ITERATIONS = 3000  # largest number of L-BFGS iterations in one run of the optimiser
+ROUNDS = 2  # number of runs of the optimiser; the second run starts from the result of the first run
+RESOLUTION = math.radians(0.003)  # rad, accepted rms error that remains with the learned directions
+JUMP_KEPT = 0.45  # fraction of the speed jump at the step change that the fit keeps
+END_WEIGHT = 20.0  # weight of the samples at start and end of a step; the other samples have weight 1
+ACCELERATION_WEIGHT = 5e-2  # s2, weight of an acceleration error [rad/s2] relative to an angle error [rad]
+ALPHA = 1e-7  # penalty on the squared weights of the network; it smooths the gaits between the grid points
 SEED = 1  # seed of the initial weights
-_SAMPLES = 41  # number of phases of the metric
+_SAMPLES = 41  # number of samples of a step for the distance of two gaits
 
 
 class Fit(NamedTuple):
-    """Fitted network with its errors on the gaits of the fit."""
+    """Fitted network with its errors on the gaits of the library."""
 
     network: GaitNetwork
     directions: int  # number of learned directions
@@ -51,13 +51,13 @@ class Fit(NamedTuple):
 
 
 def fit(gaits: Sequence[Gait], grid: Grid, *, hidden: Sequence[int] = HIDDEN, iterations: int = ITERATIONS) -> Fit:
-    """Fit a network to gaits of a library; the same gaits give the same network.
+    """Fit a network to the gaits of a library. The result is deterministic.
 
     Args:
         gaits: gaits with the parameters of their subjects.
-        grid: grid of the library; its limits become the range of the network.
+        grid: grid of the library; its smallest and largest levels become the range of the network.
         hidden: number of neurons of each hidden layer.
-        iterations: largest number of iterations of the optimiser in a round.
+        iterations: largest number of L-BFGS iterations in one run of the optimiser.
     """
     low, high = (np.array([axis[end] for axis in grid.axes()]) for end in (0, -1))
     x = (np.array([inputs(gait) for gait in gaits]) - low) * (2.0 / (high - low)) - 1.0
@@ -70,7 +70,8 @@ def fit(gaits: Sequence[Gait], grid: Grid, *, hidden: Sequence[int] = HIDDEN, it
     root = np.linalg.cholesky(measure)
     deviations = (points - mean) @ root
     _, spread, directions = np.linalg.svd(deviations, full_matrices=False)
-    outside = np.sqrt(np.cumsum(spread[::-1] ** 2)[::-1] / len(gaits))  # rms of the rest after the first k directions
+    # Element k is the rms error that remains with the first k directions.
+    outside = np.sqrt(np.cumsum(spread[::-1] ** 2)[::-1] / len(gaits))
     directions = directions[: int((outside > RESOLUTION).sum())]
     scores = deviations @ directions.T
     unit = float(np.sqrt((scores**2).sum(axis=1).mean()))
@@ -80,7 +81,7 @@ def fit(gaits: Sequence[Gait], grid: Grid, *, hidden: Sequence[int] = HIDDEN, it
         max_iter=iterations, max_fun=2 * iterations, random_state=SEED, warm_start=True,
     )  # fmt: skip
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # the optimiser usually ends at the iteration limit
+        warnings.simplefilter("ignore", ConvergenceWarning)  # the optimiser usually stops at the iteration limit
         for _ in range(ROUNDS):
             perceptron.fit(x, scores / unit)
     back = unit * directions @ np.linalg.inv(root)
@@ -104,7 +105,13 @@ def inputs(gait: Gait) -> Vector:
 
 
 def _metric(duration: float) -> Vector:
-    """Return the quadratic form from a difference of control points to the mean square deviation, shape (96, 96)."""
+    """Return the matrix M of the squared distance d' M d of two gaits, shape (96, 96).
+
+    d is the difference of their control points. The squared distance is the weighted mean of squared errors along the step.
+
+    Args:
+        duration: duration of the step [s].
+    """
     phase = np.linspace(0.0, 1.0, _SAMPLES)
     angle = bezier(np.eye(DEGREE + 1), phase)
     acceleration = bezier(derivative(derivative(np.eye(DEGREE + 1))), phase) / duration**2
@@ -114,6 +121,6 @@ def _metric(duration: float) -> Vector:
 
 
 def _null_space(rows: Vector) -> Vector:
-    """Return an orthonormal basis of the solutions of rows x = 0, in columns."""
+    """Return an orthonormal basis of the null space of a matrix, one vector per column."""
     _, singular, right = np.linalg.svd(rows)
     return np.asarray(right[len(singular[singular > 1e-12]) :].T)

@@ -1,6 +1,6 @@
-"""Initial guess of the optimiser: a simple step by inverse kinematics, pelvis over the stance foot, knees bent.
+"""Initial guess of the optimiser: a simple step with bent knees, computed by inverse kinematics.
 
-All gaits of the library start from this guess, so that they converge to similar local minima.
+All gaits of the library start from this guess. They therefore converge to similar local minima.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from atalante_control.gait_optimization.step_problem import StepProblem
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
 
-_BEND = 0.96  # height of the pelvis above the ankle, fraction of the straight leg
-_WIDTH, _SWAY, _LIFT = (
-    0.20,
-    0.03,
-    0.06,
-)  # m, distance of the ankles, lateral motion of the pelvis, lift of the swing foot
-_CROUCH = {"SH": -0.25, "SK": 0.5, "SA": -0.2}  # rad, initial pose of the inverse kinematics
-_ITERATIONS, _TOLERANCE, _LARGEST = 50, 1e-6, 0.2  # iterations; tolerance [m, rad]; largest step of a joint [rad]
+_BEND = 0.96  # height of the pelvis above the ankle, as a fraction of the length of the straight leg
+_WIDTH = 0.20  # m, lateral distance of the ankles
+_SWAY = 0.03  # m, lateral motion of the pelvis
+_LIFT = 0.06  # m, largest height of the swing foot
+_CROUCH = {"SH": -0.25, "SK": 0.5, "SA": -0.2}  # rad, first pose of the inverse kinematics; other joints are at 0
+_ITERATIONS = 50  # largest number of iterations of the inverse kinematics for a pose
+_TOLERANCE = 1e-6  # m or rad, largest accepted error of the inverse kinematics
+_LARGEST = 0.2  # rad, largest change of a joint angle in one iteration
 
 
 def guess(problem: StepProblem, parameters: Vector, subject: Subject) -> Vector:
-    """Return the Bezier control points of an initial guess of a step, shape (12, 8) [rad].
+    """Return the Bezier control points of the initial guess of a step, shape (12, 8) [rad].
 
     Args:
-        problem: program of the step.
-        parameters: parameters of the program.
+        problem: nonlinear program of the step.
+        parameters: parameters of the nonlinear program.
         subject: patient and step parameters.
     """
     patient, step_length = subject.patient, subject.step_length
@@ -49,7 +49,7 @@ def guess(problem: StepProblem, parameters: Vector, subject: Subject) -> Vector:
 
 
 def _reach(errors: Any, pose: Vector, target: Vector, parameters: Vector) -> Vector:
-    """Return joint angles that move pelvis and swing ankle to the target, both level, by damped Gauss-Newton."""
+    """Return joint angles that put pelvis and swing ankle at the target with level attitude (damped Gauss-Newton)."""
     for _ in range(_ITERATIONS):
         error, jacobian = (np.array(value) for value in errors(pose, target, parameters))
         if np.abs(error).max() < _TOLERANCE:

@@ -1,8 +1,8 @@
-"""Library of gaits over a grid of subjects, computed by processes or a cluster; the computation can be resumed.
+"""Library of gaits for a grid of subjects, solved in parallel. An interrupted computation can be resumed.
 
 `Grid, solve -> one file for each gait -> fit`. Every gait is solved without a warm start, so it depends only on its own
-parameters and not on its neighbours, the number of processes or interruptions. The small error of the fit shows that neighbours
-still converge to similar local minima. Failures are recorded in files.
+parameters. Other gaits, the number of processes and interruptions have no effect. The small error of the fit shows that similar
+subjects converge to similar local minima. Failures are recorded in files.
 """
 
 from __future__ import annotations
@@ -25,20 +25,22 @@ from atalante_control.model import Patient
 from atalante_hal.robot import Robot, load_robot
 
 FORMAT = "atalante-library/1"
-LEVELS_MIN = 3  # smallest number of levels of a parameter; with two levels, the fit is wrong by 10 degrees between them
+LEVELS_MIN = 3  # smallest number of levels of a parameter; with 2 levels the network error between them is 10 degrees
 
 Index = tuple[int, ...]
-#: Function that solves one gait. It must be defined at module level, so that other processes can import it.
+#: Function that solves one gait. It must be defined at module level, because other processes import it.
 Solve = Callable[[Subject], SolvedGait]
 
 
 class LibraryError(ValueError):
-    """Error of a folder without the requested library. The message gives the remedy."""
+    """Folder without the requested library. The message states the remedy."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Levels of each parameter; the default covers the subjects of the paper (58 to 91 kg, 1.62 to 1.93 m).
+    """Grid of subjects. The default covers the subjects of the paper (58 to 91 kg, 1.62 to 1.93 m).
+
+    Each attribute contains the levels of one parameter in ascending order.
 
     Raises:
         ValueError: If there are fewer than three levels, levels are not ascending, or a subject is out of range.
@@ -58,20 +60,20 @@ class Grid:
 
     @staticmethod
     def names() -> tuple[str, ...]:
-        """Return the names of the parameters, in the order in which an `Index` lists their levels."""
+        """Return the names of the parameters, in the order of an `Index`."""
         return tuple(field.name for field in fields(Grid))
 
     def axes(self) -> tuple[tuple[float, ...], ...]:
-        """Return the levels of each parameter."""
+        """Return the levels of each parameter, in the order of `names`."""
         return (self.mass, self.height, self.step_length, self.step_duration)
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Return the number of levels of each parameter."""
+        """Return the number of levels of each parameter, in the order of `names`."""
         return tuple(map(len, self.axes()))
 
     def subject(self, index: Index) -> Subject:
-        """Return the subject at a point of the grid, with leg lengths of Winter's table.
+        """Return the subject at a point of the grid. Its leg lengths are those of Winter's table.
 
         Args:
             index: index of the level of each parameter.
@@ -85,7 +87,7 @@ class Grid:
 
 
 class Library:
-    """Folder of a library: `grid.json`, `gaits/` with one file for each gait, `failed/` with one record for each failure."""
+    """Library in a folder: `grid.json`, `gaits/` with one file per gait, and `failed/` with one file per failed gait."""
 
     def __init__(self, folder: Path, grid: Grid | None = None) -> None:
         """Open a library, or create it.
@@ -95,7 +97,7 @@ class Library:
             grid: required grid; None: the grid of the folder.
 
         Raises:
-            LibraryError: If the folder has no library and no grid is given, or if the grid of the folder is another one.
+            LibraryError: If the folder has no library and no grid is given, or if the grid of the library is not `grid`.
         """
         self.folder = folder
         path = folder / "grid.json"
@@ -114,7 +116,9 @@ class Library:
                 (folder / name).mkdir(parents=True, exist_ok=True)
             path.write_text(json.dumps({"format": FORMAT, **asdict(grid)}, indent=1) + "\n", encoding="utf-8")
         elif grid is not None and grid != found:
-            raise LibraryError(f"{folder} contains a library with another grid, {found}: choose another folder")
+            raise LibraryError(
+                f"grid of the library in {folder} must be {grid}, got {found}: choose another folder or grid"
+            )
         self.grid = grid or found or Grid()
 
     def gait(self, index: Index, robot: Robot) -> Gait | None:
@@ -143,7 +147,7 @@ class Library:
         return {index: gait for index, gait in found if gait is not None}
 
     def failures(self) -> dict[Index, str]:
-        """Return the reason of the last failure for each point that failed."""
+        """Return the reason of the last failure for each grid point that failed."""
         failed = ((index, self._path("failed", index)) for index in self.grid.points())
         return {
             index: str(json.loads(path.read_text(encoding="utf-8"))["status"])
@@ -152,7 +156,7 @@ class Library:
         }
 
     def missing(self) -> list[Index]:
-        """Return the points without a gait: failed, or not tried yet."""
+        """Return the grid points without a gait file."""
         return [index for index in self.grid.points() if not self._path("gaits", index).exists()]
 
     def generate(
@@ -162,7 +166,7 @@ class Library:
 
         Args:
             solve: function that solves one gait, defined at module level.
-            jobs: number of processes on this machine.
+            jobs: number of processes on this computer.
             cluster: address of a dask scheduler whose workers are used instead of processes.
 
         Raises:
@@ -201,9 +205,9 @@ def solve_subject(subject: Subject) -> SolvedGait:
 
 
 def solve_compiled(subject: Subject) -> SolvedGait:
-    """Solve the same gait as `solve_subject` with compiled functions.
+    """Solve and verify the gait of a subject with compiled functions. The result is the same as that of `solve_subject`.
 
-    The compilation is done once on a machine. Afterwards a gait takes half the time.
+    The functions are compiled once per computer. A gait then takes half the time.
 
     Args:
         subject: patient and step parameters.
@@ -212,7 +216,7 @@ def solve_compiled(subject: Subject) -> SolvedGait:
 
 
 def verified(subject: Subject, solved: SolvedGait) -> SolvedGait:
-    """Return the solved gait, with the status of a failure if the independent verification fails.
+    """Verify a solved gait with Pinocchio. If a check fails, return the gait with the failed check as status.
 
     Args:
         subject: patient and step parameters.
@@ -237,8 +241,10 @@ def _solve(solve: Solve, task: tuple[Index, Subject]) -> tuple[Index, SolvedGait
 
 def _read_grid(path: Path) -> Grid:
     document = json.loads(path.read_text(encoding="utf-8"))
-    if not isinstance(document, dict) or document.pop("format", None) != FORMAT:
-        raise ValueError(f"format of the grid of a library must be {FORMAT!r}")
+    if not isinstance(document, dict):
+        raise ValueError(f"the grid of a library must be a JSON object, got {type(document).__name__}")
+    if (found := document.pop("format", None)) != FORMAT:
+        raise ValueError(f"format of the grid of a library must be {FORMAT!r}, got {found!r:.80}")
     return Grid(**{name: _levels(name, values) for name, values in document.items()})
 
 

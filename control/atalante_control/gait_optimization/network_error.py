@@ -1,4 +1,4 @@
-"""Deviation of gaits of the network from solved gaits of the same subjects, compared with limits.
+"""Error of the gait network: deviation of its gaits from solved gaits of the same subjects, compared with limits.
 
 `GaitNetwork, newly solved gaits -> Deviation of each -> findings against the limits`. The subjects are not on the grid of the
 library, because the fit is always good there.
@@ -22,19 +22,21 @@ from atalante_hal.types import Vector
 
 
 class Deviation(NamedTuple):
-    """Deviation of the gait of one subject."""
+    """Deviation of the gait of the network from the solved gait, for one subject."""
 
-    angles: Vector  # (n, 12) rad, absolute deviation along the step
-    landing_position: float  # m, deviation of the swing foot at the landing, in the frame of the stance foot
-    landing_attitude: float  # rad, deviation of the swing foot at the landing
+    angles: Vector  # (n, 12) rad, absolute deviation of the joint angles along the step
+    landing_position: float  # m, deviation of the position of the swing foot relative to the stance foot at the landing
+    landing_attitude: (
+        float  # rad, deviation of the attitude of the swing foot relative to the stance foot at the landing
+    )
     position_defect: float  # rad, largest jump of a joint angle at the step change
     speed_defect: float  # rad/s, largest jump of a joint speed at the step change
-    feedforward: float  # rms of the difference over rms of the solved feedforward
-    within_limits: bool  # whether positions, speeds and feedforward of both steps are within the limits
+    feedforward: float  # rms of the feedforward difference, relative to the rms of the solved feedforward
+    within_limits: bool  # True: positions, speeds and feedforward of both steps are within the limits of the robot
 
 
 class Finding(NamedTuple):
-    """Line of the report: a value with its limit."""
+    """Line of the report: one error with its limit."""
 
     name: str
     value: float
@@ -51,8 +53,8 @@ def random_subjects(low: Vector, high: Vector, count: int, seed: int) -> Iterato
     """Yield random subjects within the range of a network.
 
     Args:
-        low: smallest values of INPUTS, shape (4,).
-        high: largest values of INPUTS, shape (4,).
+        low: smallest valid values of INPUTS, shape (4,).
+        high: largest valid values of INPUTS, shape (4,).
         count: number of subjects.
         seed: seed of the random generator.
     """
@@ -63,7 +65,7 @@ def random_subjects(low: Vector, high: Vector, count: int, seed: int) -> Iterato
 
 
 def deviation(subject: Subject, gait: Gait, solved: Gait, robot: Robot) -> Deviation:
-    """Compare the gait of the network with the solved gait.
+    """Compare the gait of the network with the solved gait of the same subject.
 
     Args:
         subject: patient and step parameters of both gaits.
@@ -71,28 +73,28 @@ def deviation(subject: Subject, gait: Gait, solved: Gait, robot: Robot) -> Devia
         solved: solved gait.
         robot: limits of the joints.
     """
-    ours, theirs = gait.tables(), solved.tables()
+    made, reference = gait.tables(), solved.tables()
     mirrored = gait.mirrored().tables()
     dynamics = stance_dynamics(robot, subject.patient)
-    landed = dynamics.swing_foot(theirs.q[-1]).actInv(dynamics.swing_foot(ours.q[-1]))
+    landed = dynamics.swing_foot(reference.q[-1]).actInv(dynamics.swing_foot(made.q[-1]))
     try:
         check_gait(gait, robot)
         within_limits = True
     except GaitError:
         within_limits = False
     return Deviation(
-        angles=np.abs(ours.q - theirs.q),
+        angles=np.abs(made.q - reference.q),
         landing_position=float(np.linalg.norm(landed.translation)),
         landing_attitude=float(np.linalg.norm(pinocchio.log3(landed.rotation))),
-        position_defect=float(np.abs(ours.q[-1] - mirrored.q[0]).max()),
-        speed_defect=float(np.abs(ours.qd[-1] - mirrored.qd[0]).max()),
-        feedforward=float(np.sqrt(((ours.uf - theirs.uf) ** 2).mean() / (theirs.uf**2).mean())),
+        position_defect=float(np.abs(made.q[-1] - mirrored.q[0]).max()),
+        speed_defect=float(np.abs(made.qd[-1] - mirrored.qd[0]).max()),
+        feedforward=float(np.sqrt(((made.uf - reference.uf) ** 2).mean() / (reference.uf**2).mean())),
         within_limits=within_limits,
     )
 
 
 def findings(deviations: Sequence[Deviation]) -> list[Finding]:
-    """Return the report: the worst value of all subjects, except for the percentile.
+    """Return the report over all subjects: 95th percentile and largest value of the joint error, largest other errors.
 
     Args:
         deviations: deviation of each subject.

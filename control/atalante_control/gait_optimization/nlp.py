@@ -1,8 +1,8 @@
-"""Sparse nonlinear program built from small functions, each repeated over groups of unknowns.
+"""Sparse nonlinear program built from small functions. Each function is repeated for several groups of unknowns.
 
 `Rows (SX expressions of a few unknowns) -> NonlinearProgram.add -> f, g and their exact sparse derivatives as five functions`.
-The module is independent of walking, which is modelled in `step_problem`. Every repeated function is differentiated once, in
-scalars. The program stores the indices at which the results of the repetitions are inserted.
+The module contains no model of walking; that is in `step_problem`. Every repeated function is differentiated only once. The
+program stores the matrix indices of the results of each repetition.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ import numpy.typing as npt
 
 from atalante_hal.types import Vector
 
-Places = npt.NDArray[np.intp]
+Indices = npt.NDArray[np.intp]
 Symbol = Any  # casadi.SX or casadi.MX
 
 
 class Rows(NamedTuple):
-    """Constraints of one name: lower <= values <= upper."""
+    """Named group of constraints: lower <= values <= upper."""
 
-    name: str  # readable name, for example "swing clearance"
+    name: str  # readable name of the group, for example "swing clearance"
     unit: str  # SI unit
-    size: float  # [unit] scale, the value that equals 1 in the program
+    size: float  # [unit] scale; the program divides values and bounds by it
     values: Symbol  # SX, shape (m,) [unit]
-    lower: Vector  # shape (m,), or (repetitions, m) if it differs between repetitions [unit]
+    lower: Vector  # [unit] shape (m,), or (repetitions, m) if the bounds differ between repetitions
     upper: Vector  # as `lower`
 
 
 class Group(NamedTuple):
-    """Row indices in g of the constraints of one name."""
+    """Rows of g that belong to one named group of constraints."""
 
     name: str  # as in `Rows`
     unit: str  # as in `Rows`
     size: float  # as in `Rows`
-    rows: Places  # row indices in g
+    rows: Indices  # row indices in g
 
 
 class Functions(NamedTuple):
-    """Functions for the solver, in the order of `NAMES`; x are the unknowns, p the parameters."""
+    """Functions of the unknowns x and the parameters p for the solver, in the order of `NAMES`."""
 
     objective: Any  # x, p -> f
     constraints: Any  # x, p -> g
@@ -54,12 +54,12 @@ NAMES = ("nlp_f", "nlp_g", "nlp_grad_f", "nlp_jac_g", "nlp_hess_l")
 
 
 class _Block(NamedTuple):
-    """Expression repeated over groups of unknowns: rows of g, or a part of the objective if it has weights."""
+    """Expression repeated for several groups of unknowns. It is part of g, or of the objective if it has weights."""
 
     expression: Symbol  # SX
     x: Symbol  # SX symbols of the unknowns of one repetition, shape (n,)
-    at: Places  # indices of the unknowns, shape (repetitions, n)
-    weights: Vector | None  # weight of each repetition in the objective; None: rows of g
+    at: Indices  # indices of the unknowns, shape (repetitions, n)
+    weights: Vector | None  # weight of each repetition in the objective; None: the expression is part of g
 
 
 class NonlinearProgram:
@@ -72,7 +72,7 @@ class NonlinearProgram:
     """
 
     def __init__(self, unknowns: int, parameters: Symbol) -> None:
-        """Create a program without rows.
+        """Create a program without constraints.
 
         Args:
             unknowns: number of unknowns.
@@ -86,7 +86,7 @@ class NonlinearProgram:
         self.groups: list[Group] = []
 
     def add_linear(self, name: str, unit: str, matrix: Vector, value: Vector) -> None:
-        """Add the constraint matrix @ x = value. Linear constraints must be added before all others.
+        """Add the constraints matrix @ x = value. Linear constraints must be added before all other constraints.
 
         Args:
             name: name of the group.
@@ -99,15 +99,15 @@ class NonlinearProgram:
         self._linear = np.concatenate([self._linear, matrix])
         self.lower, self.upper = np.append(self.lower, value), np.append(self.upper, value)
 
-    def add(self, rows: Sequence[Rows], x: Symbol, places: Sequence[Places]) -> None:
+    def add(self, rows: Sequence[Rows], x: Symbol, indices: Sequence[Indices]) -> None:
         """Add the same constraints for several groups of unknowns.
 
         Args:
             rows: constraints to repeat.
-            x: SX symbols on which the rows depend, shape (n,).
-            places: indices of the unknowns for each repetition, n indices each.
+            x: SX symbols on which the constraints depend, shape (n,).
+            indices: indices of the unknowns for each repetition, each of shape (n,).
         """
-        first, height, count = len(self.lower), sum(row.values.shape[0] for row in rows), len(places)
+        first, height, count = len(self.lower), sum(row.values.shape[0] for row in rows), len(indices)
         lower, upper = np.zeros((count, height)), np.zeros((count, height))
         start = 0
         for row in rows:
@@ -118,18 +118,18 @@ class NonlinearProgram:
             start += row.values.shape[0]
         self.lower, self.upper = np.append(self.lower, lower), np.append(self.upper, upper)
         expression = casadi.vertcat(*(row.values / row.size for row in rows))
-        self._blocks.append(_Block(expression, x, np.array(places), None))
+        self._blocks.append(_Block(expression, x, np.array(indices), None))
 
-    def minimise(self, cost: Symbol, x: Symbol, places: Sequence[Places], weights: Vector) -> None:
+    def minimise(self, cost: Symbol, x: Symbol, indices: Sequence[Indices], weights: Vector) -> None:
         """Add the weighted sum of a repeated scalar expression to the objective.
 
         Args:
             cost: scalar SX expression.
             x: SX symbols on which the cost depends, shape (n,).
-            places: indices of the unknowns for each repetition, n indices each.
+            indices: indices of the unknowns for each repetition, each of shape (n,).
             weights: weight of each repetition.
         """
-        self._blocks.append(_Block(cost, x, np.array(places), weights))
+        self._blocks.append(_Block(cost, x, np.array(indices), weights))
 
     def functions(self) -> Functions:
         """Build the five functions for the solver."""
@@ -144,7 +144,7 @@ class NonlinearProgram:
         row = len(self._linear)
         for block in self._blocks:
             count, height, at = len(block.at), block.expression.shape[0], block.at
-            local = casadi.horzcat(*(x[place.tolist()] for place in at))
+            local = casadi.horzcat(*(x[indices.tolist()] for indices in at))
             values, slopes, curvature = _derivatives(block, self._p)
             value, slope = values.map(count)(local, p), slopes.function.map(count)(local, p)
             if block.weights is None:
@@ -180,12 +180,12 @@ class _Entries(NamedTuple):
     """Function that returns the entries of a sparse matrix, with their row and column indices."""
 
     function: Any  # casadi.Function
-    rows: Places  # row index of each entry
-    columns: Places  # column index of each entry
+    rows: Indices  # row index of each entry
+    columns: Indices  # column index of each entry
 
 
 def _derivatives(block: _Block, p: Symbol) -> tuple[Any, _Entries, _Entries]:
-    """Return the expression, its Jacobian, and the upper triangle of its Hessian weighted with multipliers."""
+    """Return functions for the expression, its Jacobian, and the upper triangle of its Hessian weighted with multipliers."""
     lam = casadi.SX.sym("lam", block.expression.shape[0])
     slopes = casadi.jacobian(block.expression, block.x)
     curvature = casadi.triu(casadi.hessian(casadi.dot(lam, block.expression), block.x)[0])
@@ -195,22 +195,22 @@ def _derivatives(block: _Block, p: Symbol) -> tuple[Any, _Entries, _Entries]:
         ("hessian", curvature, [block.x, p, lam]),
     ):
         rows, columns = matrix.sparsity().get_triplet()
-        # Common subexpressions are not eliminated: this would save only 3 % of the operations and dominate the build time.
+        # Eliminating common subexpressions would save only 3 % of the operations and take most of the build time.
         function = casadi.Function(name, arguments, [casadi.vertcat(*matrix.nonzeros())])
         entries.append(_Entries(function, np.array(rows, np.intp), np.array(columns, np.intp)))
     return casadi.Function("values", [block.x, p], [block.expression]), entries[0], entries[1]
 
 
 class _Sparse:
-    """Sparse matrix under construction; entries with the same row and column are added."""
+    """Sparse matrix under construction. Entries with the same row and column are summed."""
 
     def __init__(self, rows: int, columns: int) -> None:
         self._shape = (rows, columns)
-        self._keys: list[Places] = []
+        self._keys: list[Indices] = []
         self._values: list[Symbol] = []
 
-    def add(self, rows: Places, columns: Places, values: Symbol) -> None:
-        """Add entries of repeated expressions.
+    def add(self, rows: Indices, columns: Indices, values: Symbol) -> None:
+        """Add the entries of all repetitions of an expression.
 
         Args:
             rows: row indices, shape (repetitions, n).
@@ -221,10 +221,10 @@ class _Sparse:
         self._values.append(casadi.vec(values))
 
     def matrix(self) -> Symbol:
-        """Return the matrix as an MX."""
+        """Return the sparse matrix as a CasADi MX."""
         keys = np.concatenate(self._keys)
-        distinct, place = np.unique(keys, return_inverse=True)
+        distinct, row = np.unique(keys, return_inverse=True)
         height = self._shape[0]
         sparsity = casadi.Sparsity.triplet(*self._shape, (distinct % height).tolist(), (distinct // height).tolist())
-        collect = casadi.Sparsity.triplet(len(distinct), len(keys), place.tolist(), list(range(len(keys))))
+        collect = casadi.Sparsity.triplet(len(distinct), len(keys), row.tolist(), list(range(len(keys))))
         return casadi.MX(sparsity, casadi.DM(collect, 1.0) @ casadi.vertcat(*self._values))

@@ -1,6 +1,6 @@
-"""Parallel calls in processes or workers of a cluster, for the gait library and the fault campaign.
+"""Parallel function calls in processes or on a cluster, used by the gait library and the fault campaign.
 
-The calls use `joblib.Parallel`, with its own processes, or with the workers of dask if a scheduler is given.
+The calls use `joblib.Parallel` with its own processes, or with the workers of a dask scheduler.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import Final, TypeVar
 
 _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
-#: Timeout of the connection to a scheduler.
-_MEETING: Final = "10s"
+#: Timeout of the connection to a dask scheduler.
+_CONNECT_TIMEOUT: Final = "10s"
 _LOKY_THREAD: Final = "ExecutorManagerThread"
 
 
 class FanOutError(RuntimeError):
-    """Error of calls that cannot be distributed. The message gives the remedy."""
+    """Parallel calls cannot be started. The message states the remedy."""
 
 
 def fan_out(
@@ -34,14 +34,14 @@ def fan_out(
 ) -> Generator[_Result, None, None]:
     """Call a function for many tasks in parallel, and yield the results in the order of completion.
 
-    Only the caller receives Ctrl-C. The processes ignore it and end when the iteration ends or is closed.
+    Only the caller handles Ctrl-C. The processes ignore it. They end when the iteration ends or is closed.
 
     Args:
-        call: function to call, defined at module level, so that other processes can import it.
+        call: function to call, defined at module level, because other processes import it.
         tasks: argument of each call.
         jobs: number of processes on this computer; 1: this process.
         cluster: address of a dask scheduler such as tcp://127.0.0.1:8786. The project must be installed on its workers.
-        patience: longest time without a result of the processes [s]; None: unlimited.
+        patience: longest time without a result of the processes [s]; None: unlimited. It has no effect on a cluster.
 
     Raises:
         FanOutError: If joblib or dask is missing, or the scheduler does not respond.
@@ -66,21 +66,21 @@ def fan_out(
         with _without_ctrl_c():
             results = pool(delayed(call)(task) for task in tasks)
         try:
-            for result in results:  # noqa: UP028 - `yield from` would close the results outside the block that suppresses warnings
+            for result in results:  # noqa: UP028 - `yield from` would close `results` without suppressing its warnings
                 yield result
-        except multiprocessing.TimeoutError as error:  # not a subclass of TimeoutError
-            raise TimeoutError(f"no result for {patience:g} s") from error
+        except multiprocessing.TimeoutError as error:  # this class is not a subclass of TimeoutError
+            raise TimeoutError(f"no parallel call finished within {patience:g} s") from error
         finally:
-            with warnings.catch_warnings(), _without_stumbles():
-                warnings.simplefilter("ignore", UserWarning)  # unused results are expected here
+            with warnings.catch_warnings(), _without_loky_errors():
+                warnings.simplefilter("ignore", UserWarning)  # joblib warns about results that are not used
                 results.close()
 
 
 @contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """Ignore Ctrl-C in this context. Processes started in it also ignore Ctrl-C, and their parent ends them.
+    """Ignore Ctrl-C in this context. Processes started in this context also ignore Ctrl-C, and their parent ends them.
 
-    Blocking the signal is not sufficient, because the resource tracker of joblib unblocks it for the processes started later.
+    The signal is ignored instead of blocked, because the resource tracker of joblib unblocks it for processes started later.
     """
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -90,11 +90,11 @@ def _without_ctrl_c() -> Iterator[None]:
 
 
 @contextmanager
-def _without_stumbles() -> Iterator[None]:
+def _without_loky_errors() -> Iterator[None]:
     """Suppress the report of a KeyError in the executor thread of loky.
 
-    On a kill, loky clears the pending calls and then kills its processes. A call that is being queued at that moment is then
-    looked up in vain (`add_call_item_to_queue` in loky 3.6). The error has no effect, because all calls are cancelled.
+    To stop its processes, loky first clears the table of pending calls. If the thread queues a call at that moment, the call is
+    missing in the table (`add_call_item_to_queue` in loky 3.6). The error has no effect, because all calls are cancelled.
     """
     before = threading.excepthook
 
@@ -113,13 +113,13 @@ def _without_stumbles() -> Iterator[None]:
 
 @contextmanager
 def _client(address: str) -> Iterator[None]:
-    """Connect to the scheduler; the backend `dask` of joblib uses this client."""
+    """Connect to a dask scheduler. The backend `dask` of joblib uses this client."""
     try:
         from distributed import Client
     except ModuleNotFoundError as error:
         raise FanOutError("--dask needs dask: install it with `pip install 'atalante-hal[dask]'`") from error
     try:
-        client = Client(address, timeout=_MEETING)  # type: ignore[no-untyped-call]
+        client = Client(address, timeout=_CONNECT_TIMEOUT)  # type: ignore[no-untyped-call]
     except (OSError, TimeoutError, ValueError) as error:
         raise FanOutError(
             f"no dask scheduler responds at {address} ({error}): start one with `dask scheduler`"

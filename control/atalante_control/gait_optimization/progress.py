@@ -1,4 +1,4 @@
-"""Progress report of IPOPT at each iteration: `iterate -> iteration number, largest violation`."""
+"""Progress report at each iteration of IPOPT: `iterate -> iteration number, largest constraint violation`."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import numpy as np
 
 from atalante_hal.types import Vector
 
-#: Function called at each iteration with its number and the largest violation in the scale of the program.
+#: Function of the iteration number and the largest constraint violation (scaled as in the program).
 Progress = Callable[[int, float], None]
 
 
 class Watch(casadi.Callback):
-    """Iteration callback of CasADi that reports the progress."""
+    """CasADi callback that reports the progress of the solver at each iteration."""
 
     def __init__(self, unknowns: int, bounds: tuple[Vector, Vector], progress: Progress) -> None:
         """Create the callback.
 
         Args:
             unknowns: number of unknowns of the program.
-            bounds: lower and upper bounds of the rows.
+            bounds: lower and upper bounds of the constraints.
             progress: function to call at each iteration.
         """
         casadi.Callback.__init__(self)
@@ -30,7 +30,7 @@ class Watch(casadi.Callback):
         self.construct("watch", {})
 
     def get_n_in(self) -> int:
-        """Return the number of outputs of a solver, which are the inputs of the callback."""
+        """Return the number of inputs of the callback, which are the outputs of the solver."""
         return int(casadi.nlpsol_n_out())
 
     def get_n_out(self) -> int:
@@ -38,17 +38,17 @@ class Watch(casadi.Callback):
         return 1
 
     def get_name_in(self, index: int) -> str:
-        """Return the name of an output of the solver."""
+        """Return the name of an input of the callback."""
         return str(casadi.nlpsol_out(index))
 
     def get_sparsity_in(self, index: int) -> Any:
-        """Return the shape of an output of the solver, empty for the multipliers of the parameters."""
+        """Return the sparsity of an input of the callback. The multipliers of the parameters are empty."""
         name, rows = self.get_name_in(index), len(self._bounds[0])
         length = {"f": 1, "x": self._unknowns, "lam_x": self._unknowns, "g": rows, "lam_g": rows}.get(name, 0)
         return casadi.Sparsity.dense(length, 1 if length else 0)
 
     def eval(self, arguments: Sequence[Any]) -> list[int]:
-        """Report the iteration and its largest violation, and let the solver continue."""
+        """Report the iteration and its largest constraint violation, and let the solver continue."""
         rows = np.array(arguments[casadi.nlpsol_out().index("g")]).ravel()
         outside = np.maximum(self._bounds[0] - rows, rows - self._bounds[1])
         self._progress(self._iteration, max(0.0, float(outside.max())))

@@ -1,4 +1,4 @@
-"""Check that a landing pose exists before a gait is solved: `problem, subject -> reason of refusal or None`.
+"""Check before the optimisation that a landing pose exists: `problem, subject -> None, or why there is no pose`.
 
 The search finds a pose with both feet flat on the ground, one step length apart, with soft joint limits. If a joint must leave
 its range, the joint with the largest violation is reported as the reason why there is no gait.
@@ -16,8 +16,8 @@ from atalante_control.gait_optimization.step_problem import StepProblem
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
 
-_TOLERANCE = math.radians(0.5)  # rad, violation that is accepted, because the optimiser can choose another pose
-_NEAR = 1e-6  # weight of the distance to the middle of the ranges, relative to the violation
+_TOLERANCE = math.radians(0.5)  # rad, accepted violation of a joint range; the optimiser can find a better pose
+_CENTRE_WEIGHT = 1e-6  # weight of the distance from the middle of the joint ranges; a violation has weight 1
 _OPTIONS: dict[str, Any] = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "error_on_fail": False}
 
 
@@ -25,10 +25,10 @@ class Reach:
     """Search for a landing pose, built once for a program."""
 
     def __init__(self, problem: StepProblem) -> None:
-        """Build the search.
+        """Build the solver of the search.
 
         Args:
-            problem: program of the step.
+            problem: nonlinear program of the step.
         """
         self._low, self._high = problem.joint_range()
         q, give = casadi.SX.sym("q", len(JOINTS)), casadi.SX.sym("give", len(JOINTS))
@@ -42,7 +42,7 @@ class Reach:
         program = {
             "x": casadi.vertcat(q, give),
             "p": problem.symbols,
-            "f": casadi.sumsqr(give) + _NEAR * casadi.sumsqr(q - (self._low + self._high) / 2.0),
+            "f": casadi.sumsqr(give) + _CENTRE_WEIGHT * casadi.sumsqr(q - (self._low + self._high) / 2.0),
             "g": casadi.vertcat(*(row.values for row in rows), inside),
         }
         self._solver: Any = casadi.nlpsol("reach", "ipopt", program, _OPTIONS)
@@ -51,7 +51,7 @@ class Reach:
         """Return the reason why there is no landing pose, or None if there is one.
 
         Args:
-            parameters: parameters of the program.
+            parameters: parameters of the nonlinear program.
             step_length: distance of the feet along the walking direction [m].
         """
         middle = np.clip(0.0, self._low, self._high)

@@ -1,4 +1,4 @@
-"""Result of the gait solver. `solve -> SolvedGait -> library, command line`."""
+"""Result of the gait solver: `solve -> SolvedGait -> library, command line`."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ class Residual(NamedTuple):
 
 @dataclass(frozen=True)
 class SolvedGait:
-    """Solved gait with the record of the solver, which is also in `gait.solver`."""
+    """Result of the solver: gait, status and constraint violations. `gait.solver` contains a summary."""
 
-    gait: Gait  # the last iterate if the solver failed
-    status: str  # SOLVED, or a sentence with the violated constraint
-    max_residual: float  # largest violation of all constraints, each in its SI unit
+    gait: Gait  # solved gait, or the last iterate if the solver failed
+    status: str  # SOLVED, or a sentence that names the violated constraint
+    max_residual: float  # largest violation of all constraints, each in its own SI unit
     solve_s: float  # s, computing time
     iterations: int  # iterations of the optimiser
-    residuals: Mapping[str, Residual] = field(default_factory=dict)  # by group of constraints
-    peak_torque: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (12,) Nm, at the nodes
+    residuals: Mapping[str, Residual] = field(default_factory=dict)  # largest violation of each group of constraints
+    peak_torque: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (12,) Nm, largest at the nodes
 
     @property
     def solved(self) -> bool:
-        """Return whether every constraint holds."""
+        """Return whether the solver found a gait that satisfies every constraint."""
         return self.status == SOLVED

@@ -1,7 +1,7 @@
-"""Solver of one step: `subject -> initial guess or neighbour -> IPOPT -> gait with its residuals in physical units`.
+"""Solver of one step: `subject -> initial guess or similar gait -> IPOPT -> gait with constraint violations in SI units`.
 
-The program of each kind of step is built once in a process and used for every subject. A warm start is faster. In all cases
-tried, solves with and without a warm start converged to the same gait.
+The nonlinear program of each kind of step is built once per process and used for every subject. A warm start is faster. In all
+cases tried, solves with and without a warm start converged to the same gait.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from atalante_control.gait_optimization.result import SOLVED, Residual, SolvedGa
 from atalante_control.gait_optimization.step_problem import TRANSITION, Kind, StepProblem
 from atalante_hal.robot import ROBOT_FILE, load_robot
 
-RESIDUAL = 1e-6  # largest violation of each constraint in a solved gait, in its SI unit
+RESIDUAL = 1e-6  # largest accepted violation of a constraint in a solved gait, in the SI unit of the constraint
 _OPTIONS: dict[str, Any] = {
-    "ipopt.nlp_scaling_method": "none",  # rows and unknowns are scaled already
+    "ipopt.nlp_scaling_method": "none",  # because constraints and unknowns of the program are scaled
     "ipopt.max_iter": 150,
     "ipopt.tol": 1e-8,
     "ipopt.constr_viol_tol": 1e-10,
@@ -42,12 +42,12 @@ _OPTIONS: dict[str, Any] = {
     "print_time": False,
     "error_on_fail": False,
     "calc_lam_p": False,
-    "no_nlp_grad": True,  # needed only for sensitivities, which compiled functions do not provide
+    "no_nlp_grad": True,  # the gradient serves only sensitivities, which compiled functions do not provide
 }
-#: IPOPT options of a warm start: small initial barrier parameter mu, with bound multipliers computed from mu. A solution takes
-#: 17 to 21 iterations instead of 34 to 36.
+#: IPOPT options of a warm start: a small initial barrier parameter mu, and bound multipliers computed from mu.
+#: With these options a solution takes 17 to 21 iterations instead of 34 to 36.
 _WARM: dict[str, Any] = {"ipopt.mu_init": 1e-3, "ipopt.bound_mult_init_method": "mu-based"}
-#: Source files that determine a gait, for `code_version`.
+#: Patterns of the source files that determine a gait; `code_version` hashes these files.
 _SOURCES = (
     *(
         f"gait_optimization/{module}.py"
@@ -64,20 +64,21 @@ def solve(
     progress: Progress | None = None,
     machine_code: bool = False,
 ) -> SolvedGait:
-    """Optimise a gait.
+    """Optimise the gait of one step.
 
     A start step leads from rest on both feet to the end of the periodic step of the subject. A stop step leads from the start of
     the periodic step to rest. Both take `step_problem.TRANSITION` seconds for every step duration.
 
     Args:
         subject: patient and step parameters.
-        warm_start: gait of a neighbour as the initial guess; None: `guess`.
+        warm_start: gait of a similar subject as the initial guess; None: the result of `guess`.
         kind: kind of step, `periodic`, `start` or `stop`.
-        progress: function to call at each iteration; None: no report.
-        machine_code: use compiled functions. The first use on a machine compiles them, about 15 s. This pays off for a library.
+        progress: function to call at each iteration; None: no progress report.
+        machine_code: True: use compiled functions. The first use on a computer compiles them in about 15 s, which is worth it
+            for a library.
 
     Returns:
-        The gait. If the solver failed: the last iterate, with a status that gives the violated constraint.
+        The gait. If the solver failed, the gait is the last iterate and the status names the violated constraint.
     """
     around = None if kind == "periodic" else solve(subject, machine_code=machine_code)
     if around is not None and not around.solved:
@@ -126,7 +127,7 @@ def solve(
 
 @cache
 def code_version() -> str:
-    """Return the version of the package and a hash of program, model, feedforward and robot file."""
+    """Return the version of the package and a hash of the files that determine a gait, including the robot file."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256(ROBOT_FILE.read_bytes())
     for pattern in _SOURCES:
@@ -136,7 +137,7 @@ def code_version() -> str:
 
 
 def _unmet(problem: StepProblem, residuals: Mapping[str, Residual]) -> str:
-    """Return a sentence with the constraint of the largest violation relative to its size."""
+    """Return a sentence that names the constraint with the largest violation relative to its scale."""
     name = max(residuals, key=lambda group: residuals[group].value / problem.units[group][1])
     value, unit = residuals[name]
     return f"the constraint '{name}' is violated by {value:.3g} {unit}"

@@ -1,13 +1,13 @@
 """Walking step as a nonlinear program: unknowns, constraints in named groups, and cost.
 
-`Chain, Requirements -> rows of one node, of both ends, of the impact -> NonlinearProgram`, built once for a kind of step.
+`Chain, Requirements -> constraints of one node, of both ends, of the impact -> NonlinearProgram`, built once per kind of step.
 Subject, step length and duration are parameters. Bezier control points determine the motion. The unknowns of a node are the
 joint angles, their first and second derivatives with respect to the phase, the torques and the ground wrench. Linear equations
-connect them to the control points, dynamic equations to each other. The redundant unknowns keep the equations short and the
-matrix sparse.
+connect the unknowns of a node to the control points. The equations of motion connect them to each other. These redundant unknowns
+keep the equations short and the matrix sparse.
 
-Stance foot and swing foot are flat rigid bodies on flat ground, and the stance foot does not move. Every step is fully actuated,
-so the partial hybrid zero dynamics has no zero dynamics. The impact map closes the cycle.
+Stance foot and swing foot are flat rigid bodies on flat ground. The stance foot does not move. Every step is fully actuated, so
+the partial hybrid zero dynamics has no zero dynamics. The impact map connects the end of a step with the start of the next step.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import casadi
 import numpy as np
 
 from atalante_control.gait.gait import DEGREE, SIGN, SWAP, Gait, bezier, derivative
-from atalante_control.gait_optimization.nlp import NonlinearProgram, Places, Rows
+from atalante_control.gait_optimization.nlp import Indices, NonlinearProgram, Rows
 from atalante_control.gait_optimization.requirements import Requirements
 from atalante_control.gait_optimization.result import Residual
 from atalante_control.gait_optimization.symbolic_dynamics import Chain
@@ -30,12 +30,12 @@ from atalante_hal.types import Vector
 Symbol = Any  # casadi.SX
 Kind = Literal["periodic", "start", "stop"]
 KINDS: tuple[Kind, ...] = ("periodic", "start", "stop")
-TRANSITION = 1.2  # s, of start and stop steps
+TRANSITION = 1.2  # s, duration of start and stop steps
 
 _N = len(JOINTS)
-_POINTS = _N * (DEGREE + 1)  # unknowns before the nodes: control points, joint after joint
-_NODE = 4 * _N + 6  # unknowns of a node: q, dq/ds, d2q/ds2, torque, ground force, ground moment
-_TORQUE, _FORCE, _MOMENT = 100.0, 1500.0, 1500.0  # Nm, N, Nm: scales of the unknowns
+_POINTS = _N * (DEGREE + 1)  # number of control points, which are the first unknowns, joint after joint
+_NODE = 4 * _N + 6  # number of unknowns of a node: q, dq/ds, d2q/ds2, torque, ground force, ground moment
+_TORQUE, _FORCE, _MOMENT = 100.0, 1500.0, 1500.0  # scales of joint torque [Nm], ground force [N], ground moment [Nm]
 _BOUND_UNITS = {
     "joint limits": ("rad", 0.1),
     "speed limits": ("rad/s", 1.0),
@@ -43,24 +43,21 @@ _BOUND_UNITS = {
     "vertical ground force": ("N", _FORCE),
 }
 _KNEES = [i for i, joint in enumerate(JOINTS) if joint.endswith("SK")]
-_MIRROR = casadi.DM(
-    [1.0, -1.0, 1.0]
-)  # reflects a polar vector in the sagittal plane; an axial vector needs the negative
+#: Reflection of a polar vector in the sagittal plane. An axial vector is multiplied by the negative.
+_MIRROR = casadi.DM([1.0, -1.0, 1.0])
 
 
 class StepProblem:
-    """Program of one kind of step, for any subject, step length and duration.
+    """Nonlinear program of one kind of step, for any subject, step length and duration.
 
     Attributes:
-        program: nonlinear program with rows and bounds.
+        program: nonlinear program with constraints and bounds.
         phases: phases of the nodes, shape (nodes,).
         symbols: symbols of the parameters.
     """
 
     def __init__(self, kind: Kind, robot: Robot, requirements: Requirements) -> None:
-        """Build the program.
-
-        The program and its functions take some seconds, so they are built only once. Most of the time is for the functions.
+        """Build the nonlinear program. This takes some seconds.
 
         Args:
             kind: kind of step, `periodic`, `start` or `stop`.
@@ -76,14 +73,14 @@ class StepProblem:
         self._bases.append(bezier(derivative(derivative(identity)), self.phases))
         self._duration, self._length = casadi.SX.sym("T"), casadi.SX.sym("L")
         self.symbols = casadi.vertcat(self.chain.symbols, self._duration, self._length)
-        self._yaw = casadi.DM(_about_z(self.chain.stance_yaw))  # stance foot to walking direction
+        self._yaw = casadi.DM(_about_z(self.chain.stance_yaw))  # rotation from stance foot to walking frame
         self.program = NonlinearProgram(_POINTS + requirements.nodes * _NODE, self.symbols)
         self._build()
-        #: Unit and size of each group of constraints.
+        #: Unit and scale of each group of constraints, by name.
         self.units = {group.name: (group.unit, group.size) for group in self.program.groups} | _BOUND_UNITS
 
     def parameters(self, patient: Patient, duration: float, step_length: float) -> Vector:
-        """Return the parameters of the program.
+        """Return the values of the parameters of the program.
 
         Args:
             patient: patient in the exoskeleton.
@@ -100,7 +97,7 @@ class StepProblem:
         return low, self.robot.position_max - self.requirements.joint_margin
 
     def bounds(self, duration: float) -> tuple[Vector, Vector]:
-        """Return the lower and upper bounds of the unknowns: joint, speed and torque limits, vertical force.
+        """Return the lower and upper bounds of the unknowns: limits of angles, speeds, torques and vertical ground force.
 
         Args:
             duration: duration of the step [s].
@@ -117,7 +114,7 @@ class StepProblem:
         return np.concatenate([-points, np.tile(lower, nodes)]), np.concatenate([points, np.tile(upper, nodes)])
 
     def unknowns(self, coefficients: Vector, parameters: Vector) -> Vector:
-        """Return all unknowns of a motion, shape (unknowns,), with torques from inverse dynamics.
+        """Return the unknowns of a motion, shape (unknowns,). Torques and ground wrench come from inverse dynamics.
 
         Args:
             coefficients: Bezier control points, shape (12, 8) [rad].
@@ -155,9 +152,9 @@ class StepProblem:
         """Return the largest violation of each group of constraints, in its unit.
 
         Args:
-            unknowns: result of `unknowns`, so that torques and ground forces follow from the motion.
-            rows: g at these unknowns.
-            bounds: lower and upper bounds of the rows.
+            unknowns: result of `unknowns`; its torques and ground forces follow from the motion.
+            rows: values of g at these unknowns.
+            bounds: lower and upper bounds of g.
             duration: duration of the step [s].
         """
         outside, found = _outside(rows, bounds), dict[str, float]()
@@ -171,7 +168,7 @@ class StepProblem:
         found["vertical ground force"] = float(beyond[4 * _N :].max()) * _FORCE
         return {name: Residual(value, self.units[name][0]) for name, value in found.items()}
 
-    def node(self, index: int) -> Places:
+    def node(self, index: int) -> Indices:
         """Return the indices of the unknowns of a node.
 
         Args:
@@ -216,9 +213,10 @@ class StepProblem:
         program.minimise(cost, z, [self.node(n) for n in range(requirements.nodes)], weights)
 
     def _reach_function(self, q: Symbol) -> Any:
-        """Return the function for the inverse kinematics: pose, target, parameters -> error and its Jacobian.
+        """Return a CasADi function for inverse kinematics: `pose, target, parameters -> error, Jacobian of the error`.
 
-        The target is the position of pelvis and swing ankle in the walking frame [m]. The error includes their attitudes.
+        The target contains the positions of pelvis and swing ankle in the walking frame [m]. The error contains the position
+        errors and the tilts of pelvis and swing foot.
         """
         target = casadi.SX.sym("target", 6)
         frames = self.chain.frames(q, casadi.SX(_N, 1))
@@ -232,7 +230,7 @@ class StepProblem:
         return casadi.Function("reach", [q, target, self.symbols], [error, casadi.jacobian(error, q)])
 
     def _trajectory_rows(self) -> Vector:
-        """Return the rows by which the nodes follow from the control points: q, dq/ds, d2q/ds2 less basis times points is 0."""
+        """Return the linear constraints that compute q, dq/ds and d2q/ds2 of every node from the control points."""
         rows = np.zeros((self.requirements.nodes, 3, _N, self.program.unknowns))
         for node in range(self.requirements.nodes):
             for order, basis in enumerate(self._bases):
@@ -243,7 +241,7 @@ class StepProblem:
         return rows.reshape(-1, self.program.unknowns)
 
     def _control_point(self, index: int) -> Vector:
-        """Return the rows that select a control point of every joint, shape (12, unknowns)."""
+        """Return the matrix that selects one control point of every joint, shape (12, unknowns)."""
         rows = np.zeros((_N, self.program.unknowns))
         rows[np.arange(_N), np.arange(_N) * (DEGREE + 1) + index % (DEGREE + 1)] = 1.0
         return rows
@@ -254,7 +252,7 @@ class StepProblem:
             rows = point(0) - SIGN[:, None] * point(-1)[SWAP]
             program.add_linear("periodicity", "rad", rows, np.zeros(_N))
             return
-        # At one end the control points are those of the gait (`constraint_bounds`); at the other end the robot is at rest.
+        # A start step begins at rest and ends in the gait. A stop step begins in the gait and ends at rest.
         given, rest = ((-1, -2), (0, 1, 2)) if self.kind == "start" else ((0, 1), (-1, -2, -3))
         for name, index in zip(("gait pose", "gait speed"), given, strict=True):
             program.add_linear(name, "rad", point(index), np.zeros(_N))
@@ -262,7 +260,7 @@ class StepProblem:
             program.add_linear(name, "rad", point(rest[0]) - point(index), np.zeros(_N))
 
     def constraint_bounds(self, around: Gait | None = None) -> tuple[Vector, Vector]:
-        """Return the lower and upper bounds of the rows.
+        """Return the lower and upper bounds of g.
 
         Args:
             around: periodic gait after a start step or before a stop step; None for a periodic step.
@@ -271,7 +269,7 @@ class StepProblem:
         if around is not None:
             end, next_one = (-1, -2) if self.kind == "start" else (0, 1)
             pose, other = around.coefficients[:, end], around.coefficients[:, next_one]
-            # The speed is the same, but the duration of the step differs.
+            # The joint speed is the same, but the derivative with respect to the phase scales with the duration.
             points = {"gait pose": pose, "gait speed": pose + (other - pose) * TRANSITION / around.duration}
             for group in self.program.groups:
                 if group.name in points:
@@ -292,7 +290,7 @@ class StepProblem:
         return wrench[3:] * _MOMENT - casadi.cross(casadi.DM([x, 0.0, z]), wrench[:3] * _FORCE)
 
     def _ground(self, wrench: Symbol) -> list[Rows]:
-        """Return the rows of the friction cone, centre of pressure and yaw moment, as margins of the vertical force [N]."""
+        """Return the constraints of friction cone, centre of pressure and yaw moment, as margins of the vertical force."""
         requirements, exo = self.requirements, self.exoskeleton
         force, moment = wrench[:3] * _FORCE, self._pressure_moment(wrench)
         length, width = exo.sole_size
@@ -304,7 +302,7 @@ class StepProblem:
         def within(value: Symbol, lever: float) -> Symbol:
             return casadi.vertcat(force[2] - value / lever, force[2] + value / lever)
 
-        # The cone is a difference of squares divided by the size, which is smooth everywhere and has the unit N.
+        # A difference of squares is smooth everywhere. Divided by the scale of the force, it has the unit N.
         cone = (force[2] ** 2 - (force[0] ** 2 + force[1] ** 2) / requirements.friction**2) / _FORCE
         return [
             _positive("ground friction", "N", _FORCE, cone),
@@ -314,7 +312,7 @@ class StepProblem:
         ]
 
     def attitude(self, q: Symbol) -> list[Rows]:
-        """Return the rows that keep the pelvis upright and facing forward.
+        """Return the constraints that keep the pelvis upright and facing forward.
 
         Args:
             q: joint angles, SX of shape (12,) [rad].
@@ -325,7 +323,7 @@ class StepProblem:
         return [Rows("pelvis attitude", "rad", 0.1, tilt, -limit, limit)]
 
     def _swing(self, q: Symbol, rate: Symbol) -> list[Rows]:
-        """Return the rows that keep the corners of the swing foot's sole above the ground, and its ankle in a corridor."""
+        """Return the constraints on the height of the swing sole and on the lateral position of the swing ankle."""
         requirements = self.requirements
         foot = self.chain.frames(q, rate)[self.chain.swing_foot]
         ground = self.exoskeleton.sole_centre[1]
@@ -350,18 +348,18 @@ class StepProblem:
         ]
 
     def landing(self, q: Symbol) -> list[Rows]:
-        """Return the rows of the landing: swing foot flat on the ground, mirrored toe-out, one step length ahead.
+        """Return the constraints of the landing pose: swing foot flat on the ground, one step length ahead, toe-out mirrored.
 
         Args:
             q: joint angles, SX of shape (12,) [rad].
         """
         foot = self.chain.frames(q, casadi.SX(_N, 1))[self.chain.swing_foot]
         position = self._yaw @ foot.position
-        tilt = _tilt(self._yaw @ self._yaw @ foot.rotation)  # with the mirrored toe-out of the stance foot
+        tilt = _tilt(self._yaw @ self._yaw @ foot.rotation)  # the second yaw removes the toe-out of the swing foot
         zero, requirements = np.zeros(3), self.requirements
-        place = casadi.vertcat(position[0] - self._length, position[2])
+        error = casadi.vertcat(position[0] - self._length, position[2])
         return [
-            Rows("landing place", "m", 1.0, place, zero[:2], zero[:2]),
+            Rows("landing position", "m", 1.0, error, zero[:2], zero[:2]),
             Rows("landing attitude", "rad", 1.0, tilt, zero, zero),
             Rows(
                 "landing width",
@@ -374,7 +372,7 @@ class StepProblem:
         ]
 
     def _touchdown(self, q: Symbol, rate: Symbol) -> list[Rows]:
-        """Return the rows of a soft landing, with limits of the vertical, sliding and angular speed of the foot."""
+        """Return the constraints of a soft landing: limits of the vertical, horizontal and angular speed of the foot."""
         requirements = self.requirements
         foot = self.chain.frames(q, rate)[self.chain.swing_foot]
         speed = self._yaw @ foot.rotation @ foot.linear
@@ -388,10 +386,11 @@ class StepProblem:
         ]
 
     def _add_impact(self) -> None:
-        """Add the impact map to the mirrored start: no joint impulse, upward ground impulse, limited sinking of the leaving foot.
+        """Add the impact map, which connects the speeds at the end of a step with those at the start of the next step.
 
         In the mirrored robot the landing foot is the stance foot. The impact changes its twist to zero and the joint speeds to
-        those of the next step.
+        those of the next step. The joint impulses are zero, the ground impulse is upwards, and the sinking speed of the other
+        foot is limited.
         """
         requirements, program, duration = self.requirements, self.program, self._duration
         q0, v0, q1, v1 = (casadi.SX.sym(name, _N) for name in ("q0", "v0", "q1", "v1"))
@@ -434,7 +433,7 @@ def _outside(values: Vector, bounds: tuple[Vector, Vector]) -> Vector:
 
 
 def _tilt(rotation: Symbol) -> Symbol:
-    """Return a small rotation as three numbers, which are zero for the identity."""
+    """Return the first-order rotation vector of a small rotation, shape (3,) [rad]."""
     return casadi.vertcat(rotation[2, 1], -rotation[2, 0], rotation[1, 0])
 
 

@@ -1,9 +1,10 @@
-"""Inverse dynamics and kinematics of the walking chain in CasADi symbols, from the flat stance foot to the swing foot.
+"""Symbolic kinematics and inverse dynamics of the robot standing on its right foot, in CasADi.
 
-`links of the model -> bodies -> Chain (topology, numbers as parameters) -> expressions for the program`. The tree of the model is
-rooted at the pelvis, but the right foot is at rest. The recursion therefore starts at the right foot: up the stance leg against
-the direction of the joints, then down the swing leg. The algorithm is Featherstone's recursive Newton-Euler algorithm in link
-frames. Accelerations are those of the frame origins and include gravity. The root frame is that of the stance foot.
+`links of the model -> bodies -> Chain (topology, masses and lengths as parameters) -> expressions for the program`. The tree of
+the model is rooted at the pelvis, but the right foot is at rest. The recursion therefore starts at the right foot. It goes up the
+stance leg against the direction of the joints, then down the swing leg. The algorithm is Featherstone's recursive Newton-Euler
+algorithm in link frames. Accelerations are those of the frame origins and include gravity. The root frame is that of the stance
+foot.
 """
 
 from __future__ import annotations
@@ -29,17 +30,17 @@ _NUMBERS = 13  # parameters per body: mass, first moment (3), inertia about the 
 
 @dataclass(frozen=True)
 class Body:
-    """Moving link with the links fixed to it, and the inertia about the origin of the link."""
+    """Moving link with all links that are fixed to it. Its inertia is about the origin of the link."""
 
     name: str  # of the link
     parent: str  # name of the parent link
-    joint: int  # index in JOINTS, -1 for the pelvis
-    origin: Vector3  # m, position of the joint in the frame of the parent
-    yaw: float  # rad, rotation about z of the parent
+    joint: int  # index of the joint in JOINTS; -1 for the pelvis, which has no joint
+    origin: Vector3  # m, position of the joint in the frame of the parent link
+    yaw: float  # rad, rotation about z of the parent link
     axis: Vector3  # joint axis in the frame of the link
     mass: float  # kg
-    moment: Vector3  # kg m, mass times centre of mass
-    inertia: Vector  # (6,) kg m2 about the origin: xx, xy, xz, yy, yz, zz
+    moment: Vector3  # kg m, mass times position of the centre of mass
+    inertia: Vector  # (6,) kg m2, inertia about the origin of the link: xx, xy, xz, yy, yz, zz
 
 
 @dataclass(frozen=True)
@@ -56,12 +57,12 @@ class Frame:
 
     rotation: Symbol  # (3, 3), link to stance foot
     position: Symbol  # (3,) m
-    angular: Symbol  # (3,) rad/s, in the axes of the link
+    angular: Symbol  # (3,) rad/s, angular velocity in the axes of the link
     linear: Symbol  # (3,) m/s, velocity of the origin of the link, in the axes of the link
 
 
 def bodies(links: Sequence[Link]) -> tuple[Body, ...]:
-    """Return the pelvis and the twelve bodies moved by the joints, in the order of `JOINTS`, with fixed links fused into them.
+    """Return the pelvis and the twelve moving bodies in the order of `JOINTS`. Fixed links are fused into them.
 
     Args:
         links: links of the model, parents first.
@@ -74,12 +75,12 @@ def bodies(links: Sequence[Link]) -> tuple[Body, ...]:
     moment = {name: np.zeros(3) for name in carriers}
     inertia = {name: np.zeros((3, 3)) for name in carriers}
     for link in links:
-        carrier, place = (link.name, np.zeros(3)) if link.name in carriers else (link.parent, np.array(link.origin))
+        carrier, offset = (link.name, np.zeros(3)) if link.name in carriers else (link.parent, np.array(link.origin))
         if carrier not in carriers or (carrier != link.name and link.yaw):
             raise ValueError(
                 f"fixed link {link.name} must have yaw 0 and a moving parent, got yaw {link.yaw} and parent {link.parent}"
             )
-        centre = place + np.array(link.inertia.centre)
+        centre = offset + np.array(link.inertia.centre)
         mass[carrier] += link.inertia.mass
         moment[carrier] += link.inertia.mass * centre
         inertia[carrier] += _tensor(link.inertia) + link.inertia.mass * (
@@ -104,42 +105,42 @@ def bodies(links: Sequence[Link]) -> tuple[Body, ...]:
 
 
 class Chain:
-    """Walking chain with its numbers as symbols, so that one set of expressions is valid for every subject.
+    """Chain of bodies from stance foot to swing foot. Its masses and lengths are symbols, valid for every subject.
 
     Axes and toe-out are constants. Numbers that are zero in the reference remain zero, which keeps the expressions small.
     """
 
     def __init__(self, reference: Sequence[Link]) -> None:
-        """Build the chain.
+        """Build the chain from a reference robot.
 
         Args:
-            reference: links of a reference robot, which define topology, axes and the pattern of zeros.
+            reference: links of the reference robot, which define topology, axes and the numbers that are zero.
         """
         self.bodies = bodies(reference)
         numbers = _numbers(self.bodies)
         self._used = np.flatnonzero(numbers)
         self.symbols = casadi.SX.sym("chain", len(self._used))
         flat = [casadi.SX(0)] * numbers.size
-        for place, index in enumerate(self._used):
-            flat[index] = self.symbols[place]
+        for i, index in enumerate(self._used):
+            flat[index] = self.symbols[i]
         width = numbers.shape[1]
         self._rows = [casadi.vertcat(*flat[i * width : (i + 1) * width]) for i in range(len(self.bodies))]
-        by_name = {body.name: i for i, body in enumerate(self.bodies)}
-        self._route: list[tuple[int, int, bool]] = []  # (body, next body, whether the next body is the parent)
-        place = by_name[STANCE_FOOT]
-        while self.bodies[place].parent:
-            parent = by_name[self.bodies[place].parent]
-            self._route.append((place, parent, True))
-            place = parent
+        by_name = {named.name: i for i, named in enumerate(self.bodies)}
+        self._route: list[tuple[int, int, bool]] = []  # (body, next body, True if the next body is the parent)
+        body = by_name[STANCE_FOOT]
+        while self.bodies[body].parent:
+            parent = by_name[self.bodies[body].parent]
+            self._route.append((body, parent, True))
+            body = parent
         self._route += [
-            (by_name[body.parent], by_name[body.name], False) for body in self.bodies if body.name.startswith(_LEFT)
+            (by_name[child.parent], by_name[child.name], False) for child in self.bodies if child.name.startswith(_LEFT)
         ]
         self.root, self.pelvis, self.swing_foot = by_name[STANCE_FOOT], by_name[BASE_LINK], by_name[SWING_FOOT]
-        #: Yaw of the stance foot with the pelvis facing forward and all joints at zero [rad].
-        self.stance_yaw = math.fsum(body.yaw for body in self.bodies if body.name.startswith(_RIGHT))
+        #: Yaw of the stance foot relative to the pelvis with all joints at zero [rad].
+        self.stance_yaw = math.fsum(link.yaw for link in self.bodies if link.name.startswith(_RIGHT))
 
     def values(self, links: Sequence[Link]) -> Vector:
-        """Return the numbers of a robot for `symbols`.
+        """Return the values of `symbols` for a robot.
 
         Args:
             links: links of the robot.
@@ -155,11 +156,13 @@ class Chain:
         numbers = _numbers(robot).ravel()
         unused = np.delete(numbers, self._used)
         if not same or unused.any():
-            raise ValueError("the robot has another topology than the one the program was built for")
+            raise ValueError(
+                "topology, axes and zero masses and lengths of the robot must be those of the reference robot, got others"
+            )
         return np.asarray(numbers[self._used])
 
     def frames(self, q: Symbol, qd: Symbol) -> dict[int, Frame]:
-        """Return pose and velocity of every body by its index in `bodies`, with the stance foot at rest.
+        """Return pose and velocity of every body, by index in `bodies`. The stance foot is at rest.
 
         Args:
             q: joint angles, SX of shape (12,) [rad].
@@ -189,8 +192,8 @@ class Chain:
     ) -> tuple[Symbol, Wrench]:
         """Return the joint torques (12,) [Nm] and the ground wrench of a motion of the chain.
 
-        The angular velocity of the stance foot is zero. If velocity changes are given instead of accelerations and `qd` is zero,
-        the results are the joint impulses and the ground impulse of an impact.
+        The angular velocity of the stance foot is zero. For an impact, pass velocity changes as accelerations, and zero as `qd`.
+        The results are then the joint impulses and the ground impulse.
 
         Args:
             q: joint angles, SX of shape (12,) [rad].
@@ -254,7 +257,13 @@ class Chain:
 
 
 def _carried(omega: Symbol, alpha: Symbol, lever: Symbol) -> Symbol:
-    """Return the acceleration of a point at `lever` relative to the origin."""
+    """Return the acceleration of a point of a rotating body relative to the origin of the body.
+
+    Args:
+        omega: angular velocity [rad/s].
+        alpha: angular acceleration [rad/s2].
+        lever: position of the point relative to the origin [m].
+    """
     return casadi.cross(alpha, lever) + casadi.cross(omega, casadi.cross(omega, lever))
 
 

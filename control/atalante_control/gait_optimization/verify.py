@@ -1,9 +1,9 @@
 """Independent verification of a gait: `gait, patient -> Pinocchio -> checks of joints, ground forces and impact`.
 
-No code is shared with the optimiser. Polynomials are evaluated by de Casteljau, and the model is the URDF. The pelvis is a
-floating base, whose motion follows from the stance foot at rest. Torques and ground wrench come from recursive Newton-Euler on
-this base, and the impact is the KKT system of the floating robot. The step is sampled every few milliseconds, not only at the
-nodes of the optimiser.
+The verification shares no code with the optimiser. Polynomials are evaluated by de Casteljau's algorithm, and the model is the
+URDF. The pelvis is a floating base. Its motion follows from the stance foot, which is at rest. Torques and ground wrench come
+from recursive Newton-Euler on this base. The impact is computed with the KKT system of the floating robot. The step is sampled
+every few milliseconds, which is finer than the nodes of the optimiser.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from atalante_hal.types import Vector
 _LEFT, _RIGHT = (f"{side}_{LEG_LINKS['HA']}" for side in SIDES)
 _SAMPLES = 201  # number of samples of a step
 _LOCAL = pinocchio.ReferenceFrame.LOCAL
-_EXACT = 1e-6  # SI units, tolerance of equality constraints of the optimiser
-_SLIDING = 1.0  # Ns, accepted impulse beyond friction at the impact; it changes the speed of the robot by some mm/s
-_SINKING = 1e-3  # m, accepted depth of the leaving foot at the start of its swing
+_EXACT = 1e-6  # tolerance of the equality constraints of the optimiser, in SI units
+_SLIDING = 1.0  # Ns, accepted impact impulse beyond the friction limit; it changes the robot's speed by some mm/s
+_SINKING = 1e-3  # m, accepted depth of the swing sole below the ground at the start of the swing
 
 
 class GaitCheck(NamedTuple):
-    """Check of a gait: the largest value found, and its limit."""
+    """Result of one check of a gait: the largest value and its limit."""
 
     name: str
     value: float
@@ -42,15 +42,15 @@ class GaitCheck(NamedTuple):
 
 
 class _Motion(NamedTuple):
-    """Samples of a step; shape (n, 12) [rad, rad/s, rad/s2]."""
+    """Joint angles, speeds and accelerations at the samples of a step."""
 
-    q: Vector
-    qd: Vector
-    qdd: Vector
+    q: Vector  # (n, 12) rad
+    qd: Vector  # (n, 12) rad/s
+    qdd: Vector  # (n, 12) rad/s2
 
 
 class Verifier:
-    """Verifier for the exoskeleton with a patient, modelled with a floating base."""
+    """Verifier of gaits for the exoskeleton with one patient, modelled with a floating base."""
 
     def __init__(self, robot: Robot, patient: Patient) -> None:
         """Build the Pinocchio model from the URDF.
@@ -71,23 +71,25 @@ class Verifier:
 
         Args:
             gait: gait to verify.
-            kind: `periodic`, or `start` or `stop`, which are at rest at one end and have no impact.
+            kind: kind of step, `periodic`, `start` or `stop`. Start and stop steps are at rest at one end and have no impact.
         """
         motion = _sampled(gait, np.linspace(0.0, 1.0, _SAMPLES))
         checks = [*self._joints(motion), *self._loads(motion), *self._swing(motion)]
         return (*checks, *(self._cycle(motion) if kind == "periodic" else self._rest(motion, kind)))
 
     def loads(self, q: Vector, qd: Vector, qdd: Vector) -> tuple[Vector, Vector]:
-        """Return joint torques (12,) [Nm] and ground wrench (6,) [N, Nm] at the origin and in the axes of the stance foot.
+        """Return joint torques (12,) [Nm] and ground wrench (6,) [N, Nm] of one state.
+
+        The wrench is at the origin and in the axes of the stance foot.
 
         Args:
             q: joint angles, shape (12,) [rad].
             qd: joint speeds, shape (12,) [rad/s].
             qdd: joint accelerations, shape (12,) [rad/s2].
         """
-        model, data, place = self._articulated.model, self._data, self._articulated.v
+        model, data, joints = self._articulated.model, self._data, self._articulated.v
         configuration, speed, acceleration = self._on_right_foot(q), np.zeros(model.nv), np.zeros(model.nv)
-        speed[place], acceleration[place] = qd, qdd
+        speed[joints], acceleration[joints] = qd, qdd
         jacobian = pinocchio.computeFrameJacobian(model, data, configuration, self._right, _LOCAL)
         base = jacobian[:, :6]
         speed[:6] = -np.linalg.solve(base, jacobian @ speed)
@@ -96,12 +98,12 @@ class Verifier:
         acceleration[:6] = -np.linalg.solve(base, drift)
         demanded = pinocchio.rnea(model, data, configuration, speed, acceleration)
         wrench = np.linalg.solve(base.T, demanded[:6])
-        return (demanded - jacobian.T @ wrench)[place], wrench
+        return (demanded - jacobian.T @ wrench)[joints], wrench
 
     def impact(self, q: Vector, qd: Vector) -> tuple[Vector, Vector, Vector]:
         """Compute the impact of the left foot, which lands flat and does not rebound.
 
-        Source: [M -J'; J 0] (v+, impulse) = (M v-, 0), J the Jacobian of the foot that lands.
+        The equation is [M -J'; J 0] (v+, impulse) = (M v-, 0), where J is the Jacobian of the foot that lands.
 
         Args:
             q: joint angles, shape (12,) [rad].
@@ -110,9 +112,9 @@ class Verifier:
         Returns:
             Joint speeds after the impact (12,) [rad/s], impulse on the left foot (6,), and twist of the right foot (6,).
         """
-        model, data, place = self._articulated.model, self._data, self._articulated.v
+        model, data, joints = self._articulated.model, self._data, self._articulated.v
         configuration, before = self._on_right_foot(q), np.zeros(model.nv)
-        before[place] = qd
+        before[joints] = qd
         leaving = pinocchio.computeFrameJacobian(model, data, configuration, self._right, _LOCAL).copy()
         before[:6] = -np.linalg.solve(leaving[:, :6], leaving @ before)
         landing = pinocchio.computeFrameJacobian(model, data, configuration, self._left, _LOCAL).copy()
@@ -121,15 +123,15 @@ class Verifier:
         system = np.block([[mass, -landing.T], [landing, np.zeros((6, 6))]])
         outcome = np.linalg.solve(system, np.concatenate([mass @ before, np.zeros(6)]))
         after = outcome[: model.nv]
-        return after[place], outcome[model.nv :], leaving @ after
+        return after[joints], outcome[model.nv :], leaving @ after
 
     def _joints(self, motion: _Motion) -> list[GaitCheck]:
         robot = self._robot
         beyond = np.maximum(robot.position_min - motion.q, motion.q - robot.position_max)
         speed = np.abs(motion.qd) / robot.velocity_max
         return [
-            GaitCheck("beyond the joint limits", float(beyond.max()), 0.0, "rad"),
-            GaitCheck("speed over its limit", float(speed.max()), 1.0, ""),
+            GaitCheck("joint angle beyond its limit", float(beyond.max()), 0.0, "rad"),
+            GaitCheck("joint speed relative to its limit", float(speed.max()), 1.0, ""),
         ]
 
     def _loads(self, motion: _Motion) -> list[GaitCheck]:
@@ -142,9 +144,14 @@ class Verifier:
         vertical = force[:, 2]
         slip = np.hypot(force[:, 0], force[:, 1]) / vertical
         return [
-            GaitCheck("torque over its limit", float((np.abs(torque) / self._robot.torque_max).max()), 1.0, ""),
-            GaitCheck("weight off the ground", float(1.0 - vertical.min() / self.weight), 0.5, ""),
-            GaitCheck("friction needed", float(slip.max()), 0.5, ""),
+            GaitCheck(
+                "joint torque relative to its limit",
+                float((np.abs(torque) / self._robot.torque_max).max()),
+                1.0,
+                "",
+            ),
+            GaitCheck("unloaded fraction of the weight", float(1.0 - vertical.min() / self.weight), 0.5, ""),
+            GaitCheck("required friction coefficient", float(slip.max()), 0.5, ""),
             GaitCheck(
                 "centre of pressure along the sole",
                 float(np.abs(moment[:, 1] / vertical).max()),
@@ -154,38 +161,38 @@ class Verifier:
             GaitCheck(
                 "centre of pressure across the sole", float(np.abs(moment[:, 0] / vertical).max()), exo.cell_y, "m"
             ),
-            GaitCheck("yaw moment over force", float(np.abs(moment[:, 2] / vertical).max()), 0.05, "m"),
+            GaitCheck("yaw moment per vertical force", float(np.abs(moment[:, 2] / vertical).max()), 0.05, "m"),
         ]
 
     def _swing(self, motion: _Motion) -> list[GaitCheck]:
-        heights, apart, tilt = [], [], []
+        heights, widths, tilt = [], [], []
         forward = self._forward()
         for q in motion.q:
             stance, swing, pelvis = self._poses(q)
             swing, pelvis = stance.actInv(swing), stance.actInv(pelvis)
             heights.append((swing.rotation @ self._corners().T)[2] + swing.translation[2] - self._exo.sole_centre[1])
-            apart.append((forward.T @ swing.translation)[1])
+            widths.append((forward.T @ swing.translation)[1])
             tilt.append(np.abs(pinocchio.log3(forward.T @ pelvis.rotation)).max())
         return [
-            GaitCheck("swing sole in the ground", float(-np.min(heights)), _SINKING, "m"),
-            GaitCheck("ankles closer than the feet are wide", self._foot_width() - min(apart), 0.0, "m"),
-            GaitCheck("pelvis off upright and forward", max(tilt), math.radians(8.0), "rad"),
+            GaitCheck("depth of the swing sole in the ground", float(-np.min(heights)), _SINKING, "m"),
+            GaitCheck("lateral overlap of the feet", self._foot_width() - min(widths), 0.0, "m"),
+            GaitCheck("rotation of the pelvis", max(tilt), math.radians(8.0), "rad"),
         ]
 
     def _cycle(self, motion: _Motion) -> list[GaitCheck]:
         """Return the checks of a periodic step: landing pose, periodicity, impact map."""
         after, impulse, leaving = self.impact(motion.q[-1], motion.qd[-1])
         mirrored_q, mirrored_qd = SIGN * motion.q[0][SWAP], SIGN * motion.qd[0][SWAP]
-        # The impulse of the soft landing is small, so a small impulse beyond friction is accepted.
+        # The impulse of a soft landing is small, so a small impulse beyond the friction limit is accepted.
         sliding = math.hypot(impulse[0], impulse[1]) - 0.5 * impulse[2]
         sinking = -min(leaving[2] + np.cross(leaving[3:], corner)[2] for corner in self._corners())
         return [
             *self._landing(motion.q[-1]),
-            GaitCheck("joint angles not periodic", float(np.abs(motion.q[-1] - mirrored_q).max()), _EXACT, "rad"),
-            GaitCheck("joint speeds off the impact map", float(np.abs(after - mirrored_qd).max()), _EXACT, "rad/s"),
-            GaitCheck("impulse of the impact downwards", float(-impulse[2]), 0.0, "Ns"),
-            GaitCheck("impulse beyond friction at the impact", sliding, _SLIDING, "Ns"),
-            GaitCheck("sinking speed of the foot that leaves", float(sinking), 0.01 + _EXACT, "m/s"),
+            GaitCheck("angle jump at the step change", float(np.abs(motion.q[-1] - mirrored_q).max()), _EXACT, "rad"),
+            GaitCheck("speed error of the impact map", float(np.abs(after - mirrored_qd).max()), _EXACT, "rad/s"),
+            GaitCheck("downward impact impulse", float(-impulse[2]), 0.0, "Ns"),
+            GaitCheck("impact impulse beyond friction", sliding, _SLIDING, "Ns"),
+            GaitCheck("sinking speed of the rear foot", float(sinking), 0.01 + _EXACT, "m/s"),
         ]
 
     def _rest(self, motion: _Motion, kind: str) -> list[GaitCheck]:
@@ -197,19 +204,22 @@ class Verifier:
         ]
 
     def _landing(self, q: Vector) -> list[GaitCheck]:
-        """Return the checks that the left foot is flat on the ground and is the mirror image of the right foot."""
+        """Return the checks that the left foot is flat on the ground, with the mirrored toe-out of the right foot."""
         stance, swing, _ = self._poses(q)
         relative = stance.actInv(swing)
         turned = self._forward() @ self._forward()
         return [
-            GaitCheck("landing sole over the ground", abs(float(relative.translation[2])), _EXACT, "m"),
+            GaitCheck("height error of the landing foot", abs(float(relative.translation[2])), _EXACT, "m"),
             GaitCheck(
-                "landing foot turned", float(np.abs(pinocchio.log3(turned.T @ relative.rotation)).max()), _EXACT, "rad"
+                "rotation error of the landing foot",
+                float(np.abs(pinocchio.log3(turned.T @ relative.rotation)).max()),
+                _EXACT,
+                "rad",
             ),
         ]
 
     def _poses(self, q: Vector) -> tuple[Any, Any, Any]:
-        """Return the poses of right foot, left foot and pelvis."""
+        """Return the poses of right foot, left foot and pelvis, with the pelvis at the world origin."""
         configuration = pinocchio.neutral(self._articulated.model)
         configuration[self._articulated.q] = q
         pinocchio.framesForwardKinematics(self._articulated.model, self._data, configuration)
@@ -217,7 +227,7 @@ class Verifier:
         return frames[self._right].copy(), frames[self._left].copy(), frames[self._pelvis].copy()
 
     def _on_right_foot(self, q: Vector) -> Vector:
-        """Return the configuration of the floating robot with the right foot as the world frame."""
+        """Return the configuration of the floating robot with its right foot at the world origin."""
         stance, _, pelvis = self._poses(q)
         configuration = pinocchio.neutral(self._articulated.model)
         configuration[self._articulated.q] = q
@@ -225,7 +235,7 @@ class Verifier:
         return np.asarray(configuration)
 
     def _forward(self) -> Vector:
-        """Return the rotation from the walking frame to the frame of the stance foot, which is turned by the toe-out."""
+        """Return the rotation from the walking frame to the frame of the stance foot, which has the toe-out angle."""
         return np.asarray(pinocchio.utils.rotate("z", self._exo.toe_out))
 
     def _corners(self) -> Vector:
@@ -235,7 +245,7 @@ class Verifier:
         return np.array([(x + i * length / 2, j * width / 2, z) for i in (1, -1) for j in (1, -1)])
 
     def _foot_width(self) -> float:
-        """Return the distance of the ankles at which the heels touch [m]; the toe-out moves the heels inwards."""
+        """Return the lateral distance of the ankles at which the feet touch [m]. The toe-out moves the heels inwards."""
         inner = self._forward().T @ (self._corners() * [1.0, -1.0, 1.0]).T
         return float(2.0 * inner[1].max())
 

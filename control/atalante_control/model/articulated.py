@@ -1,4 +1,4 @@
-"""Pinocchio model of a URDF, with the indices of the joints in its vectors. `URDF -> ArticulatedModel`."""
+"""Pinocchio model of a URDF, with the indices of the joints in its vectors: `URDF -> ArticulatedModel`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ArticulatedModel(NamedTuple):
 
 
 def pinocchio_model(urdf_text: str, fixed_base: bool = True) -> ArticulatedModel:
-    """Build the Pinocchio model of a URDF from `urdf`, with gravity (`GRAVITY`) downwards.
+    """Build the Pinocchio model of a URDF, with gravity of 9.81 m/s2 (`GRAVITY`) downwards.
 
     The joint order of Pinocchio can differ from `JOINTS`, so index its vectors only with `ArticulatedModel.q` and `.v`.
 
@@ -39,7 +39,7 @@ def pinocchio_model(urdf_text: str, fixed_base: bool = True) -> ArticulatedModel
     else:
         model = pinocchio.buildModelFromXML(urdf_text, pinocchio.JointModelFreeFlyer())
     if missing := [name for name in JOINTS if not model.existJointName(name)]:
-        raise ValueError(f"the URDF lacks joint {missing[0]}; it needs all of {', '.join(JOINTS)}")
+        raise ValueError(f"the URDF must have the joints {', '.join(JOINTS)}; {missing[0]} is missing")
     ids = [model.getJointId(name) for name in JOINTS]
     q, v = np.array([model.idx_qs[i] for i in ids], np.intp), np.array([model.idx_vs[i] for i in ids], np.intp)
     return ArticulatedModel(model, q, v)

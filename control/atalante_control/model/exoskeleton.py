@@ -1,7 +1,7 @@
 """Links of the exoskeleton, empty or with a patient: `ExoskeletonParameters (, Patient) -> links`.
 
-The right leg is the mirror image of the left leg. Each segment of a patient is fused into the link that carries it. Joint
-idealization compensates the empty exoskeleton; gaits are computed for the exoskeleton with the patient.
+The right leg is the mirror image of the left leg. Each segment of a patient is fused into the link that carries it. The joint
+idealization of the controller compensates the empty exoskeleton. Gaits are computed for the exoskeleton with the patient.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ LEG_LINKS = dict(zip(LEG_JOINTS, ("frontal_hip", "transverse_hip", "thigh", "sha
 
 @dataclass(frozen=True)
 class ExoskeletonParameters:
-    """Parameters of an Atalante-like exoskeleton, left side; the right side is its mirror image in the sagittal plane.
+    """Dimensions and masses of an Atalante-like exoskeleton. They describe the left side; the right side is its mirror image.
 
     Joint offsets, axes, masses, sole and sensor positions are rounded public numbers. The positions of the masses in their links
     are assumptions of this project. Thigh and shank are adjusted to the patient.
@@ -31,35 +31,31 @@ class ExoskeletonParameters:
     shank_length: float = 0.408  # m, from SK to SA
 
     pelvis_mass: float = 16.5  # kg, pelvis and back
-    frontal_hip_mass: float = 3.7  # kg, one side; the masses below are also of one side
+    frontal_hip_mass: float = 3.7  # kg, of one leg; the masses below are also of one leg
     transverse_hip_mass: float = 4.4
     thigh_mass: float = 9.0
     shank_mass: float = 11.0
     ankle_mass: float = 1.7
     foot_mass: float = 3.2  # kg, including the force cells
 
-    fh_offset: Vector3 = (0.0, 0.089, 0.0)  # m, position of FH in the pelvis frame
-    th_offset: Vector3 = (-0.135, 0.169, 0.0)  # m, position of TH in the frame of the frontal hip
-    sh_offset: Vector3 = (0.135, 0.0, 0.0)  # m, position of SH in the frame of the transverse hip
-    knee_lateral: float = 0.005  # m, SK outwards of SH
-    ankle_lateral: float = -0.169  # m, SA outwards of SK
-    toe_out: float = math.radians(8.0)  # rad, foot about the vertical
-    ha_axis: Vector3 = (0.788, 0.0, 0.616)  # henke axis in the foot frame, normalised in the URDF
+    fh_offset: Vector3 = (0.0, 0.089, 0.0)  # m, position of joint FH in the pelvis frame
+    th_offset: Vector3 = (-0.135, 0.169, 0.0)  # m, position of joint TH in the frontal hip frame
+    sh_offset: Vector3 = (0.135, 0.0, 0.0)  # m, position of joint SH in the transverse hip frame
+    knee_lateral: float = 0.005  # m, lateral distance of joint SK from SH, outwards positive
+    ankle_lateral: float = -0.169  # m, lateral distance of joint SA from SK, outwards positive
+    toe_out: float = math.radians(8.0)  # rad, outward rotation of the foot about the vertical
+    ha_axis: Vector3 = (0.788, 0.0, 0.616)  # axis of joint HA in the foot frame; the URDF contains its unit vector
 
     sole_size: tuple[float, float] = (0.275, 0.119)  # m, length and width
     sole_centre: tuple[float, float] = (0.06, -0.165)  # m, x and z of the sole centre relative to the ankle
     cell_x: tuple[float, float] = (0.178, -0.064)  # m, x of front and rear force cells relative to the ankle
     cell_y: float = 0.027  # m, lateral distance of the force cells from the middle of the foot
     pad_radius: float = 0.005  # m, radius of the contact sphere under each force cell; it touches the sole plane
-    pad_mass: float = 0.0015  # kg, mass of each contact sphere, subtracted from the foot
+    pad_mass: float = 0.0015  # kg, mass of each contact sphere, subtracted from the mass of the foot
 
-    torso_imu: Vector3 = (-0.14, 0.0, 0.50)  # m, position in the pelvis link
-    pelvis_imu: Vector3 = (-0.164, -0.015, 0.191)  # m, position in the pelvis link
-    tibia_imu: Vector3 = (
-        -0.13,
-        -0.074,
-        0.018,
-    )  # m, in the left shank; z is measured from SA, because the IMU is at the lower end
+    torso_imu: Vector3 = (-0.14, 0.0, 0.50)  # m, position of the torso IMU in the pelvis frame
+    pelvis_imu: Vector3 = (-0.164, -0.015, 0.191)  # m, position of the pelvis IMU in the pelvis frame
+    tibia_imu: Vector3 = (-0.13, -0.074, 0.018)  # m, position of the left tibia IMU: x and y from SK, z from SA
 
     def __post_init__(self) -> None:
         for name in ("thigh_length", "shank_length"):
@@ -69,7 +65,7 @@ class ExoskeletonParameters:
             raise ValueError(f"pad_mass must be positive and below 1/40 of foot_mass, got {self.pad_mass!r}")
 
     def fitted(self, patient: Patient) -> ExoskeletonParameters:
-        """Return the empty exoskeleton with thigh and shank adjusted to a patient.
+        """Return the parameters with thigh and shank adjusted to a patient.
 
         Args:
             patient: patient whose leg lengths are used.
@@ -94,13 +90,13 @@ def links(parameters: ExoskeletonParameters, patient: Patient | None = None) -> 
     imus = (_imu("torso", BASE_LINK, p.torso_imu), _imu("pelvis", BASE_LINK, p.pelvis_imu))
     left = _left_leg(p)
     if patient is not None:
-        worn = _worn(p, patient)
-        base, *left = (link.fused(*worn[link.name]) if link.name in worn else link for link in (base, *left))
+        segments = _patient_segments(p, patient)
+        base, *left = (link.fused(*segments[link.name]) if link.name in segments else link for link in (base, *left))
     return (base, *imus, *left, *(link.mirrored() for link in left))
 
 
 def imu_link(imu: str) -> str:
-    """Return the name of the link whose frame is that of an IMU.
+    """Return the name of the link that represents an IMU.
 
     Args:
         imu: one of `IMUS`.
@@ -109,7 +105,9 @@ def imu_link(imu: str) -> str:
 
 
 def pad_link(foot: str, cell: str) -> str:
-    """Return the name of the link of the contact pad under a force cell; its axes are those of the foot.
+    """Return the name of the link that represents the contact pad under a force cell.
+
+    The axes of the link are parallel to those of the foot.
 
     Args:
         foot: left or right.
@@ -118,8 +116,8 @@ def pad_link(foot: str, cell: str) -> str:
     return f"{foot}_foot_{cell}"
 
 
-def _worn(p: ExoskeletonParameters, patient: Patient) -> dict[str, tuple[Box, Inertia]]:
-    """Return the segments of the patient in the frames of the links that carry them, left side.
+def _patient_segments(p: ExoskeletonParameters, patient: Patient) -> dict[str, tuple[Box, Inertia]]:
+    """Return the segments of the patient's body by link, for pelvis and left leg, each in the frame of its link.
 
     The hip of the patient is the intersection of the axes of FH and SH, the knee is on the axis of SK, and the ankle is at SA.
     The lateral offsets of the exoskeleton shift thigh and shank by half a centimetre. The foot is centred along the sole.
@@ -140,7 +138,7 @@ def _left_leg(p: ExoskeletonParameters) -> list[Link]:
     sk, sa = (0.0, p.knee_lateral, -p.thigh_length), (0.0, p.ankle_lateral, -p.shank_length)
     length, width = p.sole_size
     sole_x, sole_z = p.sole_centre
-    # A box from each joint to the next; the boxes of hip and ankle enclose the motors at their joint.
+    # The boxes of hip, thigh and shank extend from their joint to the next joint. The ankle box encloses its motors.
     chain = (
         ("FH", p.fh_offset, 0.0, (1.0, 0.0, 0.0), Box(p.frontal_hip_mass, _half(p.th_offset), (0.17, 0.19, 0.12))),
         ("TH", p.th_offset, 0.0, (0.0, 0.0, 1.0), Box(p.transverse_hip_mass, _half(p.sh_offset), (0.20, 0.10, 0.12))),

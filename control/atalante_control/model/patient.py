@@ -1,4 +1,4 @@
-"""Patient as four kinds of rigid segments: `mass, height (, thigh, shank) -> Winter's table -> body of a segment`.
+"""Patient as a set of rigid segments: `mass, height (, thigh, shank) -> Winter's table -> mass properties of a segment`.
 
 `exoskeleton.links` fuses these bodies into the links of the exoskeleton.
 """
@@ -20,20 +20,19 @@ ANKLE_HEIGHT = 0.039
 
 @dataclass(frozen=True)
 class Segment:
-    """Row of Winter's table."""
+    """Segment of the human body, a row of Winter's table."""
 
     mass: float  # fraction of the body mass
-    centre: float  # centre of mass from the proximal end, fraction of the segment length
-    gyration: (
-        float  # radius of gyration about a transverse axis through the centre of mass, fraction of the segment length
-    )
+    centre: float  # distance of the centre of mass from the proximal end, fraction of the segment length
+    gyration: float  # transverse radius of gyration about the centre of mass, fraction of the segment length
     length: float  # fraction of the body height
     density: float  # kg/m3
 
 
-#: Segments from D. A. Winter, Biomechanics and Motor Control of Human Movement, 4th ed. 2009: table 4.1 (mass, centre, gyration,
-#: density) and figure 4.1 (length, after Drillis and Contini). HAT is head, arms and trunk, with the length from hips to
-#: shoulders and the mean density of its parts. Thigh, shank and foot are those of one side.
+#: Body segments from D. A. Winter, Biomechanics and Motor Control of Human Movement, 4th ed. 2009.
+#: Mass, centre, gyration and density are from table 4.1, length is from figure 4.1 (after Drillis and Contini).
+#: HAT is head, arms and trunk. Its length is from hips to shoulders, its density is the mean of its parts.
+#: Thigh, shank and foot are the segments of one side of the body.
 SEGMENTS = {
     "HAT": Segment(0.678, 0.626, 0.496, 0.288, 1050.0),
     "thigh": Segment(0.100, 0.433, 0.323, 0.245, 1050.0),
@@ -44,10 +43,10 @@ SEGMENTS = {
 
 @dataclass(frozen=True)
 class Patient:
-    """Patient in the exoskeleton. Lengths that are None are those of Winter's table for the height.
+    """Patient in the exoskeleton. A length of None stands for the length in Winter's table for the height.
 
     Raises:
-        ValueError: If a number is outside its range; the message gives the range.
+        ValueError: If a number is outside its range; the message states the range.
     """
 
     mass: float  # kg
@@ -75,10 +74,10 @@ class Patient:
         return SEGMENTS[segment].length * self.height if given is None else given
 
     def body(self, segment: str, proximal: Vector3, axis: int, direction: int) -> tuple[Box, Inertia]:
-        """Return the box to draw and the mass properties of a segment, in the frame of a link.
+        """Return the box for viewers and the mass properties of a segment, in the frame of its link.
 
-        The table gives the moment of inertia about transverse axes, m (gyration length)^2. It has none about the axis of the
-        segment, so that moment is the one of a square prism with the length and density of the segment. The box is this prism.
+        The moment of inertia about the transverse axes is m (gyration length)^2. The table has no moment about the axis of the
+        segment. It is computed for a square prism with the length and density of the segment, which is also the box.
 
         Args:
             segment: one of `SEGMENTS`.

@@ -18,14 +18,14 @@ ZERO: Vector3 = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Box:
-    """Homogeneous box that represents the mass of a link: mass [kg], centre [m] and edge lengths [m] in the link frame."""
+    """Homogeneous box that represents the mass of a link. Its edges are parallel to the axes of the link frame."""
 
-    mass: float
-    centre: Vector3
-    size: Vector3
+    mass: float  # kg
+    centre: Vector3  # m, in the link frame
+    size: Vector3  # m, edge lengths along x, y and z
 
     def inertia(self) -> Inertia:
-        """Return the mass properties of the box, whose edges are parallel to the axes of the link."""
+        """Return the mass properties of the box."""
         x, y, z = (edge * edge * self.mass / 12.0 for edge in self.size)
         return Inertia(self.mass, self.centre, (y + z, 0.0, 0.0, x + z, 0.0, x + y))
 
@@ -39,17 +39,17 @@ class Inertia:
     tensor: tuple[float, float, float, float, float, float]  # kg m2 about the centre of mass: xx, xy, xz, yy, yz, zz
 
     def matrix(self) -> npt.NDArray[np.float64]:
-        """Return the tensor as a symmetric matrix, shape (3, 3) [kg m2]."""
+        """Return the inertia tensor as a symmetric matrix, shape (3, 3) [kg m2]."""
         xx, xy, xz, yy, yz, zz = self.tensor
         return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
     def mirrored(self) -> Inertia:
-        """Return the body reflected in the sagittal plane, y to -y."""
+        """Return the mass properties reflected in the sagittal plane (y becomes -y)."""
         xx, xy, xz, yy, yz, zz = self.tensor
         return Inertia(self.mass, mirrored(self.centre), (xx, -xy, xz, yy, -yz, zz))
 
     def fused(self, other: Inertia) -> Inertia:
-        """Return the mass properties of two bodies fixed to each other (parallel axis theorem with the reduced mass).
+        """Return the mass properties of this body and another body fixed to it (parallel axis theorem).
 
         Args:
             other: mass properties of the second body in the same link frame.
@@ -58,23 +58,23 @@ class Inertia:
         (ax, ay, az), (bx, by, bz) = self.centre, other.centre
         share, reduced = other.mass / mass, self.mass * other.mass / mass
         x, y, z = bx - ax, by - ay, bz - az
-        apart = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
+        shift = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
         xx, xy, xz, yy, yz, zz = (
-            one + two + reduced * distance for one, two, distance in zip(self.tensor, other.tensor, apart, strict=True)
+            one + two + reduced * term for one, two, term in zip(self.tensor, other.tensor, shift, strict=True)
         )
         return Inertia(mass, (ax + share * x, ay + share * y, az + share * z), (xx, xy, xz, yy, yz, zz))
 
 
 @dataclass(frozen=True)
 class Link:
-    """Body of the tree with the joint that moves it. `joint` is one of `JOINTS`, or None for a fixed link."""
+    """Link of the tree, with the joint that connects it to its parent link."""
 
     name: str
-    parent: str
-    joint: str | None
-    origin: Vector3  # m, in the parent's frame
-    yaw: float  # rad, about the parent's z
-    axis: Vector3  # in the link's own frame; unused when fixed
+    parent: str  # name of the parent link; "": the link is the root
+    joint: str | None  # one of `JOINTS`; None: the link is fixed to its parent
+    origin: Vector3  # m, position of the joint in the frame of the parent link
+    yaw: float  # rad, rotation about z of the parent link
+    axis: Vector3  # joint axis in the frame of the link; unused for a fixed link
     inertia: Inertia
     boxes: tuple[Box, ...] = ()  # shapes for viewers
     pad: float = 0.0  # m, radius of a contact sphere at the origin of the link; 0: no contact
@@ -89,9 +89,12 @@ class Link:
         return replace(self, inertia=self.inertia.fused(inertia), boxes=(*self.boxes, box))
 
     def mirrored(self) -> Link:
-        """Return the link of the right leg. The axis is the same; the angle changes sign instead (MIRROR_SIGN)."""
+        """Return the mirror image of a link of the left leg, for the right leg.
+
+        The joint axis is the same. The sign of the joint angle changes instead (MIRROR_SIGN).
+        """
         name = _right(self.name)
-        if self.pad:  # mirroring swaps the left and the right cell of a foot
+        if self.pad:  # mirroring swaps the left and the right force cells of a foot
             name = name[:-1] + {"L": "R", "R": "L"}[name[-1]]
         return Link(
             name,
@@ -107,7 +110,7 @@ class Link:
 
 
 def mirrored(vector: Vector3) -> Vector3:
-    """Return a polar vector reflected in the sagittal plane.
+    """Return a polar vector reflected in the sagittal plane (y becomes -y).
 
     Args:
         vector: polar vector such as a position, x forward, y left, z up.

@@ -1,4 +1,4 @@
-"""URDF of a tree of links, loaded by PyBullet, Pinocchio and viewers. `links, robot limits -> URDF`."""
+"""Writer of the URDF that PyBullet, Pinocchio and viewers load: `links, robot limits -> URDF`."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from atalante_hal.robot import JOINTS, Robot
 def urdf(parameters: ExoskeletonParameters, robot: Robot, patient: Patient | None = None) -> str:
     """Return the URDF of the exoskeleton, empty or with a patient.
 
-    The joints are `JOINTS` in their order. Only the eight pads have collision shapes. IMU links are massless frames. The same
-    parameters give the same text, with all digits of every number.
+    The joints are `JOINTS` in their order. Only the eight contact pads have collision shapes. The links of the IMUs have no mass.
+    The same parameters give the same text, with all digits of every number.
 
     Args:
         parameters: geometry and masses of the exoskeleton; each link is a homogeneous box.
@@ -45,9 +45,8 @@ def _numbers(values: Sequence[float]) -> str:
 
 
 def _number(value: float) -> str:
-    return repr(
-        float(value) + 0.0
-    )  # repr: all digits; float: a NumPy scalar would print its type; + 0.0: no negative zero
+    # repr() prints all digits. float() is needed because a NumPy scalar prints its type. Adding 0.0 avoids -0.0.
+    return repr(float(value) + 0.0)
 
 
 def _link_xml(link: Link) -> list[str]:

@@ -158,9 +158,9 @@ def test_saved_network_is_loaded_bit_for_bit(tmp_path: Path) -> None:
         ({"weights_0": np.full((4, 5), np.nan)}, "weights_0 must be an array of finite 64-bit floats"),
         ({"weights_0": np.full((4, 5), np.inf)}, "weights_0 must be an array of finite 64-bit floats"),
         ({"weights_0": np.full((4, 5), "1.0")}, "weights_0 must be an array of finite 64-bit floats"),
-        ({"weights_0": np.zeros((3, 5))}, "weights_0 must have 4 rows"),
-        ({"bias_0": np.zeros(4)}, "weights_0 must have 4 rows, and 1 to 128 columns, as many as bias_0"),
-        ({"weights_0": np.zeros((4, 129)), "bias_0": np.zeros(129)}, "weights_0 must have 4 rows"),
+        ({"weights_0": np.zeros((3, 5))}, r"weights_0 must have shape \(4, n\)"),
+        ({"bias_0": np.zeros(4)}, r"weights_0 must have shape \(4, n\) and bias_0 shape \(n,\), with n from 1 to 128"),
+        ({"weights_0": np.zeros((4, 129)), "bias_0": np.zeros(129)}, r"weights_0 must have shape \(4, n\)"),
         ({"weights_1": np.zeros((5, 8)), "bias_1": np.zeros(8)}, f"last layer must have {OUTPUTS} columns"),
         ({"bias_1": np.arange(96.0)}, "the angles of a gait must be continuous at the step change"),
     ],
@@ -181,7 +181,9 @@ def test_invalid_network_file_is_rejected(tmp_path: Path, change: dict[str, np.n
 def test_damaged_network_file_is_rejected(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "network.npz"
     path.write_bytes(content)
-    with pytest.raises(NetworkError, match=re.escape(f"{path} is no gait network: ") + ".*`atalante gait fit`$"):
+    with pytest.raises(
+        NetworkError, match=re.escape(f"{path} is not a valid gait network: ") + ".*`atalante gait fit`$"
+    ):
         load_network(path)
     with pytest.raises(NetworkError, match="nowhere"):
         load_network(tmp_path / "nowhere.npz")
@@ -192,7 +194,9 @@ def test_invalid_network_is_not_saved(tmp_path: Path) -> None:
     endless = replace(
         network, layers=(*network.layers[:-1], Layer(network.layers[-1].weights, np.full(OUTPUTS, np.inf)))
     )
-    with pytest.raises(NetworkError, match=r"network\.npz cannot hold this network: bias_1 must be an array of finite"):
+    with pytest.raises(
+        NetworkError, match=r"npz is not written; the network must be valid: bias_1 must be an array of finite"
+    ):
         save_network(endless, tmp_path / "network.npz")
     assert not list(tmp_path.iterdir())
 
@@ -204,7 +208,7 @@ def test_damaged_network_of_the_package_asks_for_reinstallation(
     path.write_bytes(gait_network.DEFAULT_NETWORK.read_bytes()[:1000])
     monkeypatch.setattr(gait_network, "DEFAULT_NETWORK", path)
     with pytest.raises(
-        NetworkError, match=re.escape(f"{path} is no gait network: ") + ".*; install atalante-hal again$"
+        NetworkError, match=re.escape(f"{path} is not a valid gait network: ") + ".*; install atalante-hal again$"
     ):
         load_network()
 

@@ -30,7 +30,7 @@ def test_solved_within_the_residual(solved: SolvedGait) -> None:
     assert solved.status == SOLVED
     assert solved.max_residual < RESIDUAL
     assert all(residual.value < RESIDUAL for residual in solved.residuals.values())
-    wanted = {"impact map", "swing clearance", "landing place", "torque limits", "centre of pressure along the sole"}
+    wanted = {"impact map", "swing clearance", "landing position", "torque limits", "centre of pressure along the sole"}
     assert wanted <= set(solved.residuals)
 
 

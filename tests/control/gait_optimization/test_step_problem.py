@@ -93,7 +93,7 @@ def test_violations_are_in_physical_units(
     assert after["periodicity"] == pytest.approx(0.5, abs=before["periodicity"] + 1e-12)
     place = coefficients.copy()
     place[JOINTS.index("left_SK"), -1] += 0.1
-    assert violations(problem, functions, place, parameters)["landing place"] > 0.02  # m, 0.1 rad on 0.43 m of shank
+    assert violations(problem, functions, place, parameters)["landing position"] > 0.02  # m, 0.1 rad on 0.43 m of shank
     backwards = coefficients.copy()
     backwards[JOINTS.index("right_SK")] = -0.5
     assert violations(problem, functions, backwards, parameters)["joint limits"] == pytest.approx(

@@ -92,5 +92,5 @@ def test_fixed_links_belong_to_the_body_that_carries_them() -> None:
 
 def test_a_robot_the_expressions_do_not_fit_is_refused(chain: Chain) -> None:
     worn = links(ExoskeletonParameters(ha_axis=(1.0, 0.0, 0.0)), PATIENT)
-    with pytest.raises(ValueError, match="another topology"):
+    with pytest.raises(ValueError, match="must be those of the reference robot"):
         chain.values(worn)
