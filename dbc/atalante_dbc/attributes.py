@@ -1,6 +1,7 @@
-"""Check of the attribute values in a DBC text, before cantools parses it: `text -> attributes -> loader`.
+"""Check of the attribute values in a DBC text before cantools parses it: `text -> attributes -> loader`.
 
-cantools accepts a value of any type for an attribute of any type. An invalid value then fails later or not at all.
+cantools accepts a value of any type for an attribute of any type. An invalid value then causes an error later or remains
+undetected.
 """
 
 from __future__ import annotations
@@ -8,8 +9,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-#: Attributes required by the loader. Each needs a definition (`BA_DEF_`) and a default.
-_NEEDED = (
+#: Attributes that the loader requires. Each needs a definition (`BA_DEF_`) and a default (`BA_DEF_DEF_`).
+_REQUIRED = (
     "NominalBitrate", "DataBitrate", "NodeKind", "NodeNumber", "VFrameFormat", "Bus", "GenMsgSendType", "GenMsgCycleTime",
     "GenMsgDelayTime", "TimeoutTime", "E2EDataId", "InvalidRaw",
 )  # fmt: skip
@@ -20,7 +21,7 @@ _RAW = re.compile(r"(0[xX][0-9a-fA-F]{1,16}|\d{1,20})?")
 
 
 def wrong_values(text: str) -> Iterator[tuple[int, str]]:
-    """Yield each attribute that is set without definition or to an invalid value, as (line number, message)."""
+    """Yield each attribute that has no definition or an invalid value, as (line number, message)."""
     definitions: dict[str, tuple[str, str]] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         if match := _DEFINITION.match(line):
@@ -35,21 +36,21 @@ def wrong_values(text: str) -> Iterator[tuple[int, str]]:
 
 def missing(text: str) -> Iterator[tuple[int, str]]:
     """Yield each required attribute without definition or default, as (1, message)."""
-    for name in _NEEDED:
+    for name in _REQUIRED:
         for keyword, part in (("BA_DEF_", "definition"), ("BA_DEF_DEF_", "default")):
             if not re.search(rf'^{keyword}\s+[^"]*"{name}"', text, re.MULTILINE):
                 yield 1, f"the attribute {name} has no {part} ({keyword})"
 
 
 def _valid_values(name: str, kind: str, domain: str, value: str, *, by_name: bool) -> str:
-    """Return a description of the valid values if `value` is invalid, else an empty text.
+    """Return the valid values as text if `value` is invalid, else an empty text.
 
     Args:
         name: name of the attribute.
         kind: type in its definition, for example INT or ENUM.
-        domain: rest of its definition, the range or the names.
+        domain: rest of its definition: the range of a number, or the names of an enumeration.
         value: value as written in the DBC, with quotes.
-        by_name: True if an enumeration must be given by name (defaults); else its index is also valid.
+        by_name: True: an enumeration must be given by name (defaults). False: its index is also valid.
     """
     if kind == "INT":
         low, high = [*domain.split(), "0", "0"][:2]

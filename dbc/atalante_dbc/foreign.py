@@ -1,7 +1,7 @@
 """Lenient loader for any DBC: message layouts for the validator and for bulk decoding.
 
-`loader.load` is strict, because its network controls a robot. This loader accepts every DBC that cantools can parse, and
-uses the attributes of this project if the file has them. A message with an ambiguous layout is rejected with the reason.
+`loader.load` is strict, because its network controls a robot. This loader accepts every DBC that cantools can parse. It uses the
+attributes of this project if the file contains them. A message with an ambiguous layout is rejected with the reason.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from cantools.database.errors import Error as CantoolsError
 
 from atalante_dbc.loader import DbcError
 
-#: Longest payload of one CAN FD frame and of one classic CAN frame [byte]; longer J1939 messages use several frames.
+#: Longest payload of a CAN FD frame and of a classic CAN frame [byte].
 _FRAME_BYTES, _CLASSIC_BYTES = 64, 8
 _WORD = 64
 _FLOAT_BITS = (16, 32, 64)
 #: E2E Profile 5 header: name -> (start bit, number of bits), as in `loader`.
 _E2E_HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
-#: Values of GenMsgSendType for one frame per GenMsgCycleTime.
+#: Values of GenMsgSendType that stand for a cyclic message.
 _CYCLIC = ("", "cyclic", "cyclicx", "periodic", "fixedperiodic", "fixed_periodic")
-#: J1939: masks of the identifier bits for the parameter group. With a PDU format below 240 the next byte is an address.
+#: J1939: identifier masks of a parameter group. If the PDU format is below 240, the next byte is the destination address.
 _PGN_PEER, _PGN_BROADCAST, _PDU2 = 0x03FF0000, 0x03FFFF00, 240
 _QUOTED = re.compile(r'"[^"]*"')
 _WRITTEN = re.compile(r"\bBO_\s+(\d+)\s+(\w+)\s*:|\bSG_\s+(\w+)\s+(M|m\d+M?)?\s*:")
@@ -43,24 +43,24 @@ class Field:
     """Signal of any DBC: physical = raw * factor + offset."""
 
     name: str
-    start: int  # Intel: least significant bit; Motorola: most significant bit, in DBC numbering
+    start: int  # start bit in DBC numbering: least significant bit for Intel, most significant bit for Motorola
     length: int  # bits
-    big_endian: bool  # Motorola
+    big_endian: bool  # True: Motorola byte order; False: Intel byte order
     kind: str  # "unsigned", "signed" or "float" (IEEE 754)
     factor: int | float
     offset: int | float
-    minimum: float | None  # physical value; None: no range in the DBC
-    maximum: float | None
+    minimum: float | None  # smallest valid physical value; None: the DBC has no range
+    maximum: float | None  # largest valid physical value; None: the DBC has no range
     unit: str
-    invalid_raw: int | None  # raw code (as unsigned bits) for "no value"; None: there is none
-    choices: Mapping[int, str]  # raw value -> name; empty without value table
+    invalid_raw: int | None  # unsigned raw code that means "no value"; None: no such code
+    choices: Mapping[int, str]  # raw value -> name; empty: no value table
     receivers: tuple[str, ...]
-    #: Multiplexers, each with its raw values for which this signal is in the frame; empty: always in the frame.
+    #: Multiplexers of the signal with the raw values that select it; empty: the signal is in every frame.
     selectors: tuple[tuple[str, frozenset[int]], ...]
 
     @property
     def first_bit(self) -> int:
-        """Return the position of the start bit, counted in the signal's byte order.
+        """Return the position of the start bit, counted in the byte order of the signal.
 
         Intel counts from the least significant bit of byte 0, Motorola from the most significant bit of byte 0.
         """
@@ -75,7 +75,7 @@ class Field:
 
 @dataclass(frozen=True)
 class Layout:
-    """Message of any DBC."""
+    """Layout of a message of any DBC."""
 
     name: str
     frame_id: int
@@ -89,9 +89,11 @@ class Layout:
     cyclic: bool  # True: sent every `cycle_ms`; False: event message
     cycle_ms: float | None
     timeout_ms: float | None
-    inhibit_ms: float | None  # minimum time between two frames of an event message
-    data_id: int | None  # AUTOSAR E2E Profile 5; None: the message is not protected
-    pgn_mask: int  # identifier bits that select the message; all bits unless it is a J1939 parameter group
+    inhibit_ms: float | None  # ms, minimum time between two frames of an event message
+    data_id: int | None  # Data ID of AUTOSAR E2E Profile 5; None: the message is not protected
+    pgn_mask: (
+        int  # mask of the identifier bits that identify the message: all bits, or those of a J1939 parameter group
+    )
     #: Multiplexer -> raw values for which the DBC defines a layout.
     multiplexers: Mapping[str, frozenset[int]]
 
@@ -109,7 +111,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Refused:
-    """Message of the DBC that is not decoded, with the reason."""
+    """Message of the DBC that cannot be decoded, with the reason."""
 
     name: str
     frame_id: int
@@ -124,7 +126,7 @@ class Catalogue:
     path: Path
     layouts: tuple[Layout, ...]
     refused: tuple[Refused, ...]
-    nodes: Mapping[str, str]  # name -> kind; "" without NodeKind in the DBC
+    nodes: Mapping[str, str]  # name of a node -> its kind; "" if the DBC has no NodeKind
     buses: tuple[str, ...]
     nominal_bitrate: float | None  # bit/s, arbitration phase
     data_bitrate: float | None  # bit/s, data phase
@@ -138,7 +140,7 @@ class Catalogue:
         """Return the layout of the message with the given name.
 
         Raises:
-            KeyError: If the message is rejected (with the reason) or unknown (with the valid names).
+            KeyError: If the message is rejected or unknown. The text states the reason or the valid names.
         """
         if name in self._by_name:
             return self._by_name[name]
@@ -162,8 +164,8 @@ def catalogue(path: Path) -> Catalogue:
         reason = error.strerror if isinstance(error, OSError) else error
         raise DbcError(f"{path} cannot be read as a DBC: {reason}") from error
     assert isinstance(database, Database)
-    written = _Written(text)
-    reasons = [(m, next(_unsupported(m, written), "")) for m in database.messages]
+    dbc_text = _DbcText(text)
+    reasons = [(m, next(_unsupported(m, dbc_text), "")) for m in database.messages]
     data_bitrate = _number(_of(database, "DataBitrate"))
     return Catalogue(
         path=path,
@@ -177,8 +179,8 @@ def catalogue(path: Path) -> Catalogue:
     )
 
 
-class _Written:
-    """Repeated identifiers, repeated names and multiplexer marks of the DBC text, which cantools does not keep."""
+class _DbcText:
+    """Identifiers, names and multiplexer marks of a DBC text, with repetitions, which cantools removes."""
 
     def __init__(self, text: str) -> None:
         self.ids: Counter[int] = Counter()
@@ -197,18 +199,18 @@ class _Written:
                 self.multiplexed[current] += (match[4] or "").startswith("m")
 
 
-def _unsupported(message: RawMessage, written: _Written) -> Iterator[str]:
+def _unsupported(message: RawMessage, dbc_text: _DbcText) -> Iterator[str]:
     """Yield every reason to reject a message."""
     key = message.frame_id | message.is_extended_frame << 31
-    if written.ids[key] > 1:
-        yield f"its identifier {message.frame_id:#x} is used by {written.ids[key]} messages"
-    if written.names[message.name] > 1:
-        yield f"its name is used by {written.names[message.name]} messages"
+    if dbc_text.ids[key] > 1:
+        yield f"its identifier {message.frame_id:#x} is used by {dbc_text.ids[key]} messages"
+    if dbc_text.names[message.name] > 1:
+        yield f"its name is used by {dbc_text.names[message.name]} messages"
     if message.length > (_CLASSIC_BYTES if message.protocol == "j1939" else _FRAME_BYTES):
         yield f"its {message.length} bytes do not fit one frame (transport protocols are not supported)"
-    if repeated := [name for name, count in written.signals.get(key, Counter()).items() if count > 1]:
+    if repeated := [name for name, count in dbc_text.signals.get(key, Counter()).items() if count > 1]:
         yield f"the signal name {repeated[0]} is used twice"
-    if written.multiplexed[key] != sum(bool(s.multiplexer_ids) for s in message.signals):
+    if dbc_text.multiplexed[key] != sum(bool(s.multiplexer_ids) for s in message.signals):
         yield "a multiplexed signal has no multiplexer (M); extended multiplexing needs SG_MUL_VAL_"
     for signal in message.signals:
         yield from _unsupported_signal(message, signal)
@@ -231,7 +233,7 @@ def _unsupported_signal(message: RawMessage, signal: RawSignal) -> Iterator[str]
 
 
 def _overlaps(message: RawMessage) -> Iterator[str]:
-    """Yield an overlap of two signals that can be in the same frame."""
+    """Yield the first overlap of two signals that can be in the same frame."""
     owners: dict[int, list[tuple[str, dict[str, frozenset[int]]]]] = {}
     selectors = _selectors(message)
     for signal in message.signals:
@@ -251,7 +253,7 @@ def _first_bit(signal: RawSignal) -> int:
 
 
 def _selectors(message: RawMessage) -> dict[str, tuple[tuple[str, frozenset[int]], ...]]:
-    """Return for each signal its multiplexers, outermost first, with their values for which the signal is in the frame."""
+    """Return the multiplexers of each signal, outermost first, with the raw values that select the signal."""
     by_name = {s.name: s for s in message.signals}
 
     def of(signal: RawSignal, depth: int = 0) -> tuple[tuple[str, frozenset[int]], ...]:
@@ -264,7 +266,7 @@ def _selectors(message: RawMessage) -> dict[str, tuple[tuple[str, frozenset[int]
 
 
 def _multiplexers(message: RawMessage) -> dict[str, frozenset[int]]:
-    """Return for each multiplexer the values with a layout: those of its signals and of its value table."""
+    """Return the raw values of each multiplexer that occur in its signals or in its value table."""
     known: dict[str, frozenset[int]] = {}
     for multiplexer in (s for s in message.signals if s.is_multiplexer):
         values = {int(value) for value in multiplexer.choices or {}}
@@ -303,7 +305,7 @@ def _layout(message: RawMessage, data_bitrate: float | None) -> Layout:
 
 
 def _data_id(message: RawMessage) -> int | None:
-    """Return the E2E Data ID of a message with the Profile 5 header; None without header or Data ID."""
+    """Return the E2E Data ID of a message; None if the message has no Profile 5 header or no Data ID."""
     data_id = _number(_of(message, "E2EDataId"))
     header = {s.name: (s.start, s.length) for s in message.signals if s.byte_order == "little_endian"}
     has_header = all(header.get(name) == bits for name, bits in _E2E_HEADER.items())
@@ -364,7 +366,7 @@ def _of(item: Any, name: str) -> object:
 
 
 def _number(value: object) -> float | None:
-    """Return the value as a number if it is positive, else None, because 0 in a DBC attribute means "not set"."""
+    """Return an attribute value as a number, or None if it is not positive. A DBC attribute of 0 means "not set"."""
     try:
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):

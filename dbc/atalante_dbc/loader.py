@@ -1,6 +1,6 @@
-"""Strict loader of a DBC: parses with cantools and rejects every ambiguous or unsafe definition, with its line number.
+"""Strict loader of a DBC. It parses with cantools and rejects ambiguous or unsafe definitions with their line numbers.
 
-cantools accepts duplicate identifiers, duplicate names, factor 0 and signals without receiver. This loader does not.
+cantools accepts duplicate identifiers, duplicate names, factor 0 and signals without receiver. This loader rejects them.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _SG = re.compile(r"SG_\s+(\w+)\s*(\w*)\s*:")
 
 
 class DbcError(ValueError):
-    """Invalid DBC. Each line of the message is one problem with its line number in the file."""
+    """Invalid DBC. Each line of the message states one problem with its line number in the file."""
 
     code = "DBC_INVALID"
 
@@ -47,7 +47,7 @@ def load(path: Path | None = None) -> Network:
         path: DBC file; None: the network of the robot, which is read once per process.
 
     Raises:
-        DbcError: If the file cannot be parsed or breaks a rule (see `_problems`).
+        DbcError: If the file cannot be parsed or violates a rule (see `_problems`).
     """
     return _read_once(DBC_FILE) if path is None else _read(path)
 
@@ -57,7 +57,7 @@ def _read(path: Path) -> Network:
         raw = path.read_bytes()
         text = raw.decode("cp1252")
         lines = _Lines(text)
-        # These checks come first, because cantools drops duplicates and fails on invalid values without a line number.
+        # These checks come first, because cantools removes duplicates and reports invalid values without a line number.
         _require_no_problems(path, chain(_duplicates(lines), wrong_values(text)))
         database = cantools.database.load_string(text, database_format="dbc", strict=False)
     except DbcError:
@@ -93,8 +93,8 @@ class _Lines:
     """Line numbers of messages and signals, which cantools does not keep."""
 
     def __init__(self, text: str) -> None:
-        self.messages: list[tuple[int, int, str]] = []  # (line, frame id, name), with duplicates
-        self.signals: list[tuple[int, str, str, str]] = []  # (line, message, signal, multiplexer mark)
+        self.messages: list[tuple[int, int, str]] = []  # (line, frame id, name) of each message, with duplicates
+        self.signals: list[tuple[int, str, str, str]] = []  # (line, message, signal, multiplexer mark) of each signal
         for number, line in enumerate(text.splitlines(), start=1):
             if match := _BO.match(line):
                 self.messages.append((number, int(match[1]), match[2]))
@@ -111,7 +111,7 @@ class _Lines:
 
 
 def _problems(database: Database, lines: _Lines) -> Iterator[tuple[int, str]]:
-    """Yield every broken rule as (line number, message)."""
+    """Yield each violation of a rule as (line number, message)."""
     data_ids: dict[int, str] = {}
     nodes = {node.name for node in database.nodes}
     for message in database.messages:
@@ -210,7 +210,7 @@ def _range_problems(signal: RawSignal) -> Iterator[str]:
 
 
 def _overlaps(message: RawMessage, lines: _Lines) -> Iterator[tuple[int, str]]:
-    """Yield each signal that overlaps an earlier signal of the file."""
+    """Yield each signal that overlaps an earlier signal of the same message."""
     owner: dict[int, RawSignal] = {}
     for signal in sorted(message.signals, key=lambda s: lines.signal(message, s)):
         if signal.byte_order != "little_endian":

@@ -13,7 +13,7 @@ class Signal:
     """Signal of a payload, little endian: physical = raw * factor + offset."""
 
     name: str
-    start: int  # index of its least significant bit in the payload
+    start: int  # index of the least significant bit in the payload
     length: int  # bits
     signed: bool
     factor: float
@@ -21,9 +21,9 @@ class Signal:
     minimum: float  # smallest valid physical value
     maximum: float  # largest valid physical value
     unit: str
-    invalid_raw: int | None  # raw code (as unsigned bits) for "no value"; None: there is none
-    choices: Mapping[int, str]  # raw value -> name; empty for a number
-    receivers: tuple[str, ...]  # nodes that read it
+    invalid_raw: int | None  # unsigned raw code that means "no value"; None: no such code
+    choices: Mapping[int, str]  # raw value -> name; empty: the signal is a number
+    receivers: tuple[str, ...]  # nodes that receive the signal
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Message:
 
     @property
     def receivers(self) -> tuple[str, ...]:
-        """Return the nodes that read at least one signal, in DBC order."""
+        """Return the nodes that receive at least one signal of the message, in DBC order."""
         return tuple(dict.fromkeys(node for signal in self.signals for node in signal.receivers))
 
 
@@ -68,14 +68,14 @@ class Node:
 
 @dataclass(frozen=True)
 class Network:
-    """Whole network. Messages are in file order."""
+    """CAN network of the robot. Nodes and messages are in file order."""
 
     nodes: tuple[Node, ...]
     messages: tuple[Message, ...]
     buses: tuple[str, ...]
     nominal_bitrate: int  # bit/s, arbitration phase
     data_bitrate: int  # bit/s, data phase
-    hash32: int  # CRC-32 of the file, reported by nodes in their status
+    hash32: int  # CRC-32 of the DBC file; nodes send it in their heartbeat (DbcHash)
 
     @cached_property
     def _by_name(self) -> dict[str, Message]:
@@ -109,11 +109,11 @@ class Network:
         return tuple(m for m in self.messages if m.sender == node)
 
     def received_by(self, node: str) -> tuple[Message, ...]:
-        """Return the messages of which a node reads at least one signal."""
+        """Return the messages of which a node receives at least one signal."""
         return tuple(m for m in self.messages if node in m.receivers)
 
     def bus_load(self) -> dict[str, float]:
-        """Return the worst-case load of each bus, 0 to 1. Event messages count with their inhibit time as period."""
+        """Return the worst-case load of each bus, 0 to 1. The period of an event message is its inhibit time."""
         load = dict.fromkeys(self.buses, 0.0)
         for message in self.messages:
             period = (message.cycle_ms or message.inhibit_ms) * 1e-3
@@ -125,10 +125,10 @@ _T = TypeVar("_T", Signal, Node)
 
 
 def wire_time(length: int, nominal_bitrate: float = 1e6, data_bitrate: float = 5e6) -> float:
-    """Return the longest time [s] of a CAN FD frame with 11-bit identifier on the bus (ISO 11898-1), with stuff bits.
+    """Return the longest duration [s] of a CAN FD frame with 11-bit identifier on the bus, with stuff bits (ISO 11898-1).
 
-    The nominal phase with interframe space has 33 bits. The data phase has 5 + 8 n bits for n payload bytes, one stuff bit
-    per four bits, and the CRC with fixed stuff bits and delimiters: 28 bits, or 33 bits above 16 bytes.
+    The nominal phase with interframe space has 33 bits. The data phase has 5 + 8 n bits for n payload bytes, and one stuff bit
+    per four of these bits. The CRC with fixed stuff bits and delimiters adds 28 bits, or 33 bits if n is above 16.
 
     Args:
         length: payload length n [byte].
