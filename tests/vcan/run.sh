@@ -1,14 +1,22 @@
 #!/usr/bin/env bash
-# The vcan lane: tests/vcan on real SocketCAN, natively where this kernel has it, else in a Debian kernel under virtme-ng.
+# The vcan lane: tests/vcan on real SocketCAN, on this kernel if it has SocketCAN, otherwise in a guest kernel.
 #
 #   tests/vcan/run.sh [PYTEST ARGUMENTS]     PYTHON=.venv/bin/python chooses the interpreter
+#   GUEST=uml|qemu tests/vcan/run.sh ...     chooses the guest: uml is User-Mode Linux (native speed, one CPU),
+#                                            qemu is a Debian kernel in QEMU without KVM (two CPUs, about 20 times slower)
 #
-# It succeeds only if pytest ran on a working vcan0 and ended with 0: no SocketCAN, no boot or no result is a failure.
+# Without GUEST, uml is used if it boots here, otherwise qemu. The script succeeds only if pytest ran on a working vcan0 and
+# ended with 0: no SocketCAN, no boot or no result is a failure.
 set -euo pipefail
 
 channel=vcan0
-packages=(qemu-system-x86 linux-image-amd64 kmod iproute2 udev busybox-static can-utils)
-boot_limit=${VCAN_LANE_SECONDS:-2100} # KVM is not used: everything in the guest takes about 20 times longer
+uml_packages=(user-mode-linux kmod iproute2 can-utils)
+qemu_packages=(qemu-system-x86 linux-image-amd64 kmod iproute2 udev busybox-static can-utils)
+apt_wait=300 # s; another program may hold the lock of dpkg
+uml_boot_limit=60
+uml_limit=${VCAN_LANE_SECONDS:-900}
+qemu_limit=${VCAN_LANE_SECONDS:-2100}
+memory_mb=4096
 
 say() { printf 'vcan lane: %s\n' "$*" >&2; }
 fail() {
@@ -53,13 +61,16 @@ install_missing() {
     [ ${#missing[@]} = 0 ] && return
     command -v apt-get >/dev/null || fail "these Debian packages are needed and there is no apt-get: ${missing[*]}"
     say "installing ${missing[*]} (once)"
-    as_root env DEBIAN_FRONTEND=noninteractive apt-get -qq update
-    as_root env DEBIAN_FRONTEND=noninteractive apt-get -qq install -y --no-install-recommends "${missing[@]}" >/dev/null
+    local apt=(env DEBIAN_FRONTEND=noninteractive apt-get -qq -o "DPkg::Lock::Timeout=$apt_wait")
+    if ! as_root "${apt[@]}" update ||
+        ! as_root "${apt[@]}" install -y --no-install-recommends "${missing[@]}" >/dev/null; then
+        fail "apt-get could not install ${missing[*]}"
+    fi
 }
 
 run_tests() {
     say "running tests/vcan on $channel, kernel $(uname -r)"
-    "$python" -m pytest tests/vcan -vv -p no:cacheprovider -o faulthandler_timeout=300 "$@"
+    "$python" -m pytest tests/vcan -vv -n 0 -p no:cacheprovider -o faulthandler_timeout=300 "$@"
 }
 
 # The newest kernel of this machine that brings the vcan module.
@@ -73,10 +84,11 @@ bootable_kernel() {
     done
 }
 
-# What the guest runs. Its exit code comes back in a file: virtme-ng has been seen to lose it.
+# What a guest runs. The exit code comes back in a file, because neither guest passes it on.
 inside() {
     local result=$1 code=0
     shift
+    touch "$result/booted"
     if make_vcan_ready; then
         run_tests "$@" || code=$?
     else
@@ -89,41 +101,107 @@ inside() {
 }
 
 stop_guest() {
-    kill "$guest" 2>/dev/null # timeout passes it on to vng and QEMU
+    kill "$guest" 2>/dev/null # timeout passes the signal on to the guest's processes
     wait "$guest" || true
 }
 
-in_guest() {
-    local kernel code=0 command show reader
-    install_missing "${packages[@]}"
-    kernel=$(bootable_kernel)
-    [ -n "$kernel" ] || fail "no kernel with vcan under /boot; type: apt-get install --reinstall linux-image-amd64"
-    PATH=$(dirname "$python"):$PATH
-    command -v vng >/dev/null || fail "virtme-ng is missing; type: $python -m pip install virtme-ng"
-
-    result=$(mktemp -d) # global: the traps need it after this function, as they need guest
-    trap 'rm -rf "$result"' EXIT
-    # Without the compiler's library: loading it there takes longer than all loops as plain Python.
-    printf -v command '%q ' env "PYTHON=$python" NUMBA_DISABLE_JIT=1 bash tests/vcan/run.sh --inside "$result" "$@"
-    say "this kernel has no usable SocketCAN; booting ${kernel#/boot/} in QEMU without KVM (half a minute, then slowly)"
-    # Through a pipe: vng opens its standard output anew, and a file would be written over from its start.
-    exec {show}> >(exec cat)
-    reader=$!
-    timeout -k 10 "$boot_limit" vng --disable-kvm -r "$kernel" --cpus 2 --memory 4G --user root --rw \
-        --rwdir="$result" --cwd "$PWD" -- "$command" </dev/null >&"$show" 2>&1 &
-    guest=$!
+# Run a guest in the background until it ends or the operator interrupts it; `guest` is its process.
+await_guest() {
+    local code=0
     trap 'stop_guest; exit 130' INT
     trap 'stop_guest; exit 143' TERM
     wait "$guest" || code=$?
     trap - INT TERM
+    return "$code"
+}
+
+# Print the exit code that pytest left in the result folder; fail if there is none.
+result_of_guest() {
+    [ -s "$result/exit-code" ] || fail "the guest ended without a result ($1; 124 means longer than its time limit)"
+    say "pytest in the guest ended with exit code $(cat "$result/exit-code")"
+    return "$(cat "$result/exit-code")"
+}
+
+# The init process of User-Mode Linux. Its root is the root of this machine (hostfs); /run is its own, with the tests' files.
+uml_init() {
+    cat <<EOF
+#!/bin/bash
+export PATH='$PATH' HOME='$HOME' PYTHON='$python' TMPDIR=/run/tmp
+mount -t proc proc /proc && mount -t sysfs sys /sys
+mountpoint -q /dev || mount -t devtmpfs dev /dev
+mkdir -p /dev/shm /dev/pts && mount -t devpts pts /dev/pts
+mount -t tmpfs run /run && mount -t tmpfs shm /dev/shm && mkdir /run/tmp
+mount --bind /usr/lib/uml/modules /lib/modules
+ip link set lo up
+cd '$PWD' && bash tests/vcan/run.sh --inside '$result' $1
+sync
+halt -f
+EOF
+}
+
+# Return 3 if this machine cannot boot User-Mode Linux, otherwise the exit code of pytest.
+in_uml() {
+    local code=0 arguments="" watcher memory=/dev/shm
+    install_missing "${uml_packages[@]}"
+    [ $# = 0 ] || printf -v arguments '%q ' "$@"
+    uml_init "$arguments" >"$result/init"
+    chmod +x "$result/init"
+    # Its memory is a file: on the disk if the shared memory of this machine is too small.
+    [ "$(df --output=avail -m $memory 2>/dev/null | tail -1 || echo 0)" -gt $((memory_mb + 512)) ] || memory=$result
+    say "this kernel has no usable SocketCAN; booting User-Mode Linux $(linux.uml --version)"
+    TMPDIR=$memory timeout -k 10 "$uml_limit" linux.uml mem=${memory_mb}M rootfstype=hostfs rootflags=/ rw \
+        init="$result/init" con=null con0=fd:0,fd:1 quiet </dev/null > >(cat) 2>"$result/kernel.log" &
+    guest=$!
+    { sleep $uml_boot_limit && [ ! -e "$result/booted" ] && kill $guest; } 2>/dev/null &
+    watcher=$!
+    await_guest || code=$?
+    kill $watcher 2>/dev/null || true
+    if [ ! -e "$result/booted" ]; then
+        say "User-Mode Linux does not boot on this machine (exit code $code):"
+        tail -5 "$result/kernel.log" >&2
+        return 3
+    fi
+    result_of_guest "linux.uml: exit code $code"
+}
+
+in_qemu() {
+    local kernel code=0 command show reader
+    install_missing "${qemu_packages[@]}"
+    kernel=$(bootable_kernel)
+    [ -n "$kernel" ] || fail "no kernel with vcan under /boot; type: apt-get install --reinstall linux-image-amd64"
+    PATH=$(dirname "$python"):$PATH
+    command -v vng >/dev/null || fail "virtme-ng is missing; type: $python -m pip install virtme-ng"
+    # Without the compiler's library: loading it there takes longer than all loops as plain Python.
+    printf -v command '%q ' env "PYTHON=$python" NUMBA_DISABLE_JIT=1 ATALANTE_VCAN_PATIENCE=60 \
+        bash tests/vcan/run.sh --inside "$result" "$@"
+    say "this kernel has no usable SocketCAN; booting ${kernel#/boot/} in QEMU without KVM (half a minute, then slowly)"
+    # Through a pipe: vng opens its standard output anew, and a file would be written over from its start.
+    exec {show}> >(exec cat)
+    reader=$!
+    timeout -k 10 "$qemu_limit" vng --disable-kvm -r "$kernel" --cpus 2 --memory ${memory_mb}M --user root --rw \
+        --rwdir="$result" --cwd "$PWD" -- "$command" </dev/null >&"$show" 2>&1 &
+    guest=$!
+    await_guest || code=$?
     exec {show}>&-
     wait "$reader"
-    if [ ! -s "$result/exit-code" ]; then
-        fail "the guest ended without a result (vng: exit code $code; 124 means longer than $boot_limit s)"
-    fi
-    code=$(cat "$result/exit-code")
-    say "pytest in the guest ended with exit code $code"
-    return "$code"
+    result_of_guest "vng: exit code $code"
+}
+
+in_guest() {
+    local code=0
+    mkdir -p .lane
+    result=$(mktemp -d "$PWD/.lane/XXXXXX") # global: the traps need it after this function
+    trap 'rm -rf "$result"' EXIT
+    case ${GUEST:-} in
+        uml) in_uml "$@" ;;
+        qemu) in_qemu "$@" ;;
+        "")
+            in_uml "$@" || code=$?
+            [ $code = 3 ] || return $code
+            in_qemu "$@"
+            ;;
+        *) fail "GUEST must be uml or qemu, got ${GUEST}" ;;
+    esac
 }
 
 main() {
