@@ -22,7 +22,7 @@ from atalante_tools.faults import campaign, tasks
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.matrix import load_matrix
 from atalante_tools.faults.report import Summary
-from atalante_tools.faults.scenario import Case, Host, Scenario
+from atalante_tools.faults.scenario import Case, HostFault, Scenario
 from atalante_tools.faults.tasks import HORIZON, CaseTask, Endurance, EnduranceTask, PairTask, PairVerdict, plan
 from atalante_tools.faults.verdict import Verdict
 
@@ -45,7 +45,7 @@ def test_a_plan_has_every_case_and_every_pair_once() -> None:
     count = len(tasks.REPRESENTATIVES)
     assert len(pairs) == count * (count - 1) // 2
     assert {task.id for task in planned if isinstance(task, EnduranceTask)} == {
-        s.id for s in SCENARIOS.values() if s.lasting
+        s.id for s in SCENARIOS.values() if s.permanent
     }
 
 
@@ -78,18 +78,18 @@ def test_a_crash_of_the_stack_is_a_failed_case(monkeypatch: pytest.MonkeyPatch) 
         raise RuntimeError("the stack fell")
 
     monkeypatch.setattr(tasks, "observe", crash)
-    verdict = tasks.attempt("F44", SCENARIOS["F44"].cases[0])
-    assert verdict.failures == ("crashed: RuntimeError: the stack fell",)
+    verdict = tasks.run_case("F44", SCENARIOS["F44"].cases[0])
+    assert verdict.failures == ("exception in the run: RuntimeError: the stack fell",)
     pair = PairTask(("F44", SCENARIOS["F44"].cases[0].name), ("F44", SCENARIOS["F44"].cases[1].name))()
-    assert pair.failures == ("crashed: RuntimeError: the stack fell",)
+    assert pair.failures == ("exception in the run: RuntimeError: the stack fell",)
 
 
 def test_how_long_is_the_last_length_that_is_survived() -> None:
-    assert EnduranceTask("F44")() == Endurance("F44", SCENARIOS["F44"].lasting.name, 2)
+    assert EnduranceTask("F44")() == Endurance("F44", SCENARIOS["F44"].permanent.name, 2)
 
 
 def test_what_never_ends_the_walk_is_survived_to_the_end_of_the_watch(monkeypatch: pytest.MonkeyPatch) -> None:
-    harmless = Scenario("F44", (), lasting=Case("in time", (Host("late", 0, None, 0.0),)))
+    harmless = Scenario("F44", (), permanent=Case("in time", (HostFault("late", 0, None, 0.0),)))
     monkeypatch.setitem(tasks.SCENARIOS, "F44", harmless)
     assert EnduranceTask("F44")() == Endurance("F44", "in time", None)
 
@@ -101,7 +101,7 @@ def test_two_faults_end_as_badly_as_the_worse_of_them() -> None:
 
 GOOD = Verdict("F44", "3 cycles", "HOLD", 2, 3, "OVERRUN", ())
 BAD = replace(GOOD, case="4 cycles", cycles=9, failures=("HOLD after 9 cycles, and 3 are allowed",))
-PAIR = PairVerdict("F03 4 frames", "F04 LEFT_SK", "HOLD", ("crashed: X: y",))
+PAIR = PairVerdict("F03 4 frames", "F04 LEFT_SK", "HOLD", ("exception in the run: X: y",))
 
 
 def test_the_worst_case_speaks_for_its_fault() -> None:
@@ -123,7 +123,7 @@ def test_a_report_says_what_failed_how_long_and_which_pairs(tmp_path: Path) -> N
         "- F44 4 cycles: HOLD after 9",
         "| 4 |",
         f"| {HORIZON} and more |",
-        "and F04 LEFT_SK: crashed",
+        "and F04 LEFT_SK: exception in the run",
     ):
         assert piece in text
     data = json.loads((tmp_path / "new" / "report.json").read_text())
@@ -154,7 +154,7 @@ def test_run_prints_a_table_or_one_object() -> None:
         (("run", "F99"), "got 'F99'"),
         (("run", "F52"), "run `pytest tests/faults/test_refusals.py"),
         (("run", "F44", "--case", "nothing like it"), "valid cases: 2 cycles, 3 cycles"),
-        (("campaign", "F52"), "F52 has no scenario"),
+        (("campaign", "F52"), "F52 has only tests and no scenario"),
         (("campaign", "--jobs", "0"), "--jobs"),
     ],
 )

@@ -87,7 +87,7 @@ def test_the_guide_is_left_and_regained(seen: Any, outside: tuple[int, ...], say
 
 
 def test_data_may_not_be_one_cycle_old_during_the_fault(seen: Any) -> None:
-    for cycle, says in ((FIRST - 1, None), (FIRST, "data was 1 cycles old"), (PRESSED, None)):
+    for cycle, says in ((FIRST - 1, None), (FIRST, "data must have age 0, got 1 cycles"), (PRESSED, None)):
         age = np.zeros((CYCLES, 18), np.int64)
         age[cycle - 1, 7] = 1
         assert checks.data_stays_fresh(seen(age=age, over=PRESSED - 1)) == says
@@ -111,7 +111,7 @@ def test_the_knee_stays_off_until_the_start(seen: Any) -> None:
     ],
 )
 def test_a_drive_of_the_left_leg_reports_two_senders(seen: Any, code: Dtc, node: str, passes: bool) -> None:
-    found = checks.drives_notice_two_senders(seen(events=(Event(FIRST, code, "", node=node),)))
+    found = checks.drives_report_two_senders(seen(events=(Event(FIRST, code, "", node=node),)))
     assert (found is None) is passes
 
 
@@ -131,12 +131,12 @@ def test_a_full_queue_is_confirmed_by_its_own_severity(seen: Any, code: Dtc, sev
 def test_every_drive_of_the_left_leg_holds_from_the_fifth_cycle_on(seen: Any) -> None:
     held = np.full((CYCLES, 12), D.OPERATION_ENABLED)
     held[FIRST + 3 : PRESSED - 1, :6] = D.QUICK_STOP_ACTIVE
-    assert checks.left_leg_holds_by_itself(seen(drive_state=held)) is None
+    assert checks.left_leg_in_local_hold(seen(drive_state=held)) is None
     for cycle in (FIRST + 4, PRESSED - 1):
         for joint in range(6):
             drives = held.copy()
             drives[cycle - 1, joint] = D.OPERATION_ENABLED
-            assert checks.left_leg_holds_by_itself(seen(drive_state=drives)) == (
+            assert checks.left_leg_in_local_hold(seen(drive_state=drives)) == (
                 f"a drive of the left leg did not hold in cycle {cycle}"
             )
 
@@ -144,10 +144,10 @@ def test_every_drive_of_the_left_leg_holds_from_the_fifth_cycle_on(seen: Any) ->
 def test_no_drive_is_enabled_after_a_rejected_start(seen: Any) -> None:
     refused = (Event(PRESSED, "START_REFUSED", "LEFT_SK is out of range"),)
     enabled = [Controlword.SHUTDOWN] * 11 + [Controlword.ENABLE_OPERATION]
-    assert checks.start_is_refused(seen()) == "no START was rejected"
-    assert checks.start_is_refused(seen(events=refused, commands=Commanded({PRESSED - 1: enabled}))) is None
+    assert checks.start_is_rejected(seen()) == "no START was rejected"
+    assert checks.start_is_rejected(seen(events=refused, commands=Commanded({PRESSED - 1: enabled}))) is None
     for cycle in (PRESSED, CYCLES):
-        found = checks.start_is_refused(seen(events=refused, commands=Commanded({cycle: enabled})))
+        found = checks.start_is_rejected(seen(events=refused, commands=Commanded({cycle: enabled})))
         assert found == f"a drive was enabled in cycle {cycle}, after LEFT_SK is out of range"
 
 
@@ -159,7 +159,7 @@ def test_the_torque_limit_follows_the_temperature_to_the_resolution_of_the_wire(
     allowed = float(robot.torque_limit(reported[0])[KNEE])
 
     def found(limit: np.ndarray) -> str | None:
-        return checks.limit_follows_the_heat(seen(temperature=reported, commands=Commanded(limit=limit)))
+        return checks.limit_follows_temperature(seen(temperature=reported, commands=Commanded(limit=limit)))
 
     assert found(np.full(CYCLES, allowed + 0.019)) is None
     assert found(at(allowed + 1.0, FIRST - 1)) is None

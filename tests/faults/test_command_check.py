@@ -72,7 +72,7 @@ def test_nothing_is_found_in_what_may_be_sent(hal: Hal, robot: Robot) -> None:
         hal.send(cycle)
     hal.word[:], hal.torque[:] = Controlword.QUICK_STOP, 0.0  # from the largest torque to none at once: the drive holds
     hal.send(30)
-    assert hal.commands().outside(robot) == []
+    assert hal.commands().violations(robot) == []
     assert hal.commands().words(29) == [Controlword.ENABLE_OPERATION] * 12
     assert hal.commands().words(30) == [Controlword.QUICK_STOP] * 12
     assert hal.commands().words(31) == []
@@ -86,10 +86,10 @@ def test_a_torque_a_limit_a_step_and_a_torque_while_stopped_are_found(hal: Hal, 
     hal.send(3)
     hal.word[HIP], hal.torque[HIP] = Controlword.QUICK_STOP, 0.1
     hal.send(4)
-    assert hal.commands().outside(robot) == [
+    assert hal.commands().violations(robot) == [
         "a torque beyond the joint's limit was sent to left_SK in cycle 2",
         "a torque step beyond the joint's rate was sent to left_SK in cycle 2",
-        "a torque limit beyond the joint's was sent to right_SH in cycle 3",
+        "a torque limit beyond the joint's limit was sent to right_SH in cycle 3",
         "a torque with QUICK STOP was sent to right_SH in cycle 4",
     ]
 
@@ -100,10 +100,10 @@ def test_a_step_may_be_the_rate_of_its_joint_over_one_cycle(hal: Hal, robot: Rob
     hal.send(1)
     hal.torque[:] = step
     hal.send(2)
-    assert hal.commands().outside(robot) == []
+    assert hal.commands().violations(robot) == []
     hal.torque[:] = 3.0 * step
     hal.send(3)
-    assert hal.commands().outside(robot) == [
+    assert hal.commands().violations(robot) == [
         f"a torque step beyond the joint's rate was sent to {side}_{JOINTS[0].split('_')[1]} in cycle 3"
         for side in ("left", "right")
     ]
@@ -113,9 +113,9 @@ def test_a_step_over_a_cycle_without_a_frame_is_no_step(hal: Hal, robot: Robot) 
     hal.send(1)
     hal.torque[KNEE] = 100.0
     hal.send(5)
-    assert hal.commands().outside(robot) == []
+    assert hal.commands().violations(robot) == []
 
 
 def test_another_nodes_identifier_is_found(hal: Hal, network: Network, robot: Robot) -> None:
     hal.recorded.sent(TransmitImage([network.message("LEFT_SK_STATE")]).seal())
-    assert hal.commands().outside(robot) == ["the HAL must send only its own identifiers, got 0x184"]
+    assert hal.commands().violations(robot) == ["the HAL must send only its own identifiers, got 0x184"]

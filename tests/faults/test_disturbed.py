@@ -12,8 +12,8 @@ from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Command
 from atalante_hal.wire.frame import new_frames
-from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, Moment
-from atalante_tools.faults.scenario import Host
+from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, HostFaults
+from atalante_tools.faults.scenario import HostFault
 
 BEGINS = 10
 
@@ -38,31 +38,31 @@ class AtCycle:
         self.cycle = cycle
 
 
-def at(moment: Moment, cycle: int) -> Moment:
+def at(moment: HostFaults, cycle: int) -> HostFaults:
     moment.cycle = cycle
     return moment
 
 
 def test_a_fault_is_on_from_its_start_for_its_cycles_and_remembers_when_it_struck() -> None:
-    moment = Moment([Host("late", 2, 3, 1.0)], BEGINS)
+    moment = HostFaults([HostFault("late", 2, 3, 1.0)], BEGINS)
     assert [cycle for cycle in range(20) if at(moment, cycle).of("late")] == [12, 13, 14]
-    assert moment.struck == 12
-    assert at(Moment([Host("late", 0, None)], BEGINS), 10**6).of("late")
-    assert at(Moment([Host("late", 0, None)], BEGINS), 9).of("late") is None
-    assert at(moment, 12).of("raise", "ask") is None
+    assert moment.first_active == 12
+    assert at(HostFaults([HostFault("late", 0, None)], BEGINS), 10**6).of("late")
+    assert at(HostFaults([HostFault("late", 0, None)], BEGINS), 9).of("late") is None
+    assert at(moment, 12).of("raise", "request") is None
 
 
 @pytest.mark.parametrize(
     ("fault", "torque"),
     [
-        (Host("ask", value=math.nan), [math.nan] * 12),
-        (Host("shake", value=5.0), [6.0 if joint == "left_SH" else 1.0 for joint in JOINTS]),
-        (Host("shape", value=3), [0.0] * 3),
-        (Host("late", value=1.0), [1.0] * 12),
+        (HostFault("request", value=math.nan), [math.nan] * 12),
+        (HostFault("shake", value=5.0), [6.0 if joint == "left_SH" else 1.0 for joint in JOINTS]),
+        (HostFault("shape", value=3), [0.0] * 3),
+        (HostFault("late", value=1.0), [1.0] * 12),
     ],
 )
-def test_what_the_controller_asks_for(fault: Host, torque: list[float]) -> None:
-    controller = DisturbedController(Still(), at(Moment([fault], BEGINS), BEGINS))
+def test_what_the_controller_asks_for(fault: HostFault, torque: list[float]) -> None:
+    controller = DisturbedController(Still(), at(HostFaults([fault], BEGINS), BEGINS))
     assert np.array_equal(controller.update(AtCycle(BEGINS)).torque, torque, equal_nan=True)
     assert controller.telemetry is Still.telemetry
     assert controller.telemetry_fields == Still.telemetry_fields
@@ -70,26 +70,28 @@ def test_what_the_controller_asks_for(fault: Host, torque: list[float]) -> None:
 
 def test_the_controller_raises_where_it_is_asked_to() -> None:
     inner = Still()
-    controller = DisturbedController(inner, at(Moment([Host("raise_in_reset", value="KeyError")], BEGINS), BEGINS))
+    controller = DisturbedController(
+        inner, at(HostFaults([HostFault("raise_in_reset", value="KeyError")], BEGINS), BEGINS)
+    )
     with pytest.raises(KeyError):
         controller.reset(AtCycle(BEGINS))
     assert inner.resets == 1
     controller.update(AtCycle(BEGINS))
-    controller = DisturbedController(inner, at(Moment([Host("raise", value="MemoryError")], BEGINS), BEGINS))
+    controller = DisturbedController(inner, at(HostFaults([HostFault("raise", value="MemoryError")], BEGINS), BEGINS))
     controller.reset(AtCycle(BEGINS))
     with pytest.raises(MemoryError):
         controller.update(AtCycle(BEGINS))
 
 
 def test_the_clock_is_late_when_asked() -> None:
-    moment = Moment([Host("late", 0, 1, 4e-3)], BEGINS)
+    moment = HostFaults([HostFault("late", 0, 1, 4e-3)], BEGINS)
     clock = DisturbedClock(moment)
     assert [at(moment, cycle) and clock.wait() for cycle in (9, 10, 11)] == [0.0, 4e-3, 0.0]
 
 
 def test_the_bus_refuses_when_asked_and_is_the_bus_otherwise() -> None:
     ours, theirs = lockstep_pair()
-    moment = Moment([Host("bus_full", 0, 1), Host("bus_down", 1, 1)], BEGINS)
+    moment = HostFaults([HostFault("bus_full", 0, 1), HostFault("bus_down", 1, 1)], BEGINS)
     bus, frames = DisturbedBus(ours, moment), new_frames(2)
     assert bus.name == ours.name
     for cycle, error in ((10, BusFull), (11, BusDown)):

@@ -68,8 +68,8 @@ def test_cases_are_told_apart_and_have_a_bound(scenario) -> None:
     assert len(set(names)) == len(names) > 0
     for case in scenario.cases:
         assert Expectation.of(case, MATRIX[scenario.id]).reacted > 0
-    if scenario.lasting is not None:
-        assert scenario.lasting.ends is None
+    if scenario.permanent is not None:
+        assert scenario.permanent.ends is None
 
 
 def test_representatives_are_cases_of_a_dozen_faults() -> None:
@@ -88,7 +88,7 @@ def test_what_is_not_a_table_is_refused(tmp_path) -> None:
         return load_matrix.__wrapped__(path)
 
     row = load(head + good)["F01"]
-    assert (row.noticed, row.reacted, row.state, row.dtc) == (1, 5, S.HOLD, "")
+    assert (row.detected, row.reacted, row.state, row.dtc) == (1, 5, S.HOLD, "")
     assert row.tests == ("test_x.py::test_y",)
     for text, says in (
         ("", "must have a table"),

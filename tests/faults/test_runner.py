@@ -8,23 +8,23 @@ from atalante_emulator.faults import Fault
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
-from atalante_tools.faults.runner import AGAIN, CONFIG, observe, walk_begins
-from atalante_tools.faults.scenario import Case, Host, Press
-from atalante_tools.faults.verdict import uncontrolled
+from atalante_tools.faults.runner import CONFIG, RESTARTED, first_walk_cycle, observe
+from atalante_tools.faults.scenario import Case, HostFault, OperatorAction
+from atalante_tools.faults.verdict import limit_violations
 
 S = SupervisorState
 KNEE = JOINTS.index("left_SK")
 
 
 def test_a_walk_in_which_nothing_happens() -> None:
-    seen = observe(Case("nothing", (), phase=0.25, watched=300), 1, recovery=False)
-    assert seen.first == walk_begins() + 200
-    assert (seen.over, seen.pressed, seen.quiet) == (seen.first, None, seen.last)
+    seen = observe(Case("nothing", (), phase=0.25, observed=300), 1, recovery=False)
+    assert seen.first == first_walk_cycle() + 200
+    assert (seen.over, seen.pressed, seen.last_before_start) == (seen.first, None, seen.last)
     assert seen.last == seen.first + 300
     active = seen.states.index(S.ACTIVE) + 1
-    assert active + round(CONFIG.startup * 1000) == walk_begins()
+    assert active + round(CONFIG.startup * 1000) == first_walk_cycle()
     assert set(seen.states[active - 1 :]) == {S.ACTIVE}
-    assert uncontrolled(seen) == []
+    assert limit_violations(seen) == []
     assert np.ptp(seen.position[seen.first - 1 :, KNEE]) > 0.3
     assert (seen.drive_state[seen.first - 1 :] == DriveState.OPERATION_ENABLED).all()
     assert seen.guide_exit[seen.first - 1 :].max() < 0.0
@@ -39,16 +39,18 @@ def test_faults_begin_in_the_first_faulty_cycle_of_the_hal() -> None:
 
 
 def test_the_operator_does_as_told_and_starts_again_when_it_is_over() -> None:
-    seen = observe(Case("stop", (Press("stop", 5),)), 20)
+    seen = observe(Case("stop", (OperatorAction("stop", 5),)), 20)
     assert seen.states[seen.first + 3] is S.ACTIVE
     assert seen.states[seen.first + 4] is S.HOLD
     assert seen.pressed == seen.first + 20 + 60
-    assert {*seen.states[seen.first + 4 : seen.quiet]} == {S.HOLD}
-    assert [*seen.states[-AGAIN - 1 :]] == [S.HOLD] + [S.ACTIVE] * AGAIN
+    assert {*seen.states[seen.first + 4 : seen.last_before_start]} == {S.HOLD}
+    assert [*seen.states[-RESTARTED - 1 :]] == [S.HOLD] + [S.ACTIVE] * RESTARTED
 
 
 def test_a_fault_of_the_host_is_judged_from_where_it_struck() -> None:
-    seen = observe(Case("in reset", (Host("raise_in_reset", 0, 800, "ValueError"),), phase=None), 1, recovery=False)
+    seen = observe(
+        Case("in reset", (HostFault("raise_in_reset", 0, 800, "ValueError"),), phase=None), 1, recovery=False
+    )
     assert seen.state(seen.first) is S.ACTIVE
     assert seen.first > 1
 

@@ -6,12 +6,12 @@ import pytest
 
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.scenario import Case
-from atalante_tools.faults.tasks import attempt
+from atalante_tools.faults.tasks import run_case
 
 CASES = [(scenario.id, case) for scenario in SCENARIOS.values() for case in scenario.cases]
 
 
 @pytest.mark.parametrize(("id_", "case"), CASES, ids=[f"{id_}-{case.name}" for id_, case in CASES])
 def test_fault(id_: str, case: Case) -> None:
-    verdict = attempt(id_, case)
+    verdict = run_case(id_, case)
     assert verdict.passed, "\n".join(verdict.failures)

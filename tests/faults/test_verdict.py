@@ -18,7 +18,7 @@ from atalante_tools.faults.command_check import Commands, SentFrames
 from atalante_tools.faults.matrix import Row
 from atalante_tools.faults.observation import Observation
 from atalante_tools.faults.scenario import Case
-from atalante_tools.faults.verdict import Expectation, Verdict, judge
+from atalante_tools.faults.verdict import Expectation, Verdict, evaluate
 
 S = SupervisorState
 FIRST, PRESSED = 11, 41
@@ -58,7 +58,7 @@ def seen(network: Network, robot: Robot) -> Any:
 
 
 def verdict(observation: Observation, **case: Any) -> Verdict:
-    return judge(ROW, Case("a case", (), **case), observation)
+    return evaluate(ROW, Case("a case", (), **case), observation)
 
 
 def test_what_should_be_passes(seen: Any) -> None:
@@ -147,6 +147,6 @@ def test_ridden_through_is_measured_by_its_diagnostic(seen: Any) -> None:
 
 def test_a_bound_has_to_be_said_somewhere() -> None:
     with pytest.raises(
-        ValueError, match="F99 x: `noticed` and `reacted` must be given, because the bound of the row is '1 step'"
+        ValueError, match="F99 x: `detected` and `reacted` must be given, because the bound of the row is '1 step'"
     ):
         Expectation.of(Case("x", ()), Row("F99", "", "", "1 step", "", S.HOLD, "", ()))

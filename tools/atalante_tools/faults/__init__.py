@@ -1,4 +1,4 @@
-"""Command `atalante faults`: run the fault matrix against an emulated robot that walks suspended in the air.
+"""Command `atalante faults`: inject the faults of the fault matrix into an emulated robot that walks suspended in the air.
 
 FAULTS.md -> matrix        link, node, sensor, drive, host, operator -> scenarios -> runner -> verdict -> campaign, report
 """
@@ -31,10 +31,10 @@ _BAR = 24  # characters
 
 @click.group()
 def command() -> None:
-    """Run the fault matrix: inject faults into the emulated robot and check the reaction.
+    """Inject the faults of the fault matrix into an emulated robot, and check the reaction of the HAL.
 
-    Every fault has an ID, a bound in cycles of 1 ms, a final state and a diagnostic code. The table is the file FAULTS.md of this
-    package.
+    Every fault has an ID, a bound in cycles of 1 ms, a final state and a diagnostic code. The file FAULTS.md of this package
+    contains the fault matrix.
 
     \b
     Example: atalante faults list
@@ -46,7 +46,7 @@ def command() -> None:
 @command.command("list", short_help="List all faults with bound, code and proof.")
 @json_option
 def list_(as_json: bool) -> None:
-    """List all faults with their bound, final state, diagnostic code and proof."""
+    """List all faults with their bounds, final states, diagnostic codes and proofs."""
     from atalante_tools.faults.matrix import load_matrix
 
     rows = load_matrix().values()
@@ -60,12 +60,12 @@ def list_(as_json: bool) -> None:
     )
 
 
-@command.command("run", short_help="Run the cases of one fault and check them.")
+@command.command("run", short_help="Run the cases of one fault and check the reactions.")
 @click.argument("id_", metavar="ID")
 @click.option("--case", "name", metavar="TEXT", default="", help="Run only the cases whose name contains this text.")
 @json_option
 def run(id_: str, name: str, as_json: bool) -> None:
-    """Run the cases of one fault, each on a new robot, and check the reactions."""
+    """Run the cases of one fault and check the reactions. Every case starts a new emulated robot."""
     from atalante_tools.faults.catalogue import SCENARIOS
     from atalante_tools.faults.report import Summary, number
     from atalante_tools.faults.tasks import CaseTask
@@ -74,7 +74,7 @@ def run(id_: str, name: str, as_json: bool) -> None:
     row = _row(id_)
     if row.id not in SCENARIOS:
         raise InvalidUsage(
-            f"{row.id} must have a scenario, but has only tests: run `pytest {' '.join(f'tests/{t}' for t in row.tests)}`"
+            f"{row.id} has only tests and no scenario: run `pytest {' '.join(f'tests/{t}' for t in row.tests)}`"
         )
     cases = SCENARIOS[row.id].cases
     tasks = [CaseTask(row.id, index) for index, case in enumerate(cases) if name in case.name]
@@ -93,7 +93,7 @@ def run(id_: str, name: str, as_json: bool) -> None:
     _conclude(summary)
 
 
-@command.command("campaign", short_help="Run all faults, alone and in pairs, and write a report.")
+@command.command("campaign", short_help="Run all faults, single and in pairs, and write a report.")
 @click.argument("ids", metavar="[ID]...", nargs=-1)
 @click.option(
     "--jobs",
@@ -114,7 +114,7 @@ def run(id_: str, name: str, as_json: bool) -> None:
     "--endurance/--no-endurance",
     default=True,
     show_default=True,
-    help="Also measure how long the walk survives each fault.",
+    help="Also measure the longest duration of each fault during which the walk continues.",
 )
 @click.option(
     "--out",
@@ -128,16 +128,16 @@ def run(id_: str, name: str, as_json: bool) -> None:
 def campaign_(
     ids: tuple[str, ...], jobs: int, dask: str, pairs: bool, endurance: bool, out: Path, as_json: bool
 ) -> None:
-    """Run all faults, or those with the given IDs, and write a report."""
+    """Run all faults, or the faults with the given IDs, and write a report."""
     from atalante_tools.faults.catalogue import SCENARIOS
     from atalante_tools.faults.report import Summary
     from atalante_tools.faults.tasks import plan
 
     chosen = [_row(id_).id for id_ in ids] or list(SCENARIOS)
     if without := [id_ for id_ in chosen if id_ not in SCENARIOS]:
-        raise InvalidUsage(f"{without[0]} has no scenario; `atalante faults list` shows its tests")
+        raise InvalidUsage(f"{without[0]} has only tests and no scenario: `atalante faults list` shows the tests")
     tasks = plan(chosen, endurance=endurance, pairs=pairs and not ids)
-    out.mkdir(parents=True, exist_ok=True)  # fails now, not after minutes of runs
+    out.mkdir(parents=True, exist_ok=True)  # a folder that cannot be created fails before the runs
     begun = time.monotonic()
     say(f"{len(tasks)} runs on {f'the workers of {dask}' if dask else f'{jobs} processes'}")
     found = list(_done(tasks, jobs=jobs, dask=dask))
@@ -164,7 +164,7 @@ def _done(tasks: Sequence[Task], *, jobs: int = 1, dask: str = "") -> Iterator[R
     from atalante_tools.faults.campaign import results
     from atalante_tools.session.body import require_engine
 
-    if not dask:  # the workers of a cluster have an installation of their own
+    if not dask:  # on a cluster, PyBullet is needed only on the workers
         require_engine()
     progress, begun = Progress(), time.monotonic()
     try:
@@ -180,7 +180,7 @@ def _done(tasks: Sequence[Task], *, jobs: int = 1, dask: str = "") -> Iterator[R
 
 
 def _table(summary: Summary) -> str:
-    """Return the table of results: one line per fault, with the cycles that the walk survives it."""
+    """Return a table with one row per fault: its result, and the cycles for which the walk survives it."""
     from atalante_tools.faults.report import number, survived
 
     lasts = {one.id: survived(one) for one in summary.endurance}
@@ -194,7 +194,7 @@ def _table(summary: Summary) -> str:
 
 
 def _conclude(summary: Summary) -> None:
-    """Print all failures.
+    """Print all failures to stderr.
 
     Raises:
         Failed: If a fault or a pair failed.

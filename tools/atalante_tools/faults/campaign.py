@@ -1,4 +1,4 @@
-"""Parallel runs of a campaign in processes or on a cluster: tasks -> `fan_out` -> results -> report."""
+"""Parallel execution of the tasks of a campaign, in processes or on a dask cluster."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from atalante_control.gait_optimization.parallel import FanOutError, fan_out
 from atalante_tools.console.outcome import Failed
 from atalante_tools.faults.tasks import Result, Task, run_task
 
-#: Time without a result after which a campaign fails as hanging [s].
-HANGS: Final = 300.0
+#: Longest time between two results; after this time the campaign fails [s].
+RESULT_TIMEOUT: Final = 300.0
 
 
 def results(tasks: Sequence[Task], *, jobs: int = 1, dask: str = "") -> Iterator[Result]:
-    """Run the tasks and yield the results in the order of completion; see `fan_out`.
+    """Run the tasks with `fan_out` and yield the results in the order of completion.
 
     Args:
         tasks: tasks to run.
@@ -22,11 +22,11 @@ def results(tasks: Sequence[Task], *, jobs: int = 1, dask: str = "") -> Iterator
         dask: address of a dask scheduler. Empty means processes on this computer.
 
     Raises:
-        Failed: If joblib or dask is missing, the scheduler does not answer, or a task hangs.
+        Failed: If joblib or dask is not installed, the scheduler does not answer, or no result comes within `RESULT_TIMEOUT`.
     """
     try:
-        yield from fan_out(run_task, tasks, jobs=jobs, cluster=dask, patience=HANGS)
+        yield from fan_out(run_task, tasks, jobs=jobs, cluster=dask, patience=RESULT_TIMEOUT)
     except FanOutError as error:
         raise Failed(str(error)) from error
     except TimeoutError as error:
-        raise Failed(f"the campaign hangs: no result for {HANGS:.0f} s") from error
+        raise Failed(f"a task must end within {RESULT_TIMEOUT:.0f} s, got no result") from error

@@ -1,4 +1,4 @@
-"""All scenarios by ID, one for each row of the matrix whose proof is a run."""
+"""All scenarios by ID. Each row of the matrix with the proof `scenario` has one scenario."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Independent check of the wire: all command frames of the HAL, decoded by the DBC's bit positions and compared with the limits.
+"""Independent check of all command frames of the HAL: decode them with the bit positions of the DBC and compare with the limits.
 
-It shares no code with the limiter, the codec and the process image, so that it detects their errors.
+It shares no code with the limiter, the codec and the process image, so it can detect errors of these.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from atalante_hal.wire.cia402 import Controlword
 from atalante_hal.wire.frame import FRAME, Frames
 
 Vector = npt.NDArray[np.float64]
-#: Resolution of the torque signals [Nm]; a limit between two codes is rounded to the nearer one.
+#: Resolution of the torque signals [Nm]. A sent torque may exceed its limit by the rounding.
 _RESOLUTION: Final = 0.0125
 _PERIOD: Final = 1e-3  # s
 
 
 class SentFrames:
-    """`FrameTap` that records the frames the HAL sends, with their cycles."""
+    """`FrameTap` that records the frames from the HAL and their cycles."""
 
     def __init__(self) -> None:
-        self.cycle = 0  # cycle of the next frames, set by the owner
+        self.cycle = 0  # HAL cycle of the next frames, set by the runner
         self._cycles: list[int] = []
         self._sizes: list[int] = []
         self._memory = bytearray()
 
     def sent(self, frames: Frames) -> None:
-        """Record frames that were handed to the bus.
+        """Record frames that the HAL has sent.
 
         Args:
             frames: sent frames, shape (n,).
@@ -41,7 +41,7 @@ class SentFrames:
         self._cycles.append(self.cycle)
 
     def received(self, frames: Frames, count: int) -> None:
-        """Ignore frames of the nodes.
+        """Ignore frames from the nodes.
 
         Args:
             frames: receive buffer.
@@ -49,12 +49,12 @@ class SentFrames:
         """
 
     def frames(self) -> tuple[npt.NDArray[np.int64], Frames]:
-        """Return the cycle of each sent frame and the frames, shapes (n,)."""
+        """Return the HAL cycle of each sent frame, and the frames, shape (n,) each."""
         return np.repeat(self._cycles, self._sizes).astype(np.int64), np.frombuffer(bytes(self._memory), FRAME)
 
 
 class _Leg:
-    """Command frames of one leg: cycle of each frame, shape (n,), and values per signal, shape (n, 6)."""
+    """Command frames of one leg: HAL cycles, shape (n,), and the signals of the six joints, shape (n, 6) each."""
 
     def __init__(self, message: Message, cycles: npt.NDArray[np.int64], frames: Frames) -> None:
         selected = (frames["can_id"] == message.frame_id) & (frames["len"] == message.length)
@@ -67,23 +67,23 @@ class _Leg:
 
 
 class Commands:
-    """All commands of a run by cycle and joint, and the violations of their limits."""
+    """Decoded commands of a run, and the check of their limits."""
 
     def __init__(self, network: Network, cycles: npt.NDArray[np.int64], frames: Frames) -> None:
         """Decode the command frames.
 
         Args:
             network: messages of the DBC.
-            cycles: cycle of each frame, shape (n,).
+            cycles: HAL cycle of each frame, shape (n,).
             frames: frames sent by the HAL, shape (n,).
         """
         legs = [network.message(f"COMMAND_{side.upper()}_LEG") for side in SIDES]
         self._legs = [_Leg(message, cycles, frames) for message in legs]
         own = [message.frame_id for message in network.sent_by("HAL")]
-        self._strange = np.setdiff1d(frames["can_id"], own)
+        self._foreign_ids = np.setdiff1d(frames["can_id"], own)
 
     def words(self, cycle: int) -> list[int]:
-        """Return the controlwords sent in a cycle, in the order of JOINTS; a leg without a frame has none.
+        """Return the controlwords of the command frames that were sent in a cycle, in the order of JOINTS.
 
         Args:
             cycle: HAL cycle.
@@ -91,7 +91,7 @@ class Commands:
         return [int(word) for leg in self._legs for row in leg.word[leg.cycle == cycle] for word in row]
 
     def torque_of(self, joint: int) -> tuple[npt.NDArray[np.int64], Vector]:
-        """Return cycle and target torque of every command of a joint.
+        """Return the HAL cycle and the target torque of every command of a joint.
 
         Args:
             joint: index into JOINTS.
@@ -103,7 +103,7 @@ class Commands:
         return leg.cycle, leg.torque[:, joint % len(LEG_JOINTS)]
 
     def limit_of(self, joint: int) -> tuple[npt.NDArray[np.int64], Vector]:
-        """Return cycle and torque limit of every command of a joint.
+        """Return the HAL cycle and the torque limit of every command of a joint.
 
         Args:
             joint: index into JOINTS.
@@ -114,13 +114,15 @@ class Commands:
         leg = self._legs[joint // len(LEG_JOINTS)]
         return leg.cycle, leg.limit[:, joint % len(LEG_JOINTS)]
 
-    def outside(self, robot: Robot) -> list[str]:
-        """Return one sentence for each kind of violation: identifier, torque, torque limit, torque rate, QUICK STOP.
+    def violations(self, robot: Robot) -> list[str]:
+        """Return a sentence for each kind of violation: identifier, torque, torque limit, torque rate, torque with QUICK STOP.
 
         Args:
             robot: torque limits of the joints.
         """
-        found = [f"the HAL must send only its own identifiers, got {can_id:#x}" for can_id in self._strange.tolist()]
+        found = [
+            f"the HAL must send only its own identifiers, got {can_id:#x}" for can_id in self._foreign_ids.tolist()
+        ]
         for number, leg in enumerate(self._legs):
             joints = slice(number * len(LEG_JOINTS), (number + 1) * len(LEG_JOINTS))
             largest, rate = robot.torque_max[joints], robot.torque_rate_max[joints]
@@ -130,7 +132,7 @@ class Commands:
             step = np.abs(np.diff(leg.torque, axis=0))
             for violation, wrong, cycles in (
                 ("a torque beyond the joint's limit", np.abs(leg.torque) > largest + _RESOLUTION, leg.cycle),
-                ("a torque limit beyond the joint's", leg.limit > largest + _RESOLUTION, leg.cycle),
+                ("a torque limit beyond the joint's limit", leg.limit > largest + _RESOLUTION, leg.cycle),
                 ("a torque with QUICK STOP", stopped & (leg.torque != 0.0), leg.cycle),
                 ("a torque step beyond the joint's rate", both & (step > rate * _PERIOD + _RESOLUTION), leg.cycle[1:]),
             ):
@@ -141,7 +143,7 @@ class Commands:
 
 
 def _decode(words: npt.NDArray[np.uint64], signal: Signal) -> Vector:
-    """Return the physical values of a signal within one 64-bit word; words have shape (n, 8), the result has shape (n,)."""
+    """Return the physical values of a signal, shape (n,), from the 64-bit words of the payloads, shape (n, 8)."""
     raw = words[:, signal.start // 64] >> np.uint64(signal.start % 64) & np.uint64((1 << signal.length) - 1)
     values = raw.astype(np.int64)
     if signal.signed:

@@ -1,4 +1,4 @@
-"""Faults of the host: wrappers of controller, clock and bus that fail in chosen cycles."""
+"""Injection of host faults: wrappers of controller, clock and bus that fail in chosen cycles."""
 
 from __future__ import annotations
 
@@ -13,51 +13,51 @@ from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import PERIOD, Command, Controller, State, Vector
 from atalante_hal.wire.frame import Frames
-from atalante_tools.faults.scenario import Host
+from atalante_tools.faults.scenario import HostFault
 
-#: Selection of the joint that the fault `shake` acts on; the left hip is heavy enough to stay in place.
+#: Mask of the joint of the fault `shake`, shape (12,). The left hip hardly moves, because its inertia is large.
 _HIP: Final = np.array([joint == "left_SH" for joint in JOINTS], np.float64)
 
 
-class Moment:
-    """Timing of the host faults of a case, in HAL cycles."""
+class HostFaults:
+    """Host faults of a case, with their timing in HAL cycles."""
 
-    def __init__(self, faults: Sequence[Host], begins: int) -> None:
+    def __init__(self, faults: Sequence[HostFault], begins: int) -> None:
         self._faults, self._begins = faults, begins
-        self.cycle = 0  # present cycle, set by the owner
-        #: First cycle in which a fault acted; None: not yet.
-        self.struck: int | None = None
+        self.cycle = 0  # present HAL cycle, set by the runner
+        #: First HAL cycle in which a fault was active; None: no fault was active yet.
+        self.first_active: int | None = None
 
-    def of(self, *kinds: str) -> Host | None:
-        """Return the active fault of one of these kinds, None if there is none.
+    def of(self, *kinds: str) -> HostFault | None:
+        """Return the active fault of the given kinds, or None.
 
         Args:
-            *kinds: kinds of `Host` faults.
+            *kinds: kinds of `HostFault` faults.
         """
         since = self.cycle - self._begins
         for fault in self._faults:
             over = fault.cycles is not None and since >= fault.start + fault.cycles
             if fault.kind in kinds and since >= fault.start and not over:
-                if self.struck is None:
-                    self.struck = since + self._begins
+                if self.first_active is None:
+                    self.first_active = since + self._begins
                 return fault
         return None
 
 
 class DisturbedController:
-    """Controller with the faults `raise`, `raise_in_reset`, `ask`, `shake` and `shape`."""
+    """Controller with the faults `raise`, `raise_in_reset`, `request`, `shake` and `shape`."""
 
-    def __init__(self, controller: Controller, now: Moment) -> None:
+    def __init__(self, controller: Controller, now: HostFaults) -> None:
         self._controller, self._now = controller, now
         self.telemetry_fields = controller.telemetry_fields
 
     @property
     def telemetry(self) -> Vector:
-        """Telemetry of the wrapped controller."""
+        """Return the telemetry of the wrapped controller."""
         return self._controller.telemetry
 
     def reset(self, state: State) -> None:
-        """Reset the wrapped controller, or raise.
+        """Reset the wrapped controller, then raise an exception if `raise_in_reset` is active.
 
         Args:
             state: state of the HAL.
@@ -66,14 +66,14 @@ class DisturbedController:
         self._raise(self._now.of("raise_in_reset"))
 
     def update(self, state: State) -> Command:
-        """Return the command of the wrapped controller or a wrong one, or raise.
+        """Return the command of the wrapped controller, or a wrong command or an exception if a fault is active.
 
         Args:
             state: state of the HAL.
         """
         command = self._controller.update(state)
         self._raise(self._now.of("raise"))
-        wrong = self._now.of("ask", "shake", "shape")
+        wrong = self._now.of("request", "shake", "shape")
         if wrong is None:
             return command
         if wrong.kind == "shake":
@@ -83,7 +83,7 @@ class DisturbedController:
         return Command(np.full(len(JOINTS), float(wrong.value)), command.vibration)
 
     @staticmethod
-    def _raise(fault: Host | None) -> None:
+    def _raise(fault: HostFault | None) -> None:
         if fault is not None:
             raise getattr(builtins, str(fault.value))("injected fault of the controller")
 
@@ -91,19 +91,19 @@ class DisturbedController:
 class DisturbedClock:
     """Lock-step clock with the faults `late` and `slow`."""
 
-    def __init__(self, now: Moment) -> None:
+    def __init__(self, now: HostFaults) -> None:
         self._now = now
-        self._behind = 0.0  # s, delay of a slow loop against its deadlines
+        self._behind = 0.0  # delay of a slow loop behind its deadline [s]
 
     def wait(self) -> float:
-        """Return how late the cycle begins [s], as `WallClock.wait` would."""
-        asked = self._now.of("late", "slow")
-        if asked is None:
+        """Return the delay of the cycle behind its deadline [s], as `WallClock.wait` does."""
+        fault = self._now.of("late", "slow")
+        if fault is None:
             self._behind = 0.0
             return 0.0
-        if asked.kind == "late":
-            return float(asked.value)
-        self._behind += float(asked.value) - PERIOD
+        if fault.kind == "late":
+            return float(fault.value)
+        self._behind += float(fault.value) - PERIOD
         late = self._behind
         if late > PERIOD:
             self._behind = 0.0
@@ -111,14 +111,14 @@ class DisturbedClock:
 
 
 class DisturbedBus(WrappedBus):
-    """HAL's end of the bus with the faults `bus_down` and `bus_full`."""
+    """Bus of the HAL with the faults `bus_down` and `bus_full`."""
 
-    def __init__(self, bus: Bus, now: Moment) -> None:
+    def __init__(self, bus: Bus, now: HostFaults) -> None:
         super().__init__(bus)
         self._now = now
 
     def send(self, frames: Frames) -> None:
-        """Send frames, or raise.
+        """Send frames, or raise an error if a fault is active.
 
         Args:
             frames: frames to send, shape (n,).

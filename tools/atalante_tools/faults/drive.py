@@ -1,4 +1,4 @@
-"""Scenarios of faults of the drives and their commands: states, emergencies, heat, supply and lost commands."""
+"""Scenarios of drive faults: state changes, emergencies, over-temperature, under-voltage, lost and damaged commands."""
 
 from __future__ import annotations
 
@@ -6,33 +6,33 @@ from typing import Final
 
 from atalante_emulator.faults import Fault
 from atalante_hal.types import SupervisorState
-from atalante_tools.faults.checks import guide_regained, left_leg_holds_by_itself, limit_follows_the_heat
-from atalante_tools.faults.scenario import Case, Host, Scenario
+from atalante_tools.faults.checks import guide_regained, left_leg_in_local_hold, limit_follows_temperature
+from atalante_tools.faults.scenario import Case, HostFault, Scenario
 
 _S = SupervisorState
 _KNEE: Final = "LEFT_SK"
 _COMMAND: Final = "COMMAND_LEFT_LEG"
-#: Cycles until a lowered knee is at rest; before, its drive cannot be enabled again.
-_SUNK: Final = 4500
+#: Time until a lowered knee is at rest and its drive can be enabled again [cycles].
+_LOWERED: Final = 4500
 
 SCENARIOS: Final = (
     Scenario(
         "F21",
         tuple(
             Case(
-                f"{what}, {code:#06x}",
+                f"{name}, {code:#06x}",
                 (Fault("emergency", _KNEE, 0, 100, code=code),),
                 state=state,
                 dtc=dtc,
                 node=_KNEE,
                 recovers=recovers,
-                watched=watched,
+                observed=observed,
             )
-            for what, code, state, dtc, watched, recovers in (
-                ("current", 0x2310, _S.FAULT, "EMCY_2310", _SUNK, True),
+            for name, code, state, dtc, observed, recovers in (
+                ("current", 0x2310, _S.FAULT, "EMCY_2310", _LOWERED, True),
                 ("voltage", 0x3210, _S.HOLD, "EMCY_3210", 60, True),
                 ("temperature", 0x4210, _S.LOWER, "OVER_TEMP", 60, False),
-                ("encoder", 0x7305, _S.LOWER, "EMCY_7305", _SUNK, True),
+                ("encoder", 0x7305, _S.LOWER, "EMCY_7305", _LOWERED, True),
                 ("communication", 0x8100, _S.HOLD, "EMCY_8100", 60, True),
                 ("software", 0x6100, _S.FAULT, "EMCY_6100", 60, True),
             )
@@ -66,59 +66,59 @@ SCENARIOS: Final = (
     Scenario(
         "F23",
         (
-            Case("of one leg", (Fault("drop", "SYNC_LEFT_LEG", 0, 50),), checks=(left_leg_holds_by_itself,)),
+            Case("one leg", (Fault("drop", "SYNC_LEFT_LEG", 0, 50),), checks=(left_leg_in_local_hold,)),
             Case(
-                "of all",
+                "all buses",
                 tuple(
                     Fault("drop", f"SYNC_{side}_{part}", 0, 50)
                     for side in ("LEFT", "RIGHT")
                     for part in ("LEG", "SENSE")
                 ),
-                checks=(left_leg_holds_by_itself,),
+                checks=(left_leg_in_local_hold,),
             ),
         ),
-        lasting=Case("of one leg", (Fault("drop", "SYNC_LEFT_LEG"),)),
+        permanent=Case("one leg", (Fault("drop", "SYNC_LEFT_LEG"),)),
     ),
-    # The loss is detected by the counter of the next frame.
-    Scenario("F24", tuple(Case(f"{n} frames", (Fault("drop", _COMMAND, 0, n),), noticed=n + 1) for n in range(1, 5))),
+    # The counter of the next frame reveals the loss, so the detection takes one more cycle.
+    Scenario("F24", tuple(Case(f"{n} frames", (Fault("drop", _COMMAND, 0, n),), detected=n + 1) for n in range(1, 5))),
     Scenario(
         "F25",
         (
-            Case("5 frames", (Fault("drop", _COMMAND, 0, 5),), checks=(left_leg_holds_by_itself,)),
-            Case("200 frames", (Fault("drop", _COMMAND, 0, 200),), checks=(left_leg_holds_by_itself,)),
-            Case("for good", (Fault("drop", _COMMAND),), recovers=False, checks=(left_leg_holds_by_itself,)),
+            Case("5 frames", (Fault("drop", _COMMAND, 0, 5),), checks=(left_leg_in_local_hold,)),
+            Case("200 frames", (Fault("drop", _COMMAND, 0, 200),), checks=(left_leg_in_local_hold,)),
+            Case("permanent", (Fault("drop", _COMMAND),), recovers=False, checks=(left_leg_in_local_hold,)),
         ),
-        lasting=Case("left leg", (Fault("drop", _COMMAND),)),
+        permanent=Case("left leg", (Fault("drop", _COMMAND),)),
     ),
     Scenario(
         "F26",
         (
             *(Case(f"{bits} bits, 4 frames", (Fault("flip", _COMMAND, 0, 4, bits=bits),)) for bits in (1, 2, 16)),
-            Case("one in ten", (Fault("flip", _COMMAND, 0, 300, p=0.1),), noticed=60),
+            Case("one in ten", (Fault("flip", _COMMAND, 0, 300, p=0.1),), detected=60),
         ),
-        lasting=Case("every frame", (Fault("flip", _COMMAND),)),
+        permanent=Case("every frame", (Fault("flip", _COMMAND),)),
     ),
     Scenario(
         "F35",
         tuple(
             Case(
-                f"{node} pushed with {torque:g} Nm",
+                f"{torque:g} Nm on {node}",
                 (Fault("push", node, 0, 60, torque=torque),),
-                noticed=60,
-                watched=400,
+                detected=60,
+                observed=400,
                 checks=(guide_regained,),
             )
             for node, torque in (("LEFT_SH", -80.0), ("LEFT_SH", 80.0), (_KNEE, -50.0), (_KNEE, 50.0))
         ),
-        lasting=Case("the knee, by 40 Nm", (Fault("push", _KNEE, torque=40.0),)),
+        permanent=Case("40 Nm on the knee", (Fault("push", _KNEE, torque=40.0),)),
     ),
     Scenario(
         "F36",
         (
-            Case("250 cycles", (Host("shake", 0, 250, 1000.0),)),
-            Case("100 cycles", (Host("shake", 0, 100, 1000.0),), state=_S.ACTIVE),
+            Case("250 cycles", (HostFault("shake", 0, 250, 1000.0),)),
+            Case("100 cycles", (HostFault("shake", 0, 100, 1000.0),), state=_S.ACTIVE),
         ),
-        lasting=Case("shaken by 1000 Nm", (Host("shake", 0, None, 1000.0),)),
+        permanent=Case("1000 Nm", (HostFault("shake", 0, None, 1000.0),)),
     ),
     Scenario(
         "F38",
@@ -127,14 +127,14 @@ SCENARIOS: Final = (
                 "100 degC",
                 (Fault("over_temperature", _KNEE, 0, 400, degrees=100.0),),
                 node=_KNEE,
-                checks=(limit_follows_the_heat,),
+                checks=(limit_follows_temperature,),
             ),
             Case(
-                "up to 105 degC, 1 K a cycle",  # 90 degC are reached in cycle 65
+                "up to 105 degC, 1 K per cycle",  # derating begins at 90 degC, in cycle 65
                 (Fault("heat_ramp", _KNEE, 0, 400, rate=1000.0, up_to=105.0),),
                 node=_KNEE,
-                noticed=70,
-                checks=(limit_follows_the_heat,),
+                detected=70,
+                checks=(limit_follows_temperature,),
             ),
         ),
     ),
@@ -151,7 +151,7 @@ SCENARIOS: Final = (
                 "battery removed",
                 (Fault("battery_removed", "battery", 0, 300),),
                 dtc="SUPPLY_LOW",
-                noticed=150,
+                detected=150,
                 reacted=200,
             ),
         ),

@@ -9,17 +9,17 @@ from atalante_hal.robot import CELLS, JOINTS
 from atalante_hal.types import SupervisorState
 from atalante_tools.faults.checks import (
     data_stays_fresh,
-    drives_notice_two_senders,
+    drives_report_two_senders,
     guide_kept,
-    left_leg_holds_by_itself,
+    left_leg_in_local_hold,
 )
-from atalante_tools.faults.scenario import Case, Press, Scenario
+from atalante_tools.faults.scenario import Case, OperatorAction, Scenario
 
 _HOLD: Final = SupervisorState.HOLD
 _ACTIVE: Final = SupervisorState.ACTIVE
 _OFF: Final = SupervisorState.OFF
 _BUSES: Final = ("left_leg", "right_leg", "left_sense", "right_sense")
-#: Node and message for the faults of a single message.
+#: Node, state message and command message for the faults of a single drive.
 _KNEE: Final = "LEFT_SK"
 _STATE: Final = "LEFT_SK_STATE"
 _COMMAND: Final = "COMMAND_LEFT_LEG"
@@ -38,9 +38,9 @@ SCENARIOS: Final = (
             _lost("one frame", _STATE, 1, node=_KNEE),
             *(
                 Case(
-                    f"1 % of all, seed {seed}",
+                    f"1 % of all frames, seed {seed}",
                     tuple(Fault("drop", bus, 0, 800, p=0.01) for bus in _BUSES),
-                    noticed=800,
+                    detected=800,
                     seed=seed,
                     checks=(guide_kept,),
                 )
@@ -56,7 +56,7 @@ SCENARIOS: Final = (
                 (Fault("drop", _KNEE, 0, 1000, p=0.1),),
                 state=_ACTIVE,
                 dtc="",
-                noticed=1,
+                detected=1,
                 reacted=1,
                 checks=(guide_kept,),
             ),
@@ -66,7 +66,7 @@ SCENARIOS: Final = (
                     (Fault("drop", _KNEE, 0, within, p=p),),
                     dtc="E2E_LOSS_RATE|NODE_TIMEOUT",
                     node=_KNEE,
-                    noticed=within,
+                    detected=within,
                     reacted=within,
                     seed=seed,
                     checks=(guide_kept,),
@@ -81,21 +81,21 @@ SCENARIOS: Final = (
         "F04",
         (
             *(_lost(drive, f"{drive}_STATE", 5, node=drive) for drive in _DRIVES),
-            # The right foot is on the ground, and the left leg must finish its step first.
+            # The right foot is on the ground, so the left leg must finish its step before HOLD.
             *(
                 Case(
-                    f"{frames or 'all'} frames of a leg that swings",
+                    f"{frames or 'all'} frames of the swing leg",
                     (
                         Fault("value", "FOOT_RIGHT_STATE", 0, None, **{f"{cell}_ForceZ": 150.0 for cell in CELLS}),
                         Fault("drop", _STATE, 20, frames),
                     ),
-                    begins=20,
+                    first_faulty=20,
                     state=state,
                     dtc=dtc,
                     node=_KNEE,
                     reacted=reacted,
                     recovers=False,
-                    watched=40,  # force cells without noise would be detected after 100 cycles
+                    observed=40,  # short, because force cells without noise are detected after 100 cycles
                 )
                 for frames, state, dtc, reacted in (
                     (5, SupervisorState.FINISH_STEP, "SWING_TIMEOUT", 5),
@@ -103,41 +103,41 @@ SCENARIOS: Final = (
                 )
             ),
         ),
-        lasting=_lost("for good", _STATE, None, node=_KNEE, recovers=False),
+        permanent=_lost("permanent", _STATE, None, node=_KNEE, recovers=False),
     ),
     Scenario(
         "F05",
         (Case(_KNEE, (Fault("duplicate", _STATE, 0, 50),), node=_KNEE, checks=(data_stays_fresh,)),),
-        lasting=Case("for good", (Fault("duplicate", _STATE),)),
+        permanent=Case("permanent", (Fault("duplicate", _STATE),)),
     ),
     Scenario(
         "F06",
         (
-            Case("0 cycles", (), dtc="", state=_ACTIVE, watched=200),
-            # The delay is detected with the first late frame; before, there are no frames.
+            Case("0 cycles", (), dtc="", state=_ACTIVE, observed=200),
+            # The first late frame reveals the delay. Before, no frame arrives.
             *(
-                Case(f"{k} cycles", (Fault("delay", _STATE, 0, 200, by=k),), node=_KNEE, noticed=k + 1, state=_ACTIVE)
+                Case(f"{k} cycles", (Fault("delay", _STATE, 0, 200, by=k),), node=_KNEE, detected=k + 1, state=_ACTIVE)
                 for k in range(1, 5)
             ),
-            *(Case(f"{k} cycles", (Fault("delay", _STATE, 0, 200, by=k),), node=_KNEE, noticed=k + 1) for k in (5, 6)),
+            *(Case(f"{k} cycles", (Fault("delay", _STATE, 0, 200, by=k),), node=_KNEE, detected=k + 1) for k in (5, 6)),
         ),
-        lasting=Case("by 4 cycles, for good", (Fault("delay", _STATE, 0, None, by=4),)),
+        permanent=Case("by 4 cycles, permanent", (Fault("delay", _STATE, 0, None, by=4),)),
     ),
-    # The counter of the first frame is still correct.
+    # The counter of the first frozen frame is correct, so the fault begins one cycle later.
     Scenario(
         "F07",
         (
             Case(
                 "4 cycles",
                 (Fault("freeze_counter", _STATE, 0, 5),),
-                begins=1,
+                first_faulty=1,
                 dtc="E2E_REPEATED",
-                noticed=1,
+                detected=1,
                 state=_ACTIVE,
             ),
-            Case("50 cycles", (Fault("freeze_counter", _STATE, 0, 51),), begins=1, node=_KNEE),
+            Case("50 cycles", (Fault("freeze_counter", _STATE, 0, 51),), first_faulty=1, node=_KNEE),
         ),
-        lasting=Case("for good", (Fault("freeze_counter", _STATE),)),
+        permanent=Case("permanent", (Fault("freeze_counter", _STATE),)),
     ),
     Scenario(
         "F08",
@@ -148,12 +148,12 @@ SCENARIOS: Final = (
             ),
             Case("5 cycles", (Fault("flip", _STATE, 0, 5),), state=_HOLD, reacted=5, node=_KNEE),
         ),
-        lasting=Case("for good", (Fault("flip", _STATE),)),
+        permanent=Case("permanent", (Fault("flip", _STATE),)),
     ),
     Scenario(
         "F09",
         (Case("another knee", (Fault("masquerade", _STATE, 0, 4, like="RIGHT_SK_STATE"),), node=_KNEE),),
-        lasting=Case("for good", (Fault("masquerade", _STATE, like="RIGHT_SK_STATE"),)),
+        permanent=Case("permanent", (Fault("masquerade", _STATE, like="RIGHT_SK_STATE"),)),
     ),
     Scenario(
         "F10",
@@ -161,7 +161,7 @@ SCENARIOS: Final = (
             *(Case(f"{n} bytes", (Fault("length", _STATE, 0, 4, bytes=n),), node=_KNEE) for n in (0, 8, 16, 64)),
             Case("classic CAN", (Fault("flags", _STATE, 0, 4, flags=0),), node=_KNEE),
         ),
-        lasting=Case("for good", (Fault("length", _STATE, bytes=8),)),
+        permanent=Case("permanent", (Fault("length", _STATE, bytes=8),)),
     ),
     Scenario(
         "F11",
@@ -173,57 +173,57 @@ SCENARIOS: Final = (
                 ("extended", 0x1234567, 1),
             )
         ),
-        lasting=Case("for good", (Fault("foreign", "left_leg", can_id=0x7FF),)),
+        permanent=Case("permanent", (Fault("foreign", "left_leg", can_id=0x7FF),)),
     ),
     Scenario(
         "F12",
         (
-            Case("no such drive state", (Fault("raw", _STATE, 0, 4, DriveState=255),), node=_KNEE),
+            Case("undefined drive state", (Fault("raw", _STATE, 0, 4, DriveState=255),), node=_KNEE),
             Case("invalid position", (Fault("raw", _STATE, 0, 4, Position=1 << 23),), node=_KNEE),
         ),
-        lasting=Case("for good", (Fault("raw", _STATE, Position=1 << 23),)),
+        permanent=Case("permanent", (Fault("raw", _STATE, Position=1 << 23),)),
     ),
     Scenario(
         "F13",
         (
-            Case("one leg", (Fault("flood", "left_leg", 0, 100),), checks=(left_leg_holds_by_itself,)),
-            Case("a sensor bus", (Fault("flood", "right_sense", 0, 100),), reacted=10),
-            Case("a leg for good", (Fault("flood", "left_leg"),), recovers=False, checks=(left_leg_holds_by_itself,)),
+            Case("one leg", (Fault("flood", "left_leg", 0, 100),), checks=(left_leg_in_local_hold,)),
+            Case("one sensor bus", (Fault("flood", "right_sense", 0, 100),), reacted=10),
+            Case("one leg, permanent", (Fault("flood", "left_leg"),), recovers=False, checks=(left_leg_in_local_hold,)),
         ),
-        lasting=Case("one leg", (Fault("flood", "left_leg"),)),
+        permanent=Case("one leg", (Fault("flood", "left_leg"),)),
     ),
     Scenario(
         "F14",
         (
             Case("another HAL's SYNC", (Fault("inject", "SYNC_LEFT_LEG", 0, 20),)),
             Case(
-                "there before it starts",
+                "before the start of the HAL",
                 (Fault("inject", "SYNC_LEFT_LEG", 2),),
                 None,
                 reacted=1,
-                noticed=300,
+                detected=300,
                 state=_OFF,
                 recovers=False,
-                watched=300,
+                observed=300,
             ),
         ),
-        lasting=Case("another HAL's SYNC", (Fault("inject", "SYNC_LEFT_LEG"),)),
+        permanent=Case("another HAL's SYNC", (Fault("inject", "SYNC_LEFT_LEG"),)),
     ),
     Scenario(
         "F15",
         (
-            Case("for good", (Fault("bus_off", "left_leg"),), recovers=False),
+            Case("permanent", (Fault("bus_off", "left_leg"),), recovers=False),
             Case("for 100 cycles", (Fault("bus_off", "left_leg", 0, 100),)),
             Case(
                 "before the start, for 3 cycles",
                 (Fault("bus_off", "left_leg", 5, 3),),
                 phase=None,
-                begins=5,
+                first_faulty=5,
                 state=_OFF,
-                watched=200,
+                observed=200,
             ),
         ),
-        lasting=Case("one bus", (Fault("bus_off", "left_leg"),)),
+        permanent=Case("one bus", (Fault("bus_off", "left_leg"),)),
     ),
     Scenario(
         "F51",
@@ -231,14 +231,14 @@ SCENARIOS: Final = (
             Case(
                 "right counter, 200 Nm",
                 (Fault("inject", _COMMAND, 0, 20, SK_TargetTorque=200.0),),
-                checks=(left_leg_holds_by_itself, drives_notice_two_senders),
+                checks=(left_leg_in_local_hold, drives_report_two_senders),
             ),
             Case("counter 5 ahead", (Fault("inject", _COMMAND, 0, 20, ahead=5, SK_TargetTorque=-200.0),)),
             Case("one frame", (Fault("inject", _COMMAND, 0, 1, SK_TargetTorque=200.0),)),
         ),
-        lasting=Case("for good", (Fault("inject", _COMMAND, SK_TargetTorque=200.0),)),
+        permanent=Case("permanent", (Fault("inject", _COMMAND, SK_TargetTorque=200.0),)),
     ),
-    # With `ahead` 1 the frame has the counter of the true frame that follows it, with 0 that of the true frame before it.
+    # `ahead` 1 sends the counter of the next true frame, before this frame. `ahead` 0 repeats the counter of the last true frame.
     Scenario(
         "F58",
         (
@@ -253,35 +253,35 @@ SCENARIOS: Final = (
                 for order, ahead in (("first", 1), ("late", 0))
             ),
             Case("another position", (Fault("inject", _STATE, 0, 50, Position=0.0),), node=_KNEE),
-            Case("a counter of its own", (Fault("inject", _STATE, 0, 50, ahead=7),), node=_KNEE),
+            Case("independent counter", (Fault("inject", _STATE, 0, 50, ahead=7),), node=_KNEE),
             *(
                 Case(
                     f"{name}, {order}",
                     (*presses, Fault("inject", "PENDANT_STATE", 0, 3, ahead=ahead, **signals)),
                     node=_PENDANT,
                     dtc="OPERATOR_STOP",
-                    noticed=1,
+                    detected=1,
                     reacted=1,
                 )
                 for name, presses, signals in (
                     ("a second pendant releases the dead-man", (), {"DeadMan": 0}),
-                    ("a second pendant says STOP", (), {"Request": 2}),
-                    ("a second pendant hides STOP", (Press("stop"),), {"Request": 0}),
+                    ("a second pendant sends STOP", (), {"Request": 2}),
+                    ("a second pendant withholds STOP", (OperatorAction("stop"),), {"Request": 0}),
                 )
                 for order, ahead in (("first", 1), ("late", 0))
             ),
             Case(
-                "there before it starts",
+                "before the start of the HAL",
                 (Fault("inject", _STATE, 2, Temperature=31.0),),
                 None,
-                noticed=10,
+                detected=10,
                 reacted=1,
                 node=_KNEE,
                 state=_OFF,
                 recovers=False,
-                watched=300,
+                observed=300,
             ),
         ),
-        lasting=Case("for good", (Fault("inject", _STATE, Temperature=31.0),)),
+        permanent=Case("permanent", (Fault("inject", _STATE, Temperature=31.0),)),
     ),
 )

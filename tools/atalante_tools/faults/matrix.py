@@ -1,4 +1,4 @@
-"""Fault matrix, read from FAULTS.md: bound, state and diagnostic code of each fault for scenarios, tests and commands.
+"""Loader of the fault matrix FAULTS.md: bound, final state, diagnostic code and proof of each fault.
 
 FAULTS.md -> rows -> verdicts of the scenarios -> report
 """
@@ -15,51 +15,51 @@ from typing import Final
 from atalante_hal.types import SupervisorState
 
 MATRIX_FILE: Final = Path(__file__).with_name("FAULTS.md")
-COLUMNS: Final = ("ID", "Fault", "Noticed by", "Cycles", "What happens", "State", "DTC", "Proof")
-#: Entry of the column Proof for a run of the scenario with the row's ID.
+COLUMNS: Final = ("ID", "Fault", "Detected by", "Cycles", "Reaction", "State", "DTC", "Proof")
+#: Entry of the column Proof for a scenario with the ID of the row.
 SCENARIO: Final = "scenario"
 _ID = re.compile(r"F\d\d")
 _BOUND = re.compile(r"(\d+)(?: / (\d+))?")
 
 
 class MatrixError(ValueError):
-    """Invalid FAULTS.md; the message names the line and the valid content."""
+    """FAULTS.md is invalid. The message names the line and the valid content."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the fault matrix, that is one fault."""
+    """Row of the fault matrix, which describes one fault."""
 
     id: str
     fault: str  # description of the fault
     noticed_by: str  # check that detects it
-    cycles: str  # text of the bound; `noticed` and `reacted` are its numbers
+    cycles: str  # bounds as text; `detected` and `reacted` are the numbers
     behaviour: str  # reaction in words
-    state: SupervisorState  # state of the HAL after the reaction
+    state: SupervisorState  # final state of the HAL
     dtc: str  # diagnostic code; empty: none
-    proof: tuple[str, ...]  # SCENARIO or `path::test` below tests/; a final * matches any ending
+    proof: tuple[str, ...]  # each entry is SCENARIO or `path::test` below tests/; a * at the end matches any text
 
     @property
-    def noticed(self) -> int | None:
-        """Cycles until the DTC, including the first faulty cycle; None if the bound is not a number."""
+    def detected(self) -> int | None:
+        """Return the bound of the diagnostic [cycles], counted from the first faulty cycle as 1; None if there is no number."""
         bound = _BOUND.fullmatch(self.cycles)
         return int(bound[1]) if bound else None
 
     @property
     def reacted(self) -> int | None:
-        """Cycles until the reaction: the second number of `noticed / reacted`, or the only number."""
+        """Return the bound of the reaction [cycles]: the number after `/`, or the only number; None if there is no number."""
         bound = _BOUND.fullmatch(self.cycles)
         return int(bound[2] or bound[1]) if bound else None
 
     @property
     def tests(self) -> tuple[str, ...]:
-        """Tests that prove the row, besides a scenario."""
+        """Return the tests that prove the row."""
         return tuple(entry for entry in self.proof if entry != SCENARIO)
 
 
 @functools.cache
 def load_matrix(path: Path = MATRIX_FILE) -> Mapping[str, Row]:
-    """Load the rows by ID, in the order of the file.
+    """Load all rows by ID, in the order of the file.
 
     Args:
         path: Markdown file with the table.

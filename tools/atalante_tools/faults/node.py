@@ -1,4 +1,4 @@
-"""Scenarios of faults of whole nodes: restart, silence, lost heartbeat and wrong DBC."""
+"""Scenarios of faults of a whole node: restart, silence, lost heartbeat and wrong DBC."""
 
 from __future__ import annotations
 
@@ -8,16 +8,15 @@ from atalante_emulator.faults import Fault
 from atalante_hal.robot import FEET, IMUS, JOINTS
 from atalante_hal.types import SupervisorState
 from atalante_tools.faults.checks import not_enabled_in_motion
-from atalante_tools.faults.scenario import Case, Press, Scenario
+from atalante_tools.faults.scenario import Case, OperatorAction, Scenario
 
 _KNEE: Final = "LEFT_SK"
 _ACTIVE: Final = SupervisorState.ACTIVE
 _HOLD: Final = SupervisorState.HOLD
 _DRIVES: Final = tuple(joint.upper() for joint in JOINTS)
 _SENSORS: Final = (*(f"IMU_{name.upper()}" for name in IMUS), *(f"FOOT_{name.upper()}" for name in FEET))
-#: Timeout of IMUs and feet, and heartbeat timeout [cycles].
+#: Timeout of IMUs and feet [cycles].
 _SENSOR_TIMEOUT: Final = 10
-_HEARTBEAT: Final = 250
 
 SCENARIOS: Final = (
     Scenario(
@@ -29,12 +28,12 @@ SCENARIOS: Final = (
                     (Fault("reset", _KNEE, 0, 30),),
                     phase / 10,
                     node=_KNEE,
-                    noticed=32,
+                    detected=32,
                     checks=(not_enabled_in_motion,),
                 )
                 for phase in range(10)
             ),
-            Case("back after 2 cycles", (Fault("reset", _KNEE, 0, 2),), node=_KNEE, checks=(not_enabled_in_motion,)),
+            Case("restart after 2 cycles", (Fault("reset", _KNEE, 0, 2),), node=_KNEE, checks=(not_enabled_in_motion,)),
         ),
     ),
     Scenario(
@@ -45,7 +44,7 @@ SCENARIOS: Final = (
                 Case(
                     sensor,
                     (Fault("silence", sensor),),
-                    noticed=_SENSOR_TIMEOUT,
+                    detected=_SENSOR_TIMEOUT,
                     reacted=_SENSOR_TIMEOUT,
                     node=sensor,
                     recovers=False,
@@ -53,36 +52,38 @@ SCENARIOS: Final = (
                 for sensor in _SENSORS
             ),
         ),
-        lasting=Case("IMU_TORSO", (Fault("silence", "IMU_TORSO"),)),
+        permanent=Case("IMU_TORSO", (Fault("silence", "IMU_TORSO"),)),
     ),
     Scenario(
         "F20",
         (
-            Case("of a drive", (Fault("heartbeat_lost", _KNEE),), node=_KNEE, watched=300),
-            Case("of a foot", (Fault("heartbeat_lost", "FOOT_LEFT"),), node="FOOT_LEFT", watched=300),
+            Case("drive", (Fault("heartbeat_lost", _KNEE),), node=_KNEE, observed=300),
+            Case("foot", (Fault("heartbeat_lost", "FOOT_LEFT"),), node="FOOT_LEFT", observed=300),
             Case(
-                "no start without it",
-                (Fault("heartbeat_lost", _KNEE), Press("stop", 400)),
+                "START without heartbeat",
+                (Fault("heartbeat_lost", _KNEE), OperatorAction("stop", 400)),
                 state=_HOLD,
                 reacted=401,
                 node=_KNEE,
                 recovers=False,
             ),
             Case(
-                "a start when it is back",
-                (Fault("heartbeat_lost", _KNEE, 0, 420), Press("stop", 400)),
+                "START with heartbeat",
+                (Fault("heartbeat_lost", _KNEE, 0, 420), OperatorAction("stop", 400)),
                 state=_HOLD,
                 reacted=401,
                 node=_KNEE,
-                watched=150,
+                observed=150,
             ),
         ),
-        lasting=Case("for good", (Fault("heartbeat_lost", _KNEE),)),
+        permanent=Case("permanent", (Fault("heartbeat_lost", _KNEE),)),
     ),
     Scenario(
         "F53",
         tuple(
-            Case(node, (Fault("dbc_hash", node),), None, noticed=300, reacted=1, node=node, recovers=False, watched=300)
+            Case(
+                node, (Fault("dbc_hash", node),), None, detected=300, reacted=1, node=node, recovers=False, observed=300
+            )
             for node in (_KNEE, "IMU_PELVIS", "FOOT_RIGHT", "HAPTICS", "PENDANT")
         ),
     ),

@@ -1,4 +1,4 @@
-"""Record of one run: states and events of the HAL, commands on the wire, and true values of the drives and the body."""
+"""Record of one run: states and events of the HAL, sent commands, and true values of the emulated robot."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ Vector = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Observation:
-    """Record of one run. Arrays have one row per HAL cycle; the first row is cycle 1. All cycles are HAL cycles."""
+    """Record of one run. Every cycle is a HAL cycle. Arrays have one row per cycle, from cycle 1."""
 
     network: Network
     robot: Robot
     first: int  # first faulty cycle
-    over: int | None  # first cycle after all faults and actions; None if one is permanent
-    pressed: int | None  # cycle of the operator's START after the fault; None if the run ended before
+    over: int | None  # first cycle after the end of all stimuli; None if a stimulus is permanent
+    pressed: int | None  # cycle of the operator's START after the fault; None: no START
     states: tuple[SupervisorState, ...]  # state of each cycle
     events: tuple[Event, ...]  # events of the HAL
-    commands: Commands  # commands on the wire
-    drive_state: Vector  # (cycles, 12) `DriveState`, true state of the drives
-    torque: Vector  # (cycles, 12) Nm, of the motors
-    position: Vector  # (cycles, 12) rad, of the body
-    velocity: Vector  # (cycles, 12) rad/s
-    temperature: Vector  # (cycles, 12) degC, as reported
-    age: npt.NDArray[np.int64]  # (cycles, messages) age of the HAL's data [cycles]
-    guide_exit: Vector  # (cycles,) rad by which the worse assisted joint was outside its guide
-    messages: tuple[str, ...]  # columns of `age`
+    commands: Commands  # commands that the HAL sent
+    drive_state: Vector  # true `DriveState` of the drives, shape (cycles, 12)
+    torque: Vector  # true torque of the motors [Nm], shape (cycles, 12)
+    position: Vector  # true joint angles [rad], shape (cycles, 12)
+    velocity: Vector  # true joint velocities [rad/s], shape (cycles, 12)
+    temperature: Vector  # reported temperature of the drives [degC], shape (cycles, 12)
+    age: npt.NDArray[np.int64]  # age of the data of each message in the HAL [cycles], shape (cycles, messages)
+    guide_exit: Vector  # largest distance of an assisted joint beyond its guide, negative inside [rad], shape (cycles,)
+    messages: tuple[str, ...]  # message of each column of `age`
 
     def state(self, cycle: int) -> SupervisorState:
         """Return the state of a cycle.
@@ -46,13 +46,13 @@ class Observation:
         return self.states[cycle - 1]
 
     @property
-    def quiet(self) -> int:
-        """Last cycle before the operator's START after the fault."""
+    def last_before_start(self) -> int:
+        """Return the last cycle before the operator's START after the fault."""
         return (self.pressed or self.last + 1) - 1
 
     @property
     def last(self) -> int:
-        """Last cycle of the run."""
+        """Return the last cycle of the run."""
         return len(self.states)
 
     def latency(self, cycle: int) -> int:
@@ -64,5 +64,5 @@ class Observation:
         return cycle - self.first + 1
 
     def codes(self) -> list[str]:
-        """Return the codes of the events since the fault began."""
+        """Return the diagnostic codes of the events since the first faulty cycle."""
         return [event.code for event in self.events if event.cycle >= self.first]

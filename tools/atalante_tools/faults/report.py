@@ -19,23 +19,23 @@ from atalante_tools.faults.verdict import Verdict
 
 @dataclass(frozen=True)
 class Line:
-    """Result of one fault over all its cases; its fields are the keys of `--json`."""
+    """Result of one fault: the worst of its cases. The fields are the keys of `--json`."""
 
     id: str
     passed: bool
     state: str
-    cycles: int | None  # of the worst case: a failed one, else the case closest to its bound
+    cycles: int | None  # latency of the worst case: a failed case, else the case closest to its bound
     bound: int
     dtc: str
     cases: int
-    failures: tuple[str, ...]  # sentences, each with the name of its case
+    failures: tuple[str, ...]  # name of the case and one sentence for each failure
 
 
 def line_of(verdicts: Sequence[Verdict]) -> Line:
-    """Summarize the cases of one fault.
+    """Summarize the verdicts of one fault.
 
     Args:
-        verdicts: verdicts of all its cases.
+        verdicts: verdicts of all cases of the fault.
     """
     worst = max(verdicts, key=lambda v: (not v.passed, (v.cycles or 0) / max(1, v.bound)))
     failures = tuple(f"{v.case}: {failure}" for v in verdicts for failure in v.failures)
@@ -44,7 +44,7 @@ def line_of(verdicts: Sequence[Verdict]) -> Line:
 
 @dataclass(frozen=True)
 class Summary:
-    """Results of a campaign."""
+    """All results of a campaign."""
 
     lines: tuple[Line, ...]
     endurance: tuple[Endurance, ...]
@@ -53,7 +53,7 @@ class Summary:
 
     @classmethod
     def of(cls, results: Iterable[Result], seconds: float = 0.0) -> Summary:
-        """Summarize results.
+        """Summarize the results of a campaign.
 
         Args:
             results: results in any order.
@@ -75,11 +75,11 @@ class Summary:
 
     @property
     def passed(self) -> bool:
-        """Whether every case and every pair passed."""
+        """Return whether every case and every pair passed."""
         return all(line.passed for line in self.lines) and not any(pair.failures for pair in self.pairs)
 
     def write(self, folder: Path) -> None:
-        """Write report.md and report.json.
+        """Write the report as Markdown and JSON, to report.md and report.json.
 
         Args:
             folder: folder of the files, created if it is missing.
@@ -89,11 +89,11 @@ class Summary:
         (folder / "report.json").write_text(json.dumps(self.as_dict(), indent=2) + "\n")
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the summary as JSON types."""
+        """Return the content of report.json."""
         return {"version": version("atalante-hal"), "passed": self.passed, **asdict(self)}
 
     def markdown(self) -> str:
-        """Return the report as Markdown."""
+        """Return the content of report.md."""
         matrix = load_matrix()
         rows = [
             [
@@ -113,7 +113,7 @@ class Summary:
         parts = [
             "# Fault campaign",
             f"atalante-hal {version('atalante-hal')}: {passed} of {len(self.lines)} faults passed, {cases} cases, "
-            f"{self.seconds:.0f} s. Cycles and state are those of the worst case.",
+            f"{self.seconds:.0f} s. Each row shows cycles and state of the worst case.",
             _table([head, *rows]),
         ]
         if failed := [f"- {line.id} {failure}" for line in self.lines for failure in line.failures]:
@@ -129,7 +129,7 @@ class Summary:
         return "\n\n".join(parts) + "\n"
 
     def _pairs(self) -> str:
-        """Return the table of final states: the first fault of a pair by row, the second by column."""
+        """Return the table of final states, with a row for the first fault and a column for the second fault."""
         names = [f"{id_} {name}" for id_, name in REPRESENTATIVES]
         found = {(pair.first, pair.second): pair for pair in self.pairs}
         rows = [["", *(name.split()[0] for name in names)]]
@@ -141,7 +141,7 @@ class Summary:
 
 
 def survived(endurance: Endurance) -> str:
-    """Return the survived cycles of an endurance run as text.
+    """Return the cycles for which the walk survives a fault, as text.
 
     Args:
         endurance: result of the run.
@@ -150,7 +150,7 @@ def survived(endurance: Endurance) -> str:
 
 
 def number(value: int | None) -> str:
-    """Return a number as text, "-" for None.
+    """Return a number as text; None becomes "-".
 
     Args:
         value: number to show.

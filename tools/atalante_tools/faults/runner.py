@@ -1,4 +1,4 @@
-"""Runner of all fault cases: walks the emulated robot in lock-step, injects a case and records the run.
+"""Runner of the fault cases: an emulated robot walks in lock-step, the faults of a case are injected, and the run is recorded.
 
 case -> rig -> walk -> fault begins -> fault ends -> operator's START -> observation
 """
@@ -26,9 +26,9 @@ from atalante_hal.robot import Robot, load_robot
 from atalante_hal.types import State, SupervisorState
 from atalante_tools.console.options import EMBEDDED, Target
 from atalante_tools.faults.command_check import Commands, SentFrames
-from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, Moment
+from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, HostFaults
 from atalante_tools.faults.observation import Observation
-from atalante_tools.faults.scenario import Case, Host, Press
+from atalante_tools.faults.scenario import Case, HostFault, OperatorAction
 from atalante_tools.session.rig import Rig, open_hal
 
 if TYPE_CHECKING:
@@ -36,112 +36,116 @@ if TYPE_CHECKING:
     from atalante_hal.safety.events import Event
 
 Vector = npt.NDArray[np.float64]
-#: Telemetry fields of the controller: tracking error of the assisted joints, and width of the guide.
+#: Telemetry fields of the controller: tracking error of the assisted joints, and half-width of their guide [rad].
 _GUIDE: Final = ("error", "q_bound")
-#: Short startup, because the suspended robot is already in the first pose of the gait.
+#: Controller settings. The startup is short, because the robot is already in the first pose of the gait.
 CONFIG: Final = AirwalkConfig(startup=0.1)
 ASSISTANCE: Final = 0.5
-#: HAL cycles within which a robot without fault must be ACTIVE.
+#: Cycles within which a robot without fault must be ACTIVE.
 _START: Final = 600
-#: Cycles after each START after the fault. The operator presses it twice: the first leaves FAULT, the second leaves HOLD.
+#: Cycles between the two presses of START after the fault. The first press leaves FAULT, the second press leaves HOLD.
 RECOVERY: Final = 100
-#: Consecutive cycles in ACTIVE after which the robot counts as restarted.
-AGAIN: Final = 10
+#: Cycles in a row in ACTIVE after which the robot counts as restarted.
+RESTARTED: Final = 10
 
 
 @dataclass(frozen=True)
-class Stage:
-    """Objects shared by all runs of a process, built once."""
+class RunContext:
+    """Objects that all runs of a process share."""
 
     network: Network
     robot: Robot
     gait: Gait
-    pose: list[float]  # rad, first pose of the gait
+    pose: list[float]  # first pose of the gait [rad]
     controller: AirwalkController
 
 
 @functools.cache
-def stage() -> Stage:
-    """Return network, robot, gait and controller of all runs."""
+def run_context() -> RunContext:
+    """Return the network, the robot, the gait and the controller of all runs."""
     network, robot = atalante_dbc.load(), load_robot()
     gait = load_gait(AIRWALK_GAIT, robot)
     pose = gait.tables().q[0].tolist()
-    shared = Stage(network, robot, gait, pose, AirwalkController(robot, gait, SHAPES["constant"], CONFIG))
-    # These objects exist until the process ends. Frozen, they do not slow down the garbage collection before every run.
+    shared = RunContext(network, robot, gait, pose, AirwalkController(robot, gait, SHAPES["constant"], CONFIG))
+    # Exclude these permanent objects from later garbage collections, which makes every run faster.
     gc.collect()
     gc.freeze()
     return shared
 
 
 @functools.cache
-def walk_begins() -> int:
-    """Return the HAL cycle in which the first step begins without a fault; it is the same in every lock-step run.
+def first_walk_cycle() -> int:
+    """Return the HAL cycle in which the first step of a fault-free walk begins. It is the same in every run.
 
     Raises:
         RuntimeError: If the robot does not start without a fault.
     """
-    trial = _Run(Case("nothing", ()), moment=1)
-    trial.go(lambda state: state.supervisor is SupervisorState.ACTIVE or state.cycle >= _START)
+    trial = _Run(Case("nothing", ()), begins=1)
+    trial.execute(lambda state: state.supervisor is SupervisorState.ACTIVE or state.cycle >= _START)
     if trial.states[-1] is not SupervisorState.ACTIVE:
-        raise RuntimeError(
-            f"the robot without fault must be ACTIVE within {_START} cycles, got {trial.states[-1].name}"
-        )
+        raise RuntimeError(f"a robot without fault must be ACTIVE within {_START} cycles, got {trial.states[-1].name}")
     return len(trial.states) + round(CONFIG.startup / PERIOD)
 
 
 def observe(case: Case, bound: int, *, recovery: bool = True) -> Observation:
-    """Run a case and return the observation.
+    """Run a case and return its record.
 
     Args:
         case: faults to inject and actions of the operator.
-        bound: cycles within which the reaction must occur. A permanent fault is observed for `bound + case.watched` cycles.
-        recovery: whether the operator presses START after the fault.
+        bound: cycles within which the reaction must occur. A permanent fault lasts `bound + case.observed` cycles.
+        recovery: whether the operator presses START after the fault, to restart the walk.
     """
-    moment = 1 if case.phase is None else walk_begins() + round(case.phase * stage().gait.duration / PERIOD)
-    quiet = moment + max(case.begins + bound, case.ends or 0) + case.watched
-    case_run = _Run(case, moment)
+    begins = 1 if case.phase is None else first_walk_cycle() + round(case.phase * run_context().gait.duration / PERIOD)
+    start_pressed = begins + max(case.first_faulty + bound, case.ends or 0) + case.observed
+    case_run = _Run(case, begins)
     if recovery:
-        case_run.presses[quiet].append("start")
-        case_run.presses[quiet + RECOVERY].append("start")
-    last = quiet + 2 * RECOVERY if recovery else quiet - 1
-    again = [SupervisorState.ACTIVE] * AGAIN
+        case_run.presses[start_pressed].append("start")
+        case_run.presses[start_pressed + RECOVERY].append("start")
+    last = start_pressed + 2 * RECOVERY if recovery else start_pressed - 1
+    restarted = [SupervisorState.ACTIVE] * RESTARTED
 
     def over(state: State) -> bool:
-        return state.cycle >= last or (state.cycle >= quiet + AGAIN and case_run.states[-AGAIN:] == again)
+        return state.cycle >= last or (
+            state.cycle >= start_pressed + RESTARTED and case_run.states[-RESTARTED:] == restarted
+        )
 
-    case_run.go(over)
-    return case_run.observation(quiet if recovery else None)
+    case_run.execute(over)
+    return case_run.observation(start_pressed if recovery else None)
 
 
 class _Run:
-    """One run of one case, whose faults begin at the HAL cycle `moment`."""
+    """Run of a case that begins in the HAL cycle `begins`."""
 
-    def __init__(self, case: Case, moment: int) -> None:
-        self._case, self._begins = case, moment
+    def __init__(self, case: Case, begins: int) -> None:
+        self._case, self._begins = case, begins
         self.states: list[SupervisorState] = []
-        #: Actions of the operator, by cycle.
+        #: HAL cycle -> actions of the operator in this cycle.
         self.presses: defaultdict[int, list[str]] = defaultdict(list)
-        for one in case.happens:
-            if isinstance(one, Press):
-                self.presses[moment + one.start].append(one.kind)
-        self._faults = [one.starting(moment - 1 + one.start) for one in case.happens if isinstance(one, Fault)]
-        self._moment = Moment([one for one in case.happens if isinstance(one, Host)], moment)
+        for stimulus in case.stimuli:
+            if isinstance(stimulus, OperatorAction):
+                self.presses[begins + stimulus.start].append(stimulus.kind)
+        self._faults = [
+            stimulus.starting(begins - 1 + stimulus.start) for stimulus in case.stimuli if isinstance(stimulus, Fault)
+        ]
+        self._host_faults = HostFaults(
+            [stimulus for stimulus in case.stimuli if isinstance(stimulus, HostFault)], begins
+        )
         self._sent = SentFrames()
-        self._seen: list[_Seen] = []
-        self._events: list[Event] = []  # without the HOLD at the end of the loop
-        self._counted = 0  # events of the HAL that were copied to `_events` or dropped
+        self._samples: list[_Sample] = []
+        self._events: list[Event] = []  # events of the HAL, without the HOLD at the end of the loop
+        self._copied = 0  # number of events of the HAL that were copied or dropped
 
-    def go(self, until: Callable[[State], bool]) -> None:
-        """Run the rig; the operator presses START when the HAL is READY for the first time.
+    def execute(self, until: Callable[[State], bool]) -> None:
+        """Run HAL and emulator. The operator presses START when the HAL is READY for the first time.
 
         Args:
-            until: returns True for the state after which the run ends.
+            until: end condition, called with the state after every cycle.
         """
         from atalante_emulator.pendant import Operator
 
-        shared = stage()
+        shared = run_context()
         operator = Operator(starts=False)
-        controller = DisturbedController(shared.controller, self._moment)
+        controller = DisturbedController(shared.controller, self._host_faults)
         with open_hal(
             Target(EMBEDDED, "", lockstep=True),
             network=shared.network,
@@ -155,59 +159,59 @@ class _Run:
             faults=self._faults,
         ) as rig:
             hal = rig.hal
-            hal.bus = DisturbedBus(hal.bus, self._moment)
-            self._before(1, operator)
+            hal.bus = DisturbedBus(hal.bus, self._host_faults)
+            self._prepare(1, operator)
             waiting = True
 
             def record() -> None:
                 self.states.append(hal.state.supervisor)
-                self._seen.append(_Seen.of(rig))
-                self._events += hal.events.since(self._counted)
-                self._counted = hal.events.count
+                self._samples.append(_Sample.of(rig))
+                self._events += hal.events.since(self._copied)
+                self._copied = hal.events.count
 
             def over(state: State) -> bool:
                 nonlocal waiting
                 if waiting and state.supervisor is SupervisorState.READY:
                     waiting = False
                     operator.start()
-                self._before(state.cycle + 1, operator)
+                self._prepare(state.cycle + 1, operator)
                 return until(state)
 
-            run(hal, controller, DisturbedClock(self._moment), until=over, record=record)
+            run(hal, controller, DisturbedClock(self._host_faults), until=over, record=record)
             self._messages = hal.messages
 
-    def _before(self, cycle: int, operator: Operator) -> None:
-        """Prepare the next cycle: set its number and execute the actions of the operator."""
-        self._moment.cycle = self._sent.cycle = cycle
+    def _prepare(self, cycle: int, operator: Operator) -> None:
+        """Set the number of the next cycle, and execute the actions of the operator in this cycle."""
+        self._host_faults.cycle = self._sent.cycle = cycle
         for press in self.presses.get(cycle, ()):
             getattr(operator, press)()
 
     def observation(self, pressed: int | None) -> Observation:
-        """Return the observation of the run.
+        """Return the record of the run.
 
         Args:
-            pressed: cycle of the operator's START after the fault. None if there was none.
+            pressed: cycle of the operator's START after the fault; None: no START.
         """
-        shared, ends = stage(), self._case.ends
+        shared, ends = run_context(), self._case.ends
         cycles, frames = self._sent.frames()
         keep = cycles <= len(self.states)
-        columns = zip(*self._seen, strict=True)
+        columns = zip(*self._samples, strict=True)
         return Observation(
             network=shared.network,
             robot=shared.robot,
-            first=self._moment.struck or self._begins + self._case.begins,
+            first=self._host_faults.first_active or self._begins + self._case.first_faulty,
             over=None if ends is None else self._begins + ends,
             pressed=pressed,
             states=tuple(self.states),
             events=tuple(self._events),
             commands=Commands(shared.network, cycles[keep], frames[keep]),
             messages=self._messages,
-            **{name: np.array(column) for name, column in zip(_Seen._fields, columns, strict=True)},
+            **{name: np.array(column) for name, column in zip(_Sample._fields, columns, strict=True)},
         )
 
 
-class _Seen(NamedTuple):
-    """One cycle of the arrays of an `Observation`."""
+class _Sample(NamedTuple):
+    """One row of the arrays of an `Observation`."""
 
     drive_state: list[int]
     torque: Vector
@@ -218,8 +222,8 @@ class _Seen(NamedTuple):
     guide_exit: float
 
     @classmethod
-    def of(cls, rig: Rig) -> _Seen:
-        """Read the present values, from the emulated drives and the body directly where the HAL could be wrong."""
+    def of(cls, rig: Rig) -> _Sample:
+        """Return the values of the present cycle, mostly the true values of the emulated robot."""
         hal, emulator = rig.hal, rig.emulator
         assert emulator is not None
         (hip, knee), (hip_bound, knee_bound) = (hal.record[hal.layout[f"controller.{name}"]] for name in _GUIDE)

@@ -1,8 +1,8 @@
-"""Scenarios as data: faults of a walking robot, their timing and the expected reaction.
+"""Scenarios as data: faults and operator actions with their timing, and the expected reaction.
 
     row of the matrix -> scenario: its cases -> runner -> observation -> verdict
 
-State, code and bounds that a case leaves open are those of its row of the matrix.
+State, code and bounds that a case does not define are taken from its row of the matrix.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from atalante_hal.types import SupervisorState
 if TYPE_CHECKING:
     from atalante_tools.faults.observation import Observation
 
-#: Default phase of the first right-stance step at which faults begin: the swing leg is at its fastest.
+#: Default phase of the first step at which a case begins. The left leg is in swing and has its largest velocity.
 MID_SWING: Final = 0.35
 
 
 @dataclass(frozen=True)
-class Host:
-    """Fault of the computer that runs the HAL; times are in HAL cycles.
+class HostFault:
+    """Fault of the computer that runs the HAL.
 
     Kinds of faults:
 
     - `late`: the cycle begins `value` seconds late.
     - `slow`: each cycle takes `value` seconds instead of its period.
     - `raise`, `raise_in_reset`: the controller raises the builtin exception named `value`.
-    - `ask`: the controller requests `value` Nm on every joint.
-    - `shake`: the controller alternates between `value` Nm more and `value` Nm less on the left hip.
+    - `request`: the controller requests `value` Nm on every joint.
+    - `shake`: the controller adds a torque on the left hip that alternates between `value` Nm and -`value` Nm.
     - `shape`: the controller requests an array of `value` torques.
-    - `bus_down`, `bus_full`: the HAL's end of the bus raises an error on sending.
+    - `bus_down`, `bus_full`: the bus of the HAL raises an error when it sends.
     """
 
     kind: str
@@ -43,49 +43,49 @@ class Host:
 
 
 @dataclass(frozen=True)
-class Press:
-    """Action of the operator in one cycle: a method of `atalante_emulator.pendant.Operator`, such as stop or release."""
+class OperatorAction:
+    """Action of the operator: `kind` is a method of `atalante_emulator.pendant.Operator`, such as stop or release."""
 
     kind: str
     start: int = 0
     cycles: int | None = 1
 
 
-Happening = Fault | Host | Press
-#: Additional check of a run; returns one sentence if it fails, else None.
+Stimulus = Fault | HostFault | OperatorAction
+#: Additional check of a run. It returns None if it passes, and a sentence if it fails.
 ObservationCheck = Callable[["Observation"], str | None]
 
 
 @dataclass(frozen=True)
 class Case:
-    """One run of a scenario."""
+    """Case of a scenario: stimuli and expected reaction of one run."""
 
-    name: str  # name within the scenario
-    happens: tuple[Happening, ...]  # faults and actions; `start` counts from the moment of the case
-    phase: float | None = MID_SWING  # moment of the case, as phase of the first step; None: at power-on
-    begins: int = 0  # first faulty cycle, counted from the moment of the case
-    state: SupervisorState | None = None  # expected state; here and in the next three, None means the value of the row
-    dtc: str | None = None  # expected diagnostic code; "" for none
-    noticed: int | None = None  # bound of the diagnostic [cycles]
-    reacted: int | None = None  # bound of the reaction [cycles]
-    node: str | None = None  # node that the diagnostic must name; None: any
-    recovers: bool = True  # whether the operator's START after the fault must lead to ACTIVE
-    watched: int = 60  # cycles observed after the end of the fault, or after the bound of a permanent fault
-    seed: int = 0  # seed of the emulator
-    checks: tuple[ObservationCheck, ...] = ()  # additional checks
+    name: str  # unique name in the scenario
+    stimuli: tuple[Stimulus, ...]  # faults and operator actions; `start` counts from the start of the case
+    phase: float | None = MID_SWING  # start of the case, as phase of the first step, 0 to 1; None: power-on
+    first_faulty: int = 0  # first faulty cycle, counted from the start of the case
+    state: SupervisorState | None = None  # expected final state; None: from the row of the matrix
+    dtc: str | None = None  # expected diagnostic code; "": no code; None: from the row
+    detected: int | None = None  # bound of the diagnostic [cycles]; None: from the row
+    reacted: int | None = None  # bound of the reaction [cycles]; None: from the row
+    node: str | None = None  # node that the diagnostic must name; None: any node
+    recovers: bool = True  # whether START after the fault must lead to ACTIVE; False: it must not
+    observed: int = 60  # cycles from the end of the fault, or from the bound of a permanent fault, to START
+    seed: int = 0  # seed of the random numbers in the emulator
+    checks: tuple[ObservationCheck, ...] = ()  # additional checks of the run
 
     @property
     def ends(self) -> int | None:
-        """First cycle after all faults and actions, counted from the moment of the case; None if one is permanent."""
-        ends = [None if one.cycles is None else one.start + one.cycles for one in self.happens]
+        """Return the first cycle after all stimuli, from the start of the case; None if a stimulus is permanent."""
+        ends = [None if one.cycles is None else one.start + one.cycles for one in self.stimuli]
         return None if None in ends else max((end for end in ends if end is not None), default=0)
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """Cases that prove one row of the matrix."""
+    """All cases that prove one row of the matrix."""
 
     id: str
     cases: tuple[Case, ...]
-    #: Permanent fault for the endurance run, which measures how long the walk survives it; None: no endurance run.
-    lasting: Case | None = None
+    #: Case with a permanent fault, for the endurance run; None: no endurance run.
+    permanent: Case | None = None

@@ -1,11 +1,11 @@
-"""Evaluation of a run by four checks; each failure is one sentence.
+"""Evaluation of a run by four checks. Each failure is a sentence.
 
     observation + row of the matrix -> verdict
 
-1. The state is reached within its bound.
-2. The diagnostic is reported within its bound.
-3. No command exceeded its limits, and no motor or joint did.
-4. The state improved only by an action of the operator, and START led to ACTIVE if it may.
+1. The expected state must be reached within its bound.
+2. The expected diagnostic must be reported within its bound.
+3. Commands, motors and joints must stay within their limits.
+4. The state must not improve without the operator. START must lead to ACTIVE, unless the fault persists.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from atalante_tools.faults.observation import Observation
 from atalante_tools.faults.scenario import Case
 
 _S = SupervisorState
-#: States in which the controller drives the joints.
+#: States in which the torques of the controller are sent to the drives.
 WALKING: Final = (_S.ACTIVE, _S.FULL_ASSIST, _S.FINISH_STEP)
-#: Allowed overshoot past the position limit when a drive stops its joint [rad].
+#: Accepted overshoot beyond the position limit while a drive stops its joint [rad].
 _OVERSHOOT: Final = 0.05
-#: Allowed ratio of joint velocity to velocity limit.
-_HASTE: Final = 1.2
+#: Accepted ratio of joint velocity to velocity limit.
+_VELOCITY_RATIO: Final = 1.2
 
 
 @dataclass(frozen=True)
 class Expectation:
-    """Expected result of a case. A value that the case does not set is taken from its row of the fault matrix."""
+    """Expected result of a case. Values that the case does not define are taken from its row of the fault matrix."""
 
     state: SupervisorState
-    dtc: str  # regular expression of the diagnostic code; empty: none expected
-    noticed: int  # cycles within which the diagnostic must be reported
-    reacted: int  # cycles within which the HAL must react
+    dtc: str  # regular expression for the diagnostic code; "": no code is expected
+    detected: int  # bound of the diagnostic [cycles]
+    reacted: int  # bound of the reaction [cycles]
 
     @classmethod
     def of(cls, case: Case, row: Row) -> Expectation:
@@ -53,97 +53,101 @@ class Expectation:
         Raises:
             ValueError: If neither case nor row has a bound in cycles.
         """
-        noticed = row.noticed if case.noticed is None else case.noticed
+        detected = row.detected if case.detected is None else case.detected
         reacted = row.reacted if case.reacted is None else case.reacted
-        if noticed is None or reacted is None:
+        if detected is None or reacted is None:
             raise ValueError(
-                f"{row.id} {case.name}: `noticed` and `reacted` must be given, because the bound of the row is "
+                f"{row.id} {case.name}: `detected` and `reacted` must be given, because the bound of the row is "
                 f"{row.cycles!r}, which is not a number of cycles"
             )
         state = row.state if case.state is None else case.state
-        return cls(state, row.dtc if case.dtc is None else case.dtc, noticed, reacted)
+        return cls(state, row.dtc if case.dtc is None else case.dtc, detected, reacted)
 
     @property
-    def walks_on(self) -> bool:
-        """Whether the walk must continue during the fault."""
+    def walk_continues(self) -> bool:
+        """Return whether the walk must continue during the fault."""
         return self.state is _S.ACTIVE
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Result of one case."""
+    """Result of one case: measured values and failures."""
 
     id: str
     case: str
-    state: str  # state of the HAL before the operator's START
-    cycles: int | None  # cycles to the reaction, else to the diagnostic; None if there was neither
-    bound: int  # largest allowed value of `cycles`
-    dtc: str  # first matching diagnostic code that was reported
+    state: str  # state of the HAL just before the operator's START
+    cycles: (
+        int | None
+    )  # cycles until the reaction, or until the diagnostic if there was no reaction; None: nothing happened
+    bound: int  # largest accepted value of `cycles`
+    dtc: str  # first reported code that matches the expected code
     failures: tuple[str, ...]  # one sentence each
 
     @property
     def passed(self) -> bool:
-        """Whether no check failed."""
+        """Return whether all checks passed."""
         return not self.failures
 
 
-def judge(row: Row, case: Case, seen: Observation) -> Verdict:
-    """Run all four checks and the additional checks of the case.
+def evaluate(row: Row, case: Case, run: Observation) -> Verdict:
+    """Evaluate a run by the four checks and the additional checks of the case.
 
     Args:
         row: row of the matrix.
         case: case that was run.
-        seen: observation of the run.
+        run: observation of the run.
     """
-    wanted = Expectation.of(case, row)
-    reaction = reacted(seen, wanted.state)
+    expected = Expectation.of(case, row)
+    reaction = reacted(run, expected.state)
     failures = [
-        *_state(seen, case, wanted, reaction),
-        *_diagnostic(seen, case, wanted),
-        *uncontrolled(seen),
-        *_recovery(seen, case, wanted),
-        *(sentence for check in case.checks if (sentence := check(seen)) is not None),
+        *_state(run, case, expected, reaction),
+        *_diagnostic(run, case, expected),
+        *limit_violations(run),
+        *_recovery(run, case, expected),
+        *(sentence for check in case.checks if (sentence := check(run)) is not None),
     ]
-    noted = _noted(seen, wanted)
-    code = noted[0].code if noted else ""
-    at, bound = (reaction, wanted.reacted) if reaction else (noted[0].cycle if noted else None, wanted.noticed)
-    cycles = None if at is None else seen.latency(at)
-    return Verdict(row.id, case.name, seen.state(seen.quiet).name, cycles, bound, code, tuple(failures))
+    reported = _reported(run, expected)
+    code = reported[0].code if reported else ""
+    at, bound = (
+        (reaction, expected.reacted) if reaction else (reported[0].cycle if reported else None, expected.detected)
+    )
+    cycles = None if at is None else run.latency(at)
+    return Verdict(row.id, case.name, run.state(run.last_before_start).name, cycles, bound, code, tuple(failures))
 
 
-def reacted(seen: Observation, state: SupervisorState) -> int | None:
-    """Return the first cycle with the reaction, None if there was none.
+def reacted(run: Observation, state: SupervisorState) -> int | None:
+    """Return the first cycle with the expected reaction, or None.
 
-    The reaction is a command without ENABLE OPERATION for HOLD and worse, else the state itself. If ACTIVE is expected, the
-    first cycle with any reaction is returned.
+    The reaction is the expected state or a more severe state. For HOLD and more severe states, a command without ENABLE OPERATION
+    is a reaction, too. If ACTIVE is expected, any other state is a reaction.
 
     Args:
-        seen: observation of the run.
+        run: observation of the run.
         state: expected state.
     """
-    for cycle in range(seen.first, seen.last + 1):
-        now = seen.state(cycle)
+    for cycle in range(run.first, run.last + 1):
+        now = run.state(cycle)
         if now > state or (now is state and state is not _S.ACTIVE):
             return cycle
-        words = seen.commands.words(cycle)
+        words = run.commands.words(cycle)
         if state >= _S.HOLD and words and Controlword.ENABLE_OPERATION not in words:
             return cycle
     return None
 
 
-def uncontrolled(seen: Observation) -> list[str]:
-    """Return one sentence for each limit that a command, a motor or a joint exceeded.
+def limit_violations(run: Observation) -> list[str]:
+    """Return a sentence for each limit that a command, a motor or a joint exceeded.
 
     Args:
-        seen: observation of the run.
+        run: observation of the run.
     """
-    robot = seen.robot
-    found = seen.commands.outside(robot)
+    robot = run.robot
+    found = run.commands.violations(robot)
     for sentence, wrong in (
-        ("a motor's torque was beyond its limit", np.abs(seen.torque) > robot.torque_max * (1.0 + 1e-9)),
-        ("a joint was beyond its limit", seen.position > robot.position_max + _OVERSHOOT),
-        ("a joint was beyond its limit", seen.position < robot.position_min - _OVERSHOOT),
-        ("a joint was too fast", np.abs(seen.velocity) > _HASTE * robot.velocity_max),
+        ("a motor's torque was beyond its limit", np.abs(run.torque) > robot.torque_max * (1.0 + 1e-9)),
+        ("a joint was beyond its limit", run.position > robot.position_max + _OVERSHOOT),
+        ("a joint was beyond its limit", run.position < robot.position_min - _OVERSHOOT),
+        ("a joint was too fast", np.abs(run.velocity) > _VELOCITY_RATIO * robot.velocity_max),
     ):
         if wrong.any():
             row, joint = (int(index) for index in np.argwhere(wrong)[0])
@@ -151,65 +155,65 @@ def uncontrolled(seen: Observation) -> list[str]:
     return found
 
 
-def improved(seen: Observation, until: int) -> list[str]:
-    """Return a sentence if the state improved without the operator after the first faulty cycle.
+def automatic_improvements(run: Observation, until: int) -> list[str]:
+    """Return a sentence if the state became less severe without the operator after the first faulty cycle.
 
     Args:
-        seen: observation of the run.
+        run: observation of the run.
         until: last cycle to check.
     """
-    for cycle in range(seen.first + 1, until + 1):
-        if seen.state(cycle) < seen.state(cycle - 1):
-            return [f"{seen.state(cycle).name} in cycle {cycle} without the operator"]
+    for cycle in range(run.first + 1, until + 1):
+        if run.state(cycle) < run.state(cycle - 1):
+            return [f"{run.state(cycle).name} in cycle {cycle} without the operator"]
     return []
 
 
-def _state(seen: Observation, case: Case, wanted: Expectation, reaction: int | None) -> list[str]:
-    if case.phase is not None and seen.state(seen.first - 1) is not _S.ACTIVE:
-        return [f"the robot must be ACTIVE before the fault, got {seen.state(seen.first - 1).name}"]
-    if wanted.walks_on:
+def _state(run: Observation, case: Case, expected: Expectation, reaction: int | None) -> list[str]:
+    if case.phase is not None and run.state(run.first - 1) is not _S.ACTIVE:
+        return [f"the robot must be ACTIVE before the fault, got {run.state(run.first - 1).name}"]
+    if expected.walk_continues:
         if reaction is None:
             return []
-        return [f"the robot must stay ACTIVE, got {seen.state(reaction).name} after {seen.latency(reaction)} cycles"]
+        return [f"the robot must stay ACTIVE, got {run.state(reaction).name} after {run.latency(reaction)} cycles"]
     if reaction is None:
-        return [f"no {wanted.state.name} within {seen.latency(seen.quiet)} cycles"]
+        return [f"no {expected.state.name} within {run.latency(run.last_before_start)} cycles"]
     found = []
-    if seen.latency(reaction) > wanted.reacted:
-        found.append(f"{wanted.state.name} must come within {wanted.reacted} cycles, got {seen.latency(reaction)}")
-    if seen.state(seen.quiet) is not wanted.state:
-        found.append(f"the final state must be {wanted.state.name}, got {seen.state(seen.quiet).name}")
+    if run.latency(reaction) > expected.reacted:
+        found.append(f"{expected.state.name} must come within {expected.reacted} cycles, got {run.latency(reaction)}")
+    if run.state(run.last_before_start) is not expected.state:
+        found.append(f"the final state must be {expected.state.name}, got {run.state(run.last_before_start).name}")
     return found
 
 
-def _diagnostic(seen: Observation, case: Case, wanted: Expectation) -> list[str]:
-    if not wanted.dtc:
+def _diagnostic(run: Observation, case: Case, expected: Expectation) -> list[str]:
+    if not expected.dtc:
         return []
-    noted = _noted(seen, wanted)
-    if not noted:
-        return [f"no {wanted.dtc}; reported codes: {', '.join(dict.fromkeys(seen.codes())) or 'none'}"]
-    nodes = sorted({event.node for event in noted})
+    reported = _reported(run, expected)
+    if not reported:
+        return [f"no {expected.dtc}; reported codes: {', '.join(dict.fromkeys(run.codes())) or 'none'}"]
+    nodes = sorted({event.node for event in reported})
     if case.node is not None and case.node not in nodes:
-        return [f"{wanted.dtc} must name {case.node}, got {', '.join(nodes)}"]
-    latency = min(seen.latency(event.cycle) for event in noted if case.node in (None, event.node))
-    if latency > wanted.noticed:
-        return [f"{wanted.dtc} must come within {wanted.noticed} cycles, got {latency}"]
+        return [f"{expected.dtc} must name {case.node}, got {', '.join(nodes)}"]
+    latency = min(run.latency(event.cycle) for event in reported if case.node in (None, event.node))
+    if latency > expected.detected:
+        return [f"{expected.dtc} must come within {expected.detected} cycles, got {latency}"]
     return []
 
 
-def _noted(seen: Observation, wanted: Expectation) -> list[Event]:
-    """Return the events with the expected diagnostic code since the fault began."""
-    return [event for event in seen.events if event.cycle >= seen.first and re.fullmatch(wanted.dtc, event.code)]
+def _reported(run: Observation, expected: Expectation) -> list[Event]:
+    """Return the events with the expected diagnostic code since the first faulty cycle."""
+    return [event for event in run.events if event.cycle >= run.first and re.fullmatch(expected.dtc, event.code)]
 
 
-def _recovery(seen: Observation, case: Case, wanted: Expectation) -> list[str]:
+def _recovery(run: Observation, case: Case, expected: Expectation) -> list[str]:
     found = (
-        [] if case.phase is None else improved(seen, seen.quiet)
-    )  # at power-on the state improves without the operator
-    if seen.pressed is None:
+        [] if case.phase is None else automatic_improvements(run, run.last_before_start)
+    )  # after power-on, the state improves without the operator
+    if run.pressed is None:
         return found
-    again = _S.ACTIVE in (seen.state(cycle) for cycle in range(seen.pressed, seen.last + 1))
-    if again and not case.recovers:
+    restarted = _S.ACTIVE in (run.state(cycle) for cycle in range(run.pressed, run.last + 1))
+    if restarted and not case.recovers:
         found.append("the robot must not be ACTIVE after START, because the fault persists")
-    if not again and case.recovers:
-        found.append(f"the operator's START must lead to ACTIVE, got {seen.state(seen.last).name}")
+    if not restarted and case.recovers:
+        found.append(f"the operator's START must lead to ACTIVE, got {run.state(run.last).name}")
     return found
