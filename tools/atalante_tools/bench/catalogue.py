@@ -6,9 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from atalante_tools.bench import gait_solve, gaits, motion, startup, wire
+from atalante_tools.bench import gait_solve, gaits, log_check, motion, startup, wire
 from atalante_tools.bench.measure import Effort, Measurement
-from atalante_tools.canlog.validate import benchmark
 
 _UNITS: Final = {"us": 1e6, "s": 1.0}
 
@@ -86,14 +85,14 @@ BENCHMARKS: Final = (
     ),
     Benchmark(
         "judge_log",
-        benchmark.judge_log,
+        log_check.judge_log,
         "us",
         "python-can and cantools reading and decoding the same candump log, per frame",
         1 / 20,
     ),
     Benchmark(
         "judge_against_mdf",
-        benchmark.judge_against_mdf,
+        log_check.judge_against_mdf,
         "us",
         "asammdf decoding the same frames from MF4, per frame",
         1.0,

@@ -65,7 +65,7 @@ KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_control.gait.gait", "GaitError", Failed),
     ("atalante_control.dynamics.gait_network", "NetworkError", Failed),
     ("atalante_control.gait_optimization.library", "LibraryError", Failed),
-    ("atalante_tools.canlog.validate.log", "LogError", Failed),
+    ("atalante_tools.canlog.reader.log_file", "LogError", Failed),
     ("atalante_tools.canlog.validate.project", "ProjectError", InvalidUsage),
 )
 

@@ -170,9 +170,10 @@ def test_skipped_frames_of_several_logs_are_counted(tmp_path: Path) -> None:
 
 
 def test_several_chunks_and_channels_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from atalante_tools.canlog.validate import log as log_module
+    from atalante_tools.canlog.reader import candump_log
+    from atalante_tools.canlog.reader import log as log_module
 
-    monkeypatch.setattr(log_module, "_TEXT_BYTES", 4096)
+    monkeypatch.setattr(candump_log, "_TEXT_BYTES", 4096)
     monkeypatch.setattr(log_module, "_CHUNK_FRAMES", 50)
     log, expected = random_log(atalante_dbc.DBC_FILE, tmp_path / "random.log", 400)
     lines = log.read_text().replace("can1", "can0", 70)

@@ -16,13 +16,13 @@ from atalante_hal.types import Command, SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.e2e import crc, data_id_bytes
 from atalante_hal.wire.frame import Frames
+from atalante_tools.canlog.plan import Plan
+from atalante_tools.canlog.reader.log import open_log
 from atalante_tools.canlog.validate.coverage import unchecked, unseen_signals
 from atalante_tools.canlog.validate.findings import Finding
-from atalante_tools.canlog.validate.judge import Validator
-from atalante_tools.canlog.validate.log import open_log
-from atalante_tools.canlog.validate.plan import Plan
 from atalante_tools.canlog.validate.project import Project
 from atalante_tools.canlog.validate.rules import RULE_OF
+from atalante_tools.canlog.validate.validator import Validator
 from atalante_tools.console.options import Target
 from atalante_tools.session.rig import open_hal
 

@@ -20,15 +20,16 @@ from atalante_hal.bus import BusDown
 from atalante_hal.wire.codec import Codec
 from atalante_hal.wire.e2e import crc, data_id_bytes
 from atalante_hal.wire.frame import FRAME, Frames, new_frames
-from atalante_tools.canlog.validate.chunk import NO_DIRECTION, Chunk
-from atalante_tools.canlog.validate.judge import Validator
-from atalante_tools.canlog.validate.log import LogError, open_log
-from atalante_tools.canlog.validate.plan import Plan
+from atalante_tools.canlog.plan import Plan
+from atalante_tools.canlog.reader.chunk import NO_DIRECTION, Chunk
+from atalante_tools.canlog.reader.log import open_log
+from atalante_tools.canlog.reader.log_file import LogError
 from atalante_tools.canlog.validate.project import Project, ProjectError, load_project
 from atalante_tools.canlog.validate.report import report, text
 from atalante_tools.canlog.validate.rules import RULES
 from atalante_tools.canlog.validate.run import listen
 from atalante_tools.canlog.validate.timing_rules import BINS, jitter_p99
+from atalante_tools.canlog.validate.validator import Validator
 from atalante_tools.cli import cli
 
 NETWORK = atalante_dbc.load()

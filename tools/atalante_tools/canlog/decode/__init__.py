@@ -17,7 +17,7 @@ from atalante_tools.console.terminal import Progress, say
 
 if TYPE_CHECKING:
     from atalante_tools.canlog.decode.signals import Sink
-    from atalante_tools.canlog.validate.plan import Plan
+    from atalante_tools.canlog.plan import Plan
 
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 
@@ -44,8 +44,8 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
     from atalante_dbc import DBC_FILE
     from atalante_dbc.foreign import catalogue
     from atalante_tools.canlog.decode.signals import Decoder
-    from atalante_tools.canlog.validate.log import open_log
-    from atalante_tools.canlog.validate.plan import Plan
+    from atalante_tools.canlog.plan import Plan
+    from atalante_tools.canlog.reader.log import open_log
 
     plan = Plan(catalogue(dbc or DBC_FILE))
     for unsupported in plan.refused:

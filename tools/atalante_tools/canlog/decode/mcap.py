@@ -17,7 +17,7 @@ from mcap.writer import CompressionType, Writer
 
 from atalante_dbc.foreign import Layout
 from atalante_tools.canlog.decode.signals import DecodedFrames
-from atalante_tools.canlog.validate.plan import Plan
+from atalante_tools.canlog.plan import Plan
 
 _PACKAGE = "atalante.can"
 _FIXED64 = 1  # wire type

@@ -26,7 +26,7 @@ import pyarrow.parquet as pq
 from atalante_dbc.foreign import Field
 from atalante_tools.canlog.column_codec import Column, raw_range
 from atalante_tools.canlog.decode.signals import DecodedFrames
-from atalante_tools.canlog.validate.plan import Plan
+from atalante_tools.canlog.plan import Plan
 
 _EXACT = 1 << 53  # float64 is exact for integers up to this magnitude
 _DECIMAL = pa.decimal128(38, 0)

@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from atalante_hal.wire.frame import ID_ERROR, ID_REMOTE
 from atalante_tools.canlog.column_codec import Column, ColumnCodec, Words, payload_words
-from atalante_tools.canlog.validate.chunk import Chunk
-from atalante_tools.canlog.validate.plan import UNKNOWN, Plan
-from atalante_tools.canlog.validate.stream import sort
+from atalante_tools.canlog.plan import UNKNOWN, Plan
+from atalante_tools.canlog.reader.chunk import Chunk
+from atalante_tools.canlog.stream import sort
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from atalante_tools.console.stop_request import stop_requested
 from atalante_tools.console.terminal import Progress, say, show_json
 
 if TYPE_CHECKING:
-    from atalante_tools.canlog.validate.plan import Plan
+    from atalante_tools.canlog.plan import Plan
     from atalante_tools.canlog.validate.project import Project
     from atalante_tools.canlog.validate.report import Report
 
@@ -147,7 +147,7 @@ def _prepare(options: Options) -> tuple[Plan, Project]:
     """
     from atalante_dbc import DBC_FILE
     from atalante_dbc.foreign import catalogue
-    from atalante_tools.canlog.validate.plan import Plan
+    from atalante_tools.canlog.plan import Plan
     from atalante_tools.canlog.validate.project import Project, load_project
 
     plan = Plan(catalogue(options.dbc or DBC_FILE))
@@ -169,7 +169,7 @@ def _read(logs: Sequence[Path], plan: Plan, project: Project, node: str | None) 
     Returns:
         The reports of the logs that could be opened, and the exit code.
     """
-    from atalante_tools.canlog.validate.log import LogError
+    from atalante_tools.canlog.reader.log_file import LogError
     from atalante_tools.canlog.validate.run import validate_log
 
     results, code = [], 0

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from atalante_tools.canlog.validate.chunk import Chunk
-from atalante_tools.canlog.validate.plan import UNKNOWN, Plan, Rows
+from atalante_tools.canlog.plan import UNKNOWN, Plan, Rows
+from atalante_tools.canlog.reader.chunk import Chunk
 
 #: A channel is assigned to a bus if at least this share of its known frames belongs to that bus (0 to 1).
 _MAJORITY = 0.9

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from atalante_dbc.foreign import Field, Layout
-from atalante_tools.canlog.validate.judge import Validator
-from atalante_tools.canlog.validate.plan import UNKNOWN
+from atalante_tools.canlog.plan import UNKNOWN
+from atalante_tools.canlog.validate.validator import Validator
 from atalante_tools.canlog.validate.value_rules import is_enumeration, is_hash, is_limited
 
 _E2E = ("Crc", "Counter")

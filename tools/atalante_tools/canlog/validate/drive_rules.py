@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.wire.cia402 import TRANSITIONS, Controlword, DriveState, next_state
+from atalante_tools.canlog.plan import Family, Plan
+from atalante_tools.canlog.stream import Stream
 from atalante_tools.canlog.validate.e2e_rules import Steps
 from atalante_tools.canlog.validate.findings import Findings
-from atalante_tools.canlog.validate.plan import Family, Plan
 from atalante_tools.canlog.validate.project import Project
-from atalante_tools.canlog.validate.stream import Stream
 from atalante_tools.canlog.validate.value_rules import Decoded
 
 _S, _C = DriveState, Controlword

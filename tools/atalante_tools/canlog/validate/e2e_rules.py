@@ -8,9 +8,9 @@ import numpy.typing as npt
 from atalante_hal.wire.e2e import COUNTER_BYTE
 from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES
 from atalante_tools.canlog.column_codec import crc_differences
+from atalante_tools.canlog.plan import Plan, Rows
+from atalante_tools.canlog.stream import Stream
 from atalante_tools.canlog.validate.findings import Findings
-from atalante_tools.canlog.validate.plan import Plan, Rows
-from atalante_tools.canlog.validate.stream import Stream
 
 Steps = npt.NDArray[np.int64]
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from atalante_tools.canlog.validate.plan import Plan
+from atalante_tools.canlog.plan import Plan
 from atalante_tools.canlog.validate.rules import RULE_OF
 
 Stamps = npt.NDArray[np.int64]

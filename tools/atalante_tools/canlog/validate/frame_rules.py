@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.wire.frame import FD_LENGTHS, FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_REMOTE, as_words
+from atalante_tools.canlog.plan import UNKNOWN, Plan, Rows
+from atalante_tools.canlog.reader.chunk import NO_DIRECTION, SENT, Chunk
 from atalante_tools.canlog.validate.buses import ChannelMap
-from atalante_tools.canlog.validate.chunk import NO_DIRECTION, SENT, Chunk
 from atalante_tools.canlog.validate.findings import MAX_UNKNOWN_IDS, OTHERS, Findings
-from atalante_tools.canlog.validate.plan import UNKNOWN, Plan, Rows
 
 Indices = npt.NDArray[np.intp]
 

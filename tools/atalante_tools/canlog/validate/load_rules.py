@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE, as_words
+from atalante_tools.canlog.plan import UNKNOWN, Plan, Rows
+from atalante_tools.canlog.reader.chunk import Chunk
 from atalante_tools.canlog.validate.buses import ChannelMap
-from atalante_tools.canlog.validate.chunk import Chunk
 from atalante_tools.canlog.validate.findings import Findings
-from atalante_tools.canlog.validate.plan import UNKNOWN, Plan, Rows
 from atalante_tools.canlog.validate.project import Project
 
 #: Minimum length of an error frame with delimiter and intermission, bits.

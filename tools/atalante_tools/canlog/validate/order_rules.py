@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from atalante_tools.canlog.plan import UNKNOWN, Plan
+from atalante_tools.canlog.stream import Stream
 from atalante_tools.canlog.validate.e2e_rules import Steps
 from atalante_tools.canlog.validate.findings import Findings
-from atalante_tools.canlog.validate.plan import UNKNOWN, Plan
 from atalante_tools.canlog.validate.project import Project
-from atalante_tools.canlog.validate.stream import Stream
 
 Indices = npt.NDArray[np.intp]
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from atalante_tools.canlog.validate.coverage import Unchecked, unchecked
 from atalante_tools.canlog.validate.findings import Finding
-from atalante_tools.canlog.validate.judge import Validator
 from atalante_tools.canlog.validate.project import Silence
 from atalante_tools.canlog.validate.rules import RULE_OF, RULES
+from atalante_tools.canlog.validate.validator import Validator
 from atalante_tools.console.terminal import table
 
 #: Maximum number of unchecked items per reason in the text report. The HTML report lists all of them.

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from atalante_hal.bus import Bus, BusError, open_bus
-from atalante_hal.wire.frame import WORDS, new_frames
-from atalante_tools.canlog.validate.chunk import NO_DIRECTION, Chunk
-from atalante_tools.canlog.validate.judge import Validator
-from atalante_tools.canlog.validate.log import Log, open_log
-from atalante_tools.canlog.validate.plan import Plan
+from atalante_hal.wire.frame import new_frames
+from atalante_tools.canlog.plan import Plan
+from atalante_tools.canlog.reader.chunk import NO_DIRECTION, Chunk, concatenated
+from atalante_tools.canlog.reader.log import Log, open_log
 from atalante_tools.canlog.validate.project import Project
 from atalante_tools.canlog.validate.report import Report, report
+from atalante_tools.canlog.validate.validator import Validator
 
 #: Period of the checks on a live bus, and longest wait for a frame [s].
 _CHECK_PERIOD, _RECEIVE_TIMEOUT = 0.5, 0.02
@@ -149,15 +149,7 @@ def _chunk(bus: Bus, frames: np.ndarray, channel: int) -> Chunk:
 def _check_received(validator: Validator, received: list[Chunk], names: list[str]) -> None:
     if not received:
         return
-    frames = new_frames(sum(map(len, received)))
-    words = [chunk.frames.view("<u8").reshape(-1, WORDS) for chunk in received]
-    np.concatenate(words, out=frames.view("<u8").reshape(-1, WORDS))
-    chunk = Chunk(
-        frames,
-        np.concatenate([chunk.stamps for chunk in received]),
-        np.concatenate([chunk.channels for chunk in received]),
-        np.concatenate([chunk.sent for chunk in received]),
-    )
+    chunk = concatenated(received)
     received.clear()
     validator.check(chunk.select(np.argsort(chunk.stamps, kind="stable")), names)
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from atalante_tools.canlog.plan import Plan, Rows
+from atalante_tools.canlog.stream import Stream
 from atalante_tools.canlog.validate.e2e_rules import REPEATED, Steps
 from atalante_tools.canlog.validate.findings import Findings
-from atalante_tools.canlog.validate.plan import Plan, Rows
 from atalante_tools.canlog.validate.project import Project
-from atalante_tools.canlog.validate.stream import Stream
 
 Vector = npt.NDArray[np.float64]
 

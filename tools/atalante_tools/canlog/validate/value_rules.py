@@ -15,10 +15,10 @@ import numpy.typing as npt
 
 from atalante_dbc.foreign import Field, Layout
 from atalante_tools.canlog.column_codec import ColumnCodec, Mask, Words, payload_words, raw_range
+from atalante_tools.canlog.plan import Family, Plan
+from atalante_tools.canlog.stream import Stream
 from atalante_tools.canlog.validate.findings import Findings
-from atalante_tools.canlog.validate.plan import Family, Plan
 from atalante_tools.canlog.validate.project import Project
-from atalante_tools.canlog.validate.stream import Stream
 
 #: Longest field for which named values are stored as a lookup table [bit].
 _TABLE_BITS = 16

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.wire.frame import FRAME, WORDS, Frames
-from atalante_tools.canlog.validate.chunk import Chunk
-from atalante_tools.canlog.validate.plan import Family, Rows
+from atalante_tools.canlog.plan import Family, Rows
+from atalante_tools.canlog.reader.chunk import Chunk
 
 _Column = TypeVar("_Column", bound=npt.NDArray[Any])
 

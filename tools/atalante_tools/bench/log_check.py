@@ -21,7 +21,7 @@ from atalante_hal.wire.e2e import COUNTER_BYTE, CRC_BYTES
 from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES, Frames, new_frames
 from atalante_tools.bench.measure import Block, Effort, Measurement, require
 from atalante_tools.canlog.column_codec import crc_differences, crc_of_zeros
-from atalante_tools.canlog.validate.plan import Plan
+from atalante_tools.canlog.plan import Plan
 from atalante_tools.canlog.validate.project import Project
 
 #: Recorded cycles, and number of repetitions. The log has 50,000 cycles with 1.3 million frames.

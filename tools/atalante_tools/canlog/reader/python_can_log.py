@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -30,11 +30,8 @@ from atalante_hal.wire.frame import (
     ID_REMOTE,
     new_frames,
 )
-from atalante_tools.canlog.validate.candump import Channels
-from atalante_tools.canlog.validate.chunk import NO_DIRECTION, RECEIVED, SENT, Chunk, LogError
-
-if TYPE_CHECKING:
-    from atalante_tools.canlog.validate.log import Log
+from atalante_tools.canlog.reader.chunk import NO_DIRECTION, RECEIVED, SENT, Channels, Chunk
+from atalante_tools.canlog.reader.log_file import LogError, LogFile
 
 #: Formats with one frame per line. Without a newline at the end of the file, the last frame is truncated.
 _LINE_FORMATS = (".asc", ".trc", ".csv")
@@ -44,7 +41,7 @@ _MDF = b"MDF     "
 _RECORD = struct.Struct("<IBB2x64s")
 
 
-def read(log: Log, chunk_frames: int) -> Iterator[Chunk]:
+def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
     """Yield the frames of a log in chunks.
 
     Args:
@@ -82,7 +79,7 @@ def read(log: Log, chunk_frames: int) -> Iterator[Chunk]:
 
 
 @contextmanager
-def _messages(log: Log) -> Iterator[tuple[Iterator[Any], Callable[[], int]]]:
+def _messages(log: LogFile) -> Iterator[tuple[Iterator[Any], Callable[[], int]]]:
     """Yield an iterator over the messages of the log, and a function that returns the number of bytes read so far.
 
     python-can does not close a file that its reader rejects. Therefore this function opens the file. Only .mf4 files are opened
@@ -105,7 +102,7 @@ def _messages(log: Log) -> Iterator[tuple[Iterator[Any], Callable[[], int]]]:
         yield iter(stack.enter_context(reader_type(file))), raw.tell
 
 
-def _remark(log: Log, count: int, broken: str, ends_within: bool, warnings: _Warnings) -> None:
+def _remark(log: LogFile, count: int, broken: str, ends_within: bool, warnings: _Warnings) -> None:
     if broken and not count:
         raise LogError(f"{log.path} cannot be read as a {log.suffix} log: {broken}")
     if broken:

@@ -10,19 +10,19 @@ from collections.abc import Iterable
 import numpy as np
 import numpy.typing as npt
 
+from atalante_tools.canlog.plan import Plan, Rows
+from atalante_tools.canlog.reader.chunk import Chunk
+from atalante_tools.canlog.reader.log_file import Remark
+from atalante_tools.canlog.stream import Stream, sort
 from atalante_tools.canlog.validate.buses import ChannelMap
-from atalante_tools.canlog.validate.chunk import Chunk
 from atalante_tools.canlog.validate.drive_rules import DriveRules
 from atalante_tools.canlog.validate.e2e_rules import Counters, CrcRules, Steps
 from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.frame_rules import FrameRules, Sorted
 from atalante_tools.canlog.validate.load_rules import LoadRules
-from atalante_tools.canlog.validate.log import Remark
 from atalante_tools.canlog.validate.motion_rules import MotionRules
 from atalante_tools.canlog.validate.order_rules import OrderRules
-from atalante_tools.canlog.validate.plan import Plan, Rows
 from atalante_tools.canlog.validate.project import Project
-from atalante_tools.canlog.validate.stream import Stream, sort
 from atalante_tools.canlog.validate.timing_rules import TimingRules
 from atalante_tools.canlog.validate.value_rules import Decoded, ValueRules
 

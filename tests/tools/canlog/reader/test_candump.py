@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE
-from atalante_tools.canlog.validate import log as log_module
-from atalante_tools.canlog.validate.candump import MARGIN, Channels, Parsed, parse
-from atalante_tools.canlog.validate.chunk import NO_DIRECTION, RECEIVED, SENT, Chunk
-from atalante_tools.canlog.validate.log import Log, open_log
+from atalante_tools.canlog.reader import candump_log
+from atalante_tools.canlog.reader import log as log_module
+from atalante_tools.canlog.reader.candump import MARGIN, Parsed, parse
+from atalante_tools.canlog.reader.chunk import NO_DIRECTION, RECEIVED, SENT, Channels, Chunk
+from atalante_tools.canlog.reader.log import Log, open_log
 
 
 def parsed(text: str | bytes) -> tuple[Parsed, list[str]]:
@@ -97,7 +98,7 @@ def test_chunk_size_does_not_change_the_frames(tmp_path: Path, monkeypatch: pyte
 
     whole = read()
     for piece, frames in ((400, 7), (1000, 100), (4096, 801)):
-        monkeypatch.setattr(log_module, "_TEXT_BYTES", piece)
+        monkeypatch.setattr(candump_log, "_TEXT_BYTES", piece)
         monkeypatch.setattr(log_module, "_CHUNK_FRAMES", frames)
         assert read() == whole
 
@@ -221,7 +222,7 @@ def test_seconds_with_different_numbers_of_digits_are_read(tmp_path: Path) -> No
 
 
 def test_line_longer_than_the_buffer_is_unreadable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(log_module, "_TEXT_BYTES", 512)
+    monkeypatch.setattr(candump_log, "_TEXT_BYTES", 512)
     path = tmp_path / "long.log"
     path.write_text("(0.000001) can0 100#00\n" + "x" * 2000 + "\n(0.000002) can0 100#00\n")
     log = open_log(path)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import binascii
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +27,7 @@ from atalante_hal.wire.frame import (
     ID_REMOTE,
     new_frames,
 )
-from atalante_tools.canlog.validate.chunk import NO_DIRECTION, RECEIVED, SENT, Chunk
+from atalante_tools.canlog.reader.chunk import NO_DIRECTION, RECEIVED, SENT, Channels, Chunk
 
 Text = npt.NDArray[np.uint8]
 Positions = npt.NDArray[np.intp]
@@ -35,7 +35,6 @@ Positions = npt.NDArray[np.intp]
 #: Size of the padding before and after the text [byte]; the parser reads less than this beyond a line.
 MARGIN = 160
 _NEWLINE, _RETURN, _SPACE, _OPEN, _CLOSE, _HASH, _DOT = b"\n\r ()#."
-_MAX_CHANNELS = 256
 _NAME_BYTES = 16  # longest channel name that the array operations parse; Linux allows 15
 _MAX_DIGITS = 2 * 64  # hexadecimal digits
 _STANDARD, _ALL_BITS = 0x7FF, 0x1FFF_FFFF
@@ -55,27 +54,6 @@ _LINE = re.compile(
     rb"\s*\((\d{1,10})\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
     rb"(?:(#)([0-9A-Fa-f])((?:[0-9A-Fa-f]{2})*)|([Rr])(\d?)|((?:[0-9A-Fa-f]{2})*))(?:_([9A-Fa-f]))?(?:\s+([RrTt]))?\s*"
 )
-
-
-@dataclass
-class Channels:
-    """Channel names of a log, in the order of their first frames."""
-
-    names: list[str] = field(default_factory=list)
-
-    def index(self, name: str) -> int:
-        """Return the index of a channel name, and append the name if it is new.
-
-        Names after the 256th name share the last index. Only a damaged log has that many names.
-
-        Args:
-            name: name of the channel in the log.
-        """
-        if name not in self.names:
-            if len(self.names) == _MAX_CHANNELS:
-                return _MAX_CHANNELS - 1
-            self.names.append(name)
-        return self.names.index(name)
 
 
 @dataclass

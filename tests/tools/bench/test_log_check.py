@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import pytest
 
-from atalante_tools.bench.measure import Effort, Measurement, WorkError
-from atalante_tools.canlog.validate import benchmark
+from atalante_tools.bench import log_check
+from atalante_tools.bench.measure import BenchmarkError, Effort, Measurement
 
 
-@pytest.mark.parametrize("run", [benchmark.judge_log, benchmark.judge_against_mdf])
+@pytest.mark.parametrize("run", [log_check.judge_log, log_check.judge_against_mdf])
 def test_both_sides_are_measured(run: Callable[[Effort], Measurement]) -> None:
     measured = run(Effort(quick=True))
     assert measured.remarks == ()
@@ -22,14 +22,14 @@ def test_both_sides_are_measured(run: Callable[[Effort], Measurement]) -> None:
 
 def test_benchmark_rejects_a_log_with_findings(monkeypatch: pytest.MonkeyPatch) -> None:
     """Repetitions without continuous alive counters give findings, so the time would not be that of a valid log."""
-    monkeypatch.setattr(benchmark, "COUNTER_BYTE", 4)
-    with pytest.raises(WorkError, match="must have no findings"):
-        benchmark.judge_log(Effort(quick=True))
+    monkeypatch.setattr(log_check, "COUNTER_BYTE", 4)
+    with pytest.raises(BenchmarkError, match="must have no findings"):
+        log_check.judge_log(Effort(quick=True))
 
 
 def test_full_recording_repeats_without_findings(monkeypatch: pytest.MonkeyPatch) -> None:
     """A joint that sags during the recording would jump at the repetition."""
-    monkeypatch.setattr(benchmark, "_REPEATED", 2)
-    with benchmark._log(Effort()) as (path, frames):
-        assert len(frames) > 2 * benchmark._CYCLES
-        assert benchmark._validation(path, frames)() > 0.0
+    monkeypatch.setattr(log_check, "_REPEATED", 2)
+    with log_check._log(Effort()) as (path, frames):
+        assert len(frames) > 2 * log_check._CYCLES
+        assert log_check._validation(path, frames)() > 0.0

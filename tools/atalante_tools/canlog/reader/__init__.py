@@ -1,0 +1,1 @@
+"""Readers of CAN logs, which return the frames in chunks."""

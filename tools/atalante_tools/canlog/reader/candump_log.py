@@ -1,0 +1,121 @@
+"""Reader of candump logs in chunks of frames."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import zlib
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_tools.canlog.reader import candump
+from atalante_tools.canlog.reader.candump import MARGIN
+from atalante_tools.canlog.reader.chunk import Chunk, concatenated
+from atalante_tools.canlog.reader.log_file import LogFile
+
+_TEXT_BYTES = 1 << 21  # text parsed in one call [byte]; its arrays fit into the processor cache
+
+
+def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
+    """Yield the frames of a candump log in chunks.
+
+    Args:
+        log: log to read; channels, position and remarks are updated.
+        chunk_frames: minimum number of frames in each chunk but the last.
+    """
+    text = np.zeros(_TEXT_BYTES + 2 * MARGIN, np.uint8)
+    memory = text.data
+    unreadable, example = 0, b""
+    gathered: list[Chunk] = []
+    kept, line_too_long = 0, False
+    broken = ""
+    with _open(log) as file:
+        while True:
+            got, broken = _fill(file, memory[MARGIN + kept : MARGIN + _TEXT_BYTES])
+            log.position = file.tell() if not log.compressed else log.position
+            end = MARGIN + kept + got
+            if not got:
+                break  # end of the file, or a read error, described in `broken`
+            stop = _after_last_newline(text, end - got, end)
+            if not stop:
+                kept += got
+                if kept == _TEXT_BYTES:
+                    kept, line_too_long = 0, True
+                continue
+            parsed = candump.parse(text, MARGIN, stop, log.channels)
+            example = example if unreadable else parsed.first_unreadable
+            unreadable += parsed.unreadable + line_too_long
+            line_too_long = False
+            if len(parsed.chunk):
+                gathered.append(parsed.chunk)
+            kept = end - stop
+            text[MARGIN : MARGIN + kept] = text[stop:end].copy()
+            if sum(map(len, gathered)) >= chunk_frames:
+                yield concatenated(gathered)
+                gathered.clear()
+    if gathered:
+        yield concatenated(gathered)
+    last_line = text[MARGIN : MARGIN + kept].tobytes().strip()
+    _remark(log, unreadable, example, last_line, broken)
+
+
+def _remark(log: LogFile, unreadable: int, example: bytes, last_line: bytes, broken: str) -> None:
+    if unreadable:
+        log.remark(
+            "log-unreadable",
+            f"{log.path} has {unreadable} lines that are no CAN frame and were not checked; the first is {_shown(example)}",
+            unreadable,
+            -1,
+        )
+    if broken:
+        log.remark("log-truncated", f"{log.path} is truncated: {broken}", 1, -1)
+    elif last_line:
+        log.remark(
+            "log-truncated",
+            f"{log.path} ends within a line, which was not checked: {_shown(last_line)}",
+            1,
+            -1,
+        )
+
+
+def _open(log: LogFile) -> io.RawIOBase | gzip.GzipFile:
+    return gzip.GzipFile(log.path) if log.compressed else io.FileIO(log.path)
+
+
+def _fill(file: io.RawIOBase | gzip.GzipFile, memory: memoryview) -> tuple[int, str]:
+    """Read from the file until the memory is full or the file ends.
+
+    Returns:
+        The number of bytes read, and the read error if no byte was read.
+    """
+    if not isinstance(file, gzip.GzipFile):
+        return file.readinto(memory) or 0, ""
+    total = 0
+    while total < len(memory):
+        try:
+            got = file.readinto1(memory[total:])
+        except (OSError, EOFError, zlib.error) as error:
+            return total, "" if total else str(error)
+        if not got:
+            break
+        total += got
+    return total, ""
+
+
+def _after_last_newline(text: npt.NDArray[np.uint8], begin: int, end: int) -> int:
+    """Return the index after the last newline in `text[begin:end]`, or 0 without a newline.
+
+    The last bytes are searched first.
+    """
+    for first in (max(begin, end - 4 * MARGIN), begin):
+        newlines = np.flatnonzero(text[first:end] == ord("\n"))
+        if len(newlines):
+            return first + int(newlines[-1]) + 1
+    return 0
+
+
+def _shown(line: bytes) -> str:
+    text = line.decode("ascii", "replace").strip()
+    return repr(text if len(text) <= 60 else text[:57] + "...")

@@ -1,0 +1,72 @@
+"""Chunk: consecutive frames of a log as arrays. The log readers return chunks, and the rules check them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.wire.frame import Frames, as_words, new_frames
+
+#: Direction of a frame in its log; `NO_DIRECTION` if the log does not record it.
+SENT, RECEIVED, NO_DIRECTION = 1, 0, -1
+_MAX_CHANNELS = 256
+
+
+@dataclass
+class Chunk:
+    """Consecutive frames of a log. Each array has shape (n,)."""
+
+    frames: Frames  # `FRAME` records
+    stamps: npt.NDArray[np.int64]  # ns
+    channels: npt.NDArray[np.uint8]  # index of the channel of each frame in the channel list of the log
+    sent: npt.NDArray[np.int8]  # direction: SENT, RECEIVED or NO_DIRECTION
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def select(self, indices: npt.NDArray[Any]) -> Chunk:
+        """Return a chunk with the selected frames.
+
+        Args:
+            indices: indices of frames, or a mask of shape (n,).
+        """
+        return Chunk(self.frames[indices], self.stamps[indices], self.channels[indices], self.sent[indices])
+
+
+def concatenated(chunks: Sequence[Chunk]) -> Chunk:
+    """Return all frames of several chunks in one chunk."""
+    if len(chunks) == 1:
+        return chunks[0]
+    frames = new_frames(sum(map(len, chunks)))
+    np.concatenate([as_words(chunk.frames) for chunk in chunks], out=as_words(frames))
+    return Chunk(
+        frames,
+        np.concatenate([chunk.stamps for chunk in chunks]),
+        np.concatenate([chunk.channels for chunk in chunks]),
+        np.concatenate([chunk.sent for chunk in chunks]),
+    )
+
+
+@dataclass
+class Channels:
+    """Channel names of a log, in the order of their first frames."""
+
+    names: list[str] = field(default_factory=list)
+
+    def index(self, name: str) -> int:
+        """Return the index of a channel name, and append the name if it is new.
+
+        Names after the 256th name share the last index. Only a damaged log has that many names.
+
+        Args:
+            name: name of the channel in the log.
+        """
+        if name not in self.names:
+            if len(self.names) == _MAX_CHANNELS:
+                return _MAX_CHANNELS - 1
+            self.names.append(name)
+        return self.names.index(name)
