@@ -12,20 +12,20 @@ class Door(Closing):
         self.closed += 1
 
 
-def test_the_block_has_the_thing_itself_and_closes_it_once() -> None:
+def test_with_block_returns_the_object_and_closes_it_once() -> None:
     with Door() as door:
         assert door.closed == 0
     assert door.closed == 1
 
 
-def test_an_error_closes_it_too_and_goes_on() -> None:
+def test_error_in_the_block_closes_the_object_and_is_raised() -> None:
     door = Door()
     with pytest.raises(KeyError), door:
         raise KeyError
     assert door.closed == 1
 
 
-def test_what_cannot_be_closed_cannot_be_made() -> None:
+def test_subclass_without_close_cannot_be_constructed() -> None:
     class Hole(Closing):
         pass
 

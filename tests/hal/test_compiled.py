@@ -34,22 +34,22 @@ def beyond(values: Any, place: int) -> float:
     return float(values[place])
 
 
-def test_gives_what_python_gives() -> None:
+def test_compiled_function_returns_the_same_as_python() -> None:
     values = np.random.default_rng(0).standard_normal(100)
     assert compiled(total)(values, 1.5) == total(values, 1.5)
 
 
-def test_is_compiled_once() -> None:
+def test_function_is_compiled_only_once() -> None:
     assert compiled(total) is compiled(total)
     assert compiled(total) is not total
 
 
-def test_checks_bounds() -> None:
+def test_index_out_of_bounds_raises_index_error() -> None:
     with pytest.raises(IndexError):
         compiled(beyond)(np.zeros(3), 3)
 
 
-def test_divides_like_python() -> None:
+def test_division_by_zero_raises_zero_division_error() -> None:
     with pytest.raises(ZeroDivisionError):
         compiled(_inverse)(0.0)
 
@@ -58,12 +58,12 @@ def _inverse(x: float) -> float:
     return 1.0 / x
 
 
-def test_is_the_plain_function_where_compiling_is_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_switched_off_compiler_returns_the_python_function(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
     assert compiled(total) is total
 
 
-def test_compiles_where_nothing_can_be_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_function_is_compiled_without_a_writable_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "atalante").write_text("a file where the folder should be")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert module._folder(total) is None  # type: ignore[arg-type]
@@ -97,7 +97,9 @@ _other_scaled.__name__ = _other_scaled.__qualname__ = "_scaled"
     ],
     ids=["constant of a callee", "body of a callee", "type of a constant"],
 )
-def test_the_cache_notices_every_change(changed: FunctionType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_every_source_change_gets_another_cache_folder(
+    changed: FunctionType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert module._folder(total) != module._folder(changed)  # type: ignore[arg-type]
     assert module._folder(total) == module._folder(_changed(total))  # type: ignore[arg-type]
@@ -117,7 +119,9 @@ def _span(bounds: _Bounds) -> float:
     return bounds.high - bounds.low
 
 
-def test_the_cache_notices_another_order_of_record_fields(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_other_order_of_record_fields_gets_another_cache_folder(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     reordered = _changed(_span, _Bounds=_Reversed)
     reordered.__annotations__ = _span.__annotations__
@@ -125,7 +129,7 @@ def test_the_cache_notices_another_order_of_record_fields(monkeypatch: pytest.Mo
     assert compiled(_span)(_Bounds(1.0, 3.0)) == 2.0
 
 
-def test_tells_what_takes_long(
+def test_compilation_is_logged_once(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -139,7 +143,7 @@ def _told(x: float) -> float:
     return x * x * x
 
 
-def test_a_second_process_finds_it_in_the_cache(tmp_path: Path) -> None:
+def test_second_process_loads_the_function_from_the_cache(tmp_path: Path) -> None:
     (tmp_path / "kernel.py").write_text("def square(x):\n    return x * x\n")
     script = (
         "from atalante_hal.compiled import compiled; from kernel import square; f = compiled(square); f(3.0);"
@@ -195,7 +199,7 @@ def test_reordered_fields_of_a_record_are_compiled_again(tmp_path: Path, future:
         assert result.stdout.strip() == "1.0"
 
 
-def test_machine_code_is_the_same_for_every_machine() -> None:
+def test_machine_code_is_for_a_generic_cpu() -> None:
     import numba
 
     compiled(total)

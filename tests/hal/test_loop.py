@@ -58,7 +58,7 @@ def after(cycles: int):
     return lambda state: state.cycle >= cycles
 
 
-def test_the_controller_runs_in_active_alone_and_its_telemetry_is_recorded(make_rig):
+def test_controller_runs_only_in_active_and_its_telemetry_is_recorded(make_rig):
     rig = make_rig(controller_fields=Recorder.telemetry_fields)
     controller = Recorder()
     seen = []
@@ -76,7 +76,7 @@ def test_the_controller_runs_in_active_alone_and_its_telemetry_is_recorded(make_
     assert hal.state.supervisor is S.HOLD
 
 
-def test_an_exception_holds_in_the_same_cycle_and_the_loop_goes_on(make_rig):
+def test_controller_exception_leads_to_hold_and_the_loop_continues(make_rig):
     rig = make_rig(controller_fields=Recorder.telemetry_fields)
     controller = Recorder(fail_at=10)
     run(rig.hal, controller, LockStep(), until=after(600))
@@ -104,7 +104,7 @@ def test_an_exception_holds_in_the_same_cycle_and_the_loop_goes_on(make_rig):
         ({352: 4e-3, 401: 4e-3}, S.HOLD),
     ],
 )
-def test_three_late_cycles_in_a_row_or_one_long_gap_end_in_hold(make_rig, lateness, expected):
+def test_three_late_cycles_or_one_long_gap_lead_to_hold(make_rig, lateness, expected):
     rig = make_rig(controller_fields=Recorder.telemetry_fields)
     states = []
     statistics = run(rig.hal, Recorder(), Late(lateness), until=lambda s: states.append(s.supervisor) or s.cycle >= 420)
@@ -131,7 +131,7 @@ class SimulatedTime:
 @pytest.mark.parametrize(
     ("busy", "expected"), [(0.99e-3, S.ACTIVE), (1.05e-3, S.ACTIVE), (1.2e-3, S.HOLD), (1.9e-3, S.HOLD)]
 )
-def test_a_loop_that_falls_behind_the_monotonic_clock_ends_in_hold(make_rig, busy, expected):
+def test_loop_slower_than_the_monotonic_clock_leads_to_hold(make_rig, busy, expected):
     rig = make_rig(controller_fields=Recorder.telemetry_fields)
     time, states = SimulatedTime(busy), []
     clock = WallClock(now=lambda: time.now, sleep=time.sleep)
@@ -146,7 +146,7 @@ def test_a_loop_that_falls_behind_the_monotonic_clock_ends_in_hold(make_rig, bus
         assert states.count(S.ACTIVE) <= DRIFT_TO_HOLD / (busy - 1e-3) + 3
 
 
-def test_the_drift_is_the_time_lost_within_the_window():
+def test_drift_is_the_time_lost_within_the_window():
     drift = Drift()
     assert drift.add(0.0) == 0.0
     assert drift.add(0.9e-3) == pytest.approx(0.9e-3)
@@ -159,7 +159,7 @@ def test_the_drift_is_the_time_lost_within_the_window():
     assert lost == pytest.approx(0.0, abs=1e-12)
 
 
-def test_the_memory_of_cycle_costs_is_bounded_and_its_percentiles_are_exact_to_a_microsecond():
+def test_cost_histogram_is_bounded_and_exact_to_a_microsecond():
     statistics = Statistics()
     size = len(statistics.costs)
     assert statistics.cost(50) == 0.0
@@ -172,13 +172,13 @@ def test_the_memory_of_cycle_costs_is_bounded_and_its_percentiles_are_exact_to_a
     assert statistics.cost(100) == pytest.approx(COST_BINS * 1e-6)
 
 
-def test_every_cycle_of_a_run_is_in_the_histogram_of_costs(make_rig):
+def test_cost_histogram_contains_every_cycle_of_a_run(make_rig):
     rig = make_rig(controller_fields=Recorder.telemetry_fields)
     statistics = run(rig.hal, Recorder(), LockStep(), until=after(50))
     assert sum(statistics.costs) == statistics.cycles == 50
 
 
-def test_the_loop_ends_in_hold_whatever_ends_it(make_rig):
+def test_keyboard_interrupt_leaves_the_hal_in_hold(make_rig):
     rig = make_rig(controller_fields=Recorder.telemetry_fields)
 
     def interrupt(state):
@@ -192,7 +192,7 @@ def test_the_loop_ends_in_hold_whatever_ends_it(make_rig):
 
 
 @pytest.mark.parametrize("frozen", [False, True], ids=["nobody froze before", "the caller froze"])
-def test_the_collector_leaves_alone_what_was_there_before_the_run(make_rig, monkeypatch, frozen):
+def test_garbage_collector_ignores_objects_from_before_the_run(make_rig, monkeypatch, frozen):
     collected = []
     monkeypatch.setattr(gc, "collect", lambda: collected.append("collect"))
     gc.unfreeze()
@@ -210,7 +210,7 @@ def test_the_collector_leaves_alone_what_was_there_before_the_run(make_rig, monk
     assert collected == ([] if frozen else ["collect"])
 
 
-def test_deadlines_are_absolute_and_a_missed_one_is_not_made_up_for():
+def test_deadlines_are_absolute_and_missed_ones_are_skipped():
     now = [10.0]
     slept = []
 
@@ -232,7 +232,7 @@ def test_deadlines_are_absolute_and_a_missed_one_is_not_made_up_for():
     assert slept[-1] == pytest.approx(0.8e-3)
 
 
-def test_who_oversleeps_makes_no_cycle_up_either():
+def test_cycles_missed_by_a_late_wake_up_are_skipped():
     """As a process that was stopped in its sleep."""
     now, oversleeps = [0.0], [0.0]
 
@@ -253,7 +253,7 @@ def test_who_oversleeps_makes_no_cycle_up_either():
     assert now[0] == pytest.approx(26e-3)
 
 
-def test_a_controller_the_hal_cannot_record_is_refused_before_anything_moves(make_rig):
+def test_controller_with_wrong_telemetry_length_is_rejected_before_the_start(make_rig):
     rig = make_rig()
     with pytest.raises(
         ValueError,

@@ -28,18 +28,18 @@ def say(
     pendant.hear(True)
 
 
-def test_it_knows_its_row(pendant: Pendant):
+def test_pendant_finds_its_row_in_the_process_image(pendant: Pendant):
     assert pendant.row == 1
 
 
-def test_nothing_is_pressed_before_it_is_heard(pendant: Pendant):
+def test_nothing_is_pressed_before_the_first_frame(pendant: Pendant):
     assert (pendant.dead_man, pendant.stop_requested, pendant.started, pendant.assistance_factor) == (False,) * 3 + (
         None,
     )
     assert pendant.heard == b""
 
 
-def test_dead_man(pendant: Pendant):
+def test_dead_man_follows_its_signal(pendant: Pendant):
     say(pendant, dead_man=1)
     assert pendant.dead_man
     assert pendant.heard == pendant.signals.tobytes()
@@ -48,7 +48,7 @@ def test_dead_man(pendant: Pendant):
 
 
 @pytest.mark.parametrize("request_", [STOP, HOLD])
-def test_stop_and_hold_hold_as_long_as_they_are_said(pendant: Pendant, request_: int):
+def test_stop_and_hold_requests_last_as_long_as_they_are_sent(pendant: Pendant, request_: int):
     say(pendant, request=request_)
     assert pendant.stop_requested
     assert not pendant.started
@@ -56,7 +56,7 @@ def test_stop_and_hold_hold_as_long_as_they_are_said(pendant: Pendant, request_:
     assert not pendant.stop_requested
 
 
-def test_start_acts_when_it_is_pressed_and_once(pendant: Pendant):
+def test_each_start_press_counts_once(pendant: Pendant):
     say(pendant, request=START, press=4)  # pressed before anybody listened
     assert not pendant.started
     say(pendant, request=START, press=5)
@@ -72,7 +72,7 @@ def test_start_acts_when_it_is_pressed_and_once(pendant: Pendant):
     assert pendant.started
 
 
-def test_a_pendant_that_is_lost_presses_nothing_and_what_was_pressed_meanwhile_does_not_count(pendant: Pendant):
+def test_presses_while_the_pendant_is_lost_do_not_count(pendant: Pendant):
     say(pendant, request=STOP, press=1)
     pendant.hear(False)
     assert [pendant.dead_man, pendant.stop_requested, pendant.started] == [False] * 3
@@ -86,7 +86,7 @@ def test_a_pendant_that_is_lost_presses_nothing_and_what_was_pressed_meanwhile_d
     assert not pendant.started
 
 
-def test_the_dial_rules_when_it_is_set(pendant: Pendant):
+def test_assistance_factor_follows_the_dial_only_while_it_is_set(pendant: Pendant):
     say(pendant, factor=0.25, factor_set=1)
     assert pendant.assistance_factor == 0.25
     say(pendant, factor=0.25, factor_set=0)
@@ -104,7 +104,7 @@ def others(pendant: Pendant, *frames: tuple[int, int, int]) -> list[np.ndarray]:
 
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=4))
-def test_the_safest_demand_is_as_safe_as_each(demands: list[tuple[bool, bool]]):
+def test_safest_demand_contains_every_stop_and_dead_man_release(demands: list[tuple[bool, bool]]):
     found = safest([Demand(*demand) for demand in demands])
     assert found.dead_man is all(dead_man for dead_man, _ in demands)
     assert found.stop is any(stop for _, stop in demands)
@@ -113,12 +113,12 @@ def test_the_safest_demand_is_as_safe_as_each(demands: list[tuple[bool, bool]]):
 @pytest.mark.parametrize(
     ("request_", "stop"), [(0, False), (START, False), (STOP, True), (HOLD, True), (4, True), (7, True)]
 )
-def test_a_request_that_is_neither_none_nor_start_is_a_stop(request_: int, stop: bool):
+def test_unknown_request_counts_as_stop(request_: int, stop: bool):
     assert demand_of([1.0, request_, 0.0, 0.0, 0.0]) == (True, stop)
     assert demand_of([0.0, request_, 0.0, 0.0, 0.0]) == (False, stop)
 
 
-def test_the_safest_frame_of_a_cycle_counts_in_that_cycle(pendant: Pendant):
+def test_safest_of_several_frames_counts_in_its_cycle(pendant: Pendant):
     pendant.signals[:] = 1, 0, 0, 0.5, 1
     pendant.hear(True, beside=others(pendant, (1, STOP, 0)))
     assert (pendant.dead_man, pendant.stop_requested) == (True, True)
@@ -131,7 +131,7 @@ def test_the_safest_frame_of_a_cycle_counts_in_that_cycle(pendant: Pendant):
     assert (pendant.dead_man, pendant.stop_requested) == (False, True)
 
 
-def test_a_press_among_frames_that_differ_counts_when_they_agree_again(pendant: Pendant):
+def test_press_in_a_cycle_with_different_frames_counts_one_cycle_later(pendant: Pendant):
     say(pendant, press=3)
     pendant.signals[:3] = 1, START, 4
     pendant.hear(True, beside=others(pendant, (1, 0, 3)))
@@ -142,7 +142,7 @@ def test_a_press_among_frames_that_differ_counts_when_they_agree_again(pendant: 
     assert not pendant.started
 
 
-def test_a_press_of_a_second_sender_does_not_count_whichever_frame_is_taken(pendant: Pendant):
+def test_press_of_a_second_sender_does_not_count(pendant: Pendant):
     say(pendant, request=START, press=3)
     pendant.signals[:3] = 1, START, 9
     pendant.hear(True, beside=others(pendant, (1, START, 3)))
@@ -160,7 +160,7 @@ def qualify(pendant: Pendant, dead_man: int = 1, request: int = 0, press: int = 
     assert pendant.heard == pendant.signals.tobytes()
 
 
-def test_a_press_while_the_pendant_is_not_trusted_yet_counts_once_when_it_is(pendant: Pendant):
+def test_press_before_qualification_counts_once_after_it(pendant: Pendant):
     qualify(pendant, press=6)
     for _ in range(10):
         qualify(pendant, request=START, press=7)
@@ -170,7 +170,7 @@ def test_a_press_while_the_pendant_is_not_trusted_yet_counts_once_when_it_is(pen
     assert not pendant.started
 
 
-def test_what_stands_in_the_first_frame_is_no_press(pendant: Pendant):
+def test_press_counter_of_the_first_frame_is_no_press(pendant: Pendant):
     for _ in range(20):
         qualify(pendant, request=START, press=7)
     say(pendant, request=START, press=7)
@@ -178,7 +178,7 @@ def test_what_stands_in_the_first_frame_is_no_press(pendant: Pendant):
 
 
 @pytest.mark.parametrize("taken_back", [(0, START, 7), (1, STOP, 8), (1, 0, 8)])
-def test_a_press_that_is_taken_back_meanwhile_does_not_count(pendant: Pendant, taken_back: tuple[int, int, int]):
+def test_press_released_before_qualification_does_not_count(pendant: Pendant, taken_back: tuple[int, int, int]):
     qualify(pendant, press=6)
     qualify(pendant, request=START, press=7)
     qualify(pendant, *taken_back)
@@ -187,7 +187,7 @@ def test_a_press_that_is_taken_back_meanwhile_does_not_count(pendant: Pendant, t
     assert not pendant.started
 
 
-def test_a_press_without_the_dead_man_is_not_kept(pendant: Pendant):
+def test_press_without_dead_man_is_not_kept(pendant: Pendant):
     qualify(pendant, dead_man=0, press=6)
     qualify(pendant, dead_man=0, request=START, press=7)
     qualify(pendant, request=START, press=7)
@@ -196,7 +196,7 @@ def test_a_press_without_the_dead_man_is_not_kept(pendant: Pendant):
 
 
 @pytest.mark.parametrize("beside", [(0, 0, 0), (1, STOP, 0)])
-def test_a_second_sender_that_stops_takes_a_kept_press_back(pendant: Pendant, beside: tuple[int, int, int]):
+def test_stop_of_a_second_sender_clears_a_kept_press(pendant: Pendant, beside: tuple[int, int, int]):
     qualify(pendant, press=6)
     qualify(pendant, request=START, press=7)
     pendant.hear(False, qualifying=True, beside=others(pendant, beside))
@@ -205,7 +205,7 @@ def test_a_second_sender_that_stops_takes_a_kept_press_back(pendant: Pendant, be
     assert not pendant.started
 
 
-def test_a_kept_press_is_dropped_when_the_supervisor_moves_or_the_pendant_is_lost(pendant: Pendant):
+def test_kept_press_is_cleared_by_state_change_or_pendant_loss(pendant: Pendant):
     for drop in (pendant.forget_press, lambda: pendant.hear(False)):
         qualify(pendant, press=6)
         qualify(pendant, request=START, press=7)

@@ -16,7 +16,7 @@ FIELDS = st.lists(
 
 
 @given(FIELDS)
-def test_the_slices_cover_the_vector_in_order_without_a_gap(fields: list[tuple[str, int]]) -> None:
+def test_slices_cover_the_vector_in_order_without_gaps(fields: list[tuple[str, int]]) -> None:
     layout = Layout(fields)
     places = list(range(layout.size))
     assert [place for name in layout for place in places[layout[name]]] == places
@@ -24,7 +24,7 @@ def test_the_slices_cover_the_vector_in_order_without_a_gap(fields: list[tuple[s
 
 
 @given(FIELDS)
-def test_json_keeps_everything(fields: list[tuple[str, int]]) -> None:
+def test_layout_is_unchanged_by_json(fields: list[tuple[str, int]]) -> None:
     layout = Layout(fields)
     back = Layout.from_json(layout.to_json())
     assert (back.fields, back.size) == (layout.fields, layout.size)
@@ -32,12 +32,12 @@ def test_json_keeps_everything(fields: list[tuple[str, int]]) -> None:
 
 
 @pytest.mark.parametrize("fields", [[("q", 1), ("q", 1)], [("q", 0)], [("q", -1)]])
-def test_refuses_a_name_twice_and_a_length_below_one(fields: list[tuple[str, int]]) -> None:
+def test_duplicate_name_or_length_below_one_is_rejected(fields: list[tuple[str, int]]) -> None:
     with pytest.raises(ValueError, match="'q'"):
         Layout(fields)
 
 
-def test_an_unknown_field_is_answered_with_those_there_are() -> None:
+def test_unknown_field_error_lists_the_known_fields() -> None:
     layout = Layout([("position", 12), ("velocity", 12)])
     assert "position" in layout
     assert "torque" not in layout

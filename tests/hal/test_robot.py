@@ -72,7 +72,7 @@ def test_the_right_leg_mirrors_the_left():
         ("surplus_frames = 12", "surplus_frames = -1", r"surplus_frames must be 1 number from 1 to 100 \(frames\)"),
     ],
 )
-def test_a_wrong_file_is_refused_with_the_key(old: str, new: str, key: str, tmp_path: Path):
+def test_invalid_robot_file_is_rejected_with_its_key(old: str, new: str, key: str, tmp_path: Path):
     assert old in TEXT
     path = tmp_path / "robot.toml"
     path.write_text(TEXT.replace(old, new, 1))
@@ -81,7 +81,7 @@ def test_a_wrong_file_is_refused_with_the_key(old: str, new: str, key: str, tmp_
 
 
 @given(st.floats(max_value=0.0) | st.sampled_from([float("nan"), float("inf"), float("-inf")]))
-def test_no_limit_can_be_negative_zero_or_not_finite(value: float):
+def test_limits_must_be_positive_and_finite(value: float):
     path = ROBOT_FILE.with_name("robot.toml")
     text = TEXT.replace("torque_max = 350.0", f"torque_max = {value!r}", 1)
     import tempfile
@@ -93,12 +93,12 @@ def test_no_limit_can_be_negative_zero_or_not_finite(value: float):
             load_robot(path)
 
 
-def test_a_missing_file_is_named(tmp_path: Path):
+def test_missing_robot_file_is_named(tmp_path: Path):
     with pytest.raises(RobotError, match="nowhere"):
         load_robot(tmp_path / "nowhere.toml")
 
 
-def test_a_hot_drive_may_give_less_torque():
+def test_torque_limit_falls_with_drive_temperature():
     robot = load_robot()
     cold, hot = np.full(12, robot.derating.start), np.full(12, robot.derating.end)
     assert robot.torque_limit(cold).tobytes() == robot.torque_max.tobytes()

@@ -93,7 +93,7 @@ class FrameReceiver:
         sent = other_frames()
         assert receive_all(self.deliver(sent), 5).tobytes() == sent.tobytes()
 
-    def test_an_old_longer_frame_leaves_nothing_in_a_shorter_one(self) -> None:
+    def test_short_frame_contains_no_bytes_of_a_longer_earlier_frame(self) -> None:
         long, short = random_frames(1, lengths=(64,)), other_frames()[:1].copy()
         bus = self.deliver(np.concatenate([long, short]))
         frame = new_frames(1)
@@ -101,7 +101,7 @@ class FrameReceiver:
             assert bus.receive(frame, 5.0) == 1
             assert frame.tobytes() == expected.tobytes()
 
-    def test_what_does_not_fit_comes_with_the_next_receive(self) -> None:
+    def test_frames_beyond_the_buffer_are_returned_by_the_next_receive(self) -> None:
         sent = random_frames(10, seed=2)
         bus = self.deliver(sent)
         block = new_frames(4)
@@ -112,19 +112,19 @@ class FrameReceiver:
             got += [record.tobytes() for record in block[:count]]
         assert b"".join(got) == sent.tobytes()
 
-    def test_records_beyond_the_received_ones_are_left_alone(self) -> None:
+    def test_buffer_beyond_the_received_frames_is_unchanged(self) -> None:
         block = random_frames(8, seed=3)
         before = block[2:].tobytes()
         assert self.deliver(random_frames(2)).receive(block, 5.0) in (1, 2)
         assert block[2:].tobytes() == before
 
-    def test_nothing_more_is_zero_frames_at_once(self) -> None:
+    def test_receive_without_frames_returns_zero(self) -> None:
         bus = self.deliver(random_frames(3))
         receive_all(bus, 3)
         assert bus.receive(new_frames(4)) == 0
         assert bus.receive(new_frames(4), 0.002) == 0
 
-    def test_stamps_are_nanoseconds_and_never_go_back(self) -> None:
+    def test_time_stamps_are_integer_nanoseconds_and_never_decrease(self) -> None:
         bus = self.deliver(random_frames(30))
         block = new_frames(8)
         stamps: list[int] = []
@@ -136,12 +136,12 @@ class FrameReceiver:
         assert len(bus.stamps) >= len(block)
         assert stamps == sorted(stamps)
 
-    def test_nothing_is_dropped_when_somebody_reads(self) -> None:
+    def test_no_frame_is_dropped_if_all_are_received(self) -> None:
         bus = self.deliver(random_frames(20))
         receive_all(bus, 20)
         assert bus.dropped == 0
 
-    def test_only_contiguous_frame_records_can_be_filled(self) -> None:
+    def test_receive_rejects_buffers_that_are_not_contiguous_frames(self) -> None:
         bus = self.deliver(random_frames(2))
         with pytest.raises(TypeError, match="contiguous"):
             bus.receive(new_frames(8)[::2])
@@ -149,7 +149,7 @@ class FrameReceiver:
             bus.receive(np.zeros(4, np.uint64))
         receive_all(bus, 2)
 
-    def test_closed_is_closed(self) -> None:
+    def test_receive_on_a_closed_bus_raises_bus_down(self) -> None:
         bus = self.deliver(random_frames(2))
         bus.close()
         bus.close()
@@ -184,7 +184,7 @@ class FrameSender:
         receive_all(self.receiver, 3)
         assert self.sender.receive(new_frames(3), 0.002) == 0
 
-    def test_the_sender_may_write_its_array_again_at_once(self) -> None:
+    def test_sent_array_may_be_overwritten_immediately(self) -> None:
         frames = random_frames(4, seed=5, lengths=(12,))
         expected = b""
         for cycle in range(5):
@@ -194,12 +194,12 @@ class FrameSender:
             self.sender.send(frames)
         assert receive_all(self.receiver, 20).tobytes() == expected
 
-    def test_a_batch_of_hundreds_goes_in_one_send(self) -> None:
+    def test_one_send_transmits_300_frames(self) -> None:
         sent = random_frames(300, seed=6)
         self.sender.send(sent)
         assert receive_all(self.receiver, 300).tobytes() == sent.tobytes()
 
-    def test_no_frames_is_no_error(self) -> None:
+    def test_send_without_frames_sends_nothing(self) -> None:
         self.sender.send(new_frames(0))
         assert self.receiver.receive(new_frames(2), 0.002) == 0
 
@@ -214,9 +214,7 @@ class FrameSender:
             (0x100 | ID_REMOTE, 0, FLAG_FDF),
         ],
     )
-    def test_what_no_controller_could_send_is_refused_and_nothing_goes_out(
-        self, can_id: int, length: int, flags: int
-    ) -> None:
+    def test_batch_with_an_invalid_frame_is_rejected_as_a_whole(self, can_id: int, length: int, flags: int) -> None:
         frames = random_frames(3, seed=7)
         self.sender.send(frames)
         receive_all(self.receiver, 3)
@@ -225,22 +223,22 @@ class FrameSender:
             self.sender.send(frames)
         assert self.receiver.receive(new_frames(3), 0.002) == 0
 
-    def test_only_contiguous_frame_records_are_sent(self) -> None:
+    def test_send_rejects_arrays_that_are_not_contiguous_frames(self) -> None:
         with pytest.raises(TypeError, match="contiguous"):
             self.sender.send(random_frames(8)[::2])
         with pytest.raises(TypeError, match="new_frames"):
             self.sender.send(np.zeros(4, np.uint64))
 
-    def test_closed_sends_nothing(self) -> None:
+    def test_send_on_a_closed_bus_raises_bus_down(self) -> None:
         self.sender.close()
         with pytest.raises(BusDown, match="closed"):
             self.sender.send(random_frames(1))
 
-    def test_sending_to_a_wire_nobody_listens_to_is_no_error(self) -> None:
+    def test_send_without_a_receiver_raises_nothing(self) -> None:
         self.receiver.close()
         self.sender.send(random_frames(3))
 
-    def test_it_has_a_name(self) -> None:
+    def test_bus_has_a_name(self) -> None:
         assert self.sender.name
 
 
@@ -380,13 +378,13 @@ def test_pair_steps_the_peer_only_when_nothing_is_queued() -> None:
     assert steps == [2, 0]
 
 
-def test_pair_without_an_answer_is_zero_frames() -> None:
+def test_pair_returns_zero_frames_if_the_peer_sends_none() -> None:
     hal, _ = lockstep_pair()
     hal.step = lambda: None
     assert hal.receive(new_frames(1)) == 0
 
 
-def test_pair_stamps_are_the_owners_time() -> None:
+def test_pair_time_stamps_are_the_receivers_simulated_time() -> None:
     one, other = lockstep_pair()
     one.send(random_frames(3))
     other.now_ns = 123_456_789_000
@@ -395,7 +393,7 @@ def test_pair_stamps_are_the_owners_time() -> None:
     assert other.stamps[:3].tolist() == [123_456_789_000] * 3
 
 
-def test_pair_refuses_whole_batches_when_the_peer_does_not_read() -> None:
+def test_full_pair_rejects_whole_batches() -> None:
     one, other = lockstep_pair(capacity=10)
     sent = random_frames(4)
     one.send(sent)
@@ -409,7 +407,7 @@ def test_pair_refuses_whole_batches_when_the_peer_does_not_read() -> None:
     assert other.receive(new_frames(1)) == 0
 
 
-def test_pair_finds_the_right_memory_of_many_short_lived_arrays() -> None:
+def test_pair_transfers_frames_of_many_short_lived_arrays() -> None:
     one, other = lockstep_pair()
     for seed in range(200):
         sent, received = random_frames(3, seed), new_frames(3)
@@ -418,7 +416,7 @@ def test_pair_finds_the_right_memory_of_many_short_lived_arrays() -> None:
         assert received.tobytes() == sent.tobytes()
 
 
-def test_virtual_refuses_and_counts_what_another_program_made_up() -> None:
+def test_virtual_bus_drops_and_counts_invalid_frames() -> None:
     with can.Bus(interface="virtual", channel="made-up", protocol=can.CanProtocol.CAN_FD) as stranger:
         bus = PythonCanBus("virtual", "made-up")
         for data, is_fd in ((bytes(13), True), (bytes(9), False), (bytes(12), True), (bytes(70), True)):
@@ -430,7 +428,7 @@ def test_virtual_refuses_and_counts_what_another_program_made_up() -> None:
         bus.close()
 
 
-def test_virtual_full_says_how_many_went_out() -> None:
+def test_full_virtual_bus_reports_the_number_of_sent_frames() -> None:
     listener = PythonCanBus("virtual", "full", rx_queue_size=5)
     bus = PythonCanBus("virtual", "full")
     with pytest.raises(BusFull, match="accepted 5 of 8 frames") as refusal:
@@ -448,7 +446,7 @@ def test_virtual_full_says_how_many_went_out() -> None:
         ("virtual", {"protocol": can.CanProtocol.CAN_20}, "virtual:x must support CAN FD, got classic CAN only"),
     ],
 )
-def test_opening_errors_say_what_is_valid(interface: str, options: dict[str, object], sentence: str) -> None:
+def test_error_at_opening_names_the_valid_choices(interface: str, options: dict[str, object], sentence: str) -> None:
     with pytest.raises(BusAbsent, match=sentence):
         open_bus(interface, "x", **options)
 
@@ -468,14 +466,14 @@ def test_replay_returns_one_cycle_at_a_time(tmp_path: Path) -> None:
     assert np.diff(stamps) == pytest.approx(1_000_000, abs=1000)
 
 
-def test_replay_cannot_be_sent_to(tmp_path: Path) -> None:
+def test_send_to_a_replay_is_rejected(tmp_path: Path) -> None:
     bus = ReplayBus(write_log(tmp_path / "run.log", random_frames(2)))
     with pytest.raises(BusError, match="recording: nothing can be sent"):
         bus.send(random_frames(1))
     bus.close()
 
 
-def test_replay_counts_records_that_are_no_can_frame(tmp_path: Path) -> None:
+def test_replay_counts_records_that_are_no_valid_frame(tmp_path: Path) -> None:
     log = tmp_path / "run.log"
     log.write_text("(1.0) can0 100##5000102030405060708090A0B0C\n(1.1) can0 101##500\n", encoding="ascii")
     bus = ReplayBus(log)
@@ -507,14 +505,14 @@ def broken_logs(folder: Path) -> dict[str, tuple[Path, str]]:
     return cases
 
 
-def test_replay_says_in_one_sentence_what_is_wrong_with_a_log(tmp_path: Path) -> None:
+def test_invalid_log_is_rejected_with_one_sentence(tmp_path: Path) -> None:
     for name, (path, sentence) in broken_logs(tmp_path).items():
         with pytest.raises(LogUnreadable, match=sentence) as refusal:
             ReplayBus(path)
         assert "\n" not in str(refusal.value), name
 
 
-def test_replay_delivers_what_is_before_the_break_of_a_zipped_log(tmp_path: Path) -> None:
+def test_truncated_zipped_log_is_replayed_up_to_its_end(tmp_path: Path) -> None:
     content = write_log(tmp_path / "run.log", random_frames(2000)).read_bytes()
     zipped = gzip.compress(content)
     broken = tmp_path / "run.log.gz"
@@ -525,7 +523,7 @@ def test_replay_delivers_what_is_before_the_break_of_a_zipped_log(tmp_path: Path
         receive_all(bus, 1500)
 
 
-def test_an_error_frame_is_marked_as_one() -> None:
+def test_error_frame_keeps_its_error_flag() -> None:
     frames = new_frames(1)
     frames["can_id"], frames["len"] = ID_ERROR, 8
     one, other = open_bus("virtual", "errors"), open_bus("virtual", "errors")
@@ -535,17 +533,17 @@ def test_an_error_frame_is_marked_as_one() -> None:
     other.close()
 
 
-def test_the_legal_lengths_are_those_of_iso_11898() -> None:
+def test_valid_lengths_and_identifiers_are_those_of_iso_11898() -> None:
     assert [n for n in range(256) if is_legal(0x100, n, FLAG_FDF)] == [*range(9), 12, 16, 20, 24, 32, 48, 64]
     assert [n for n in range(256) if is_legal(0x100, n, 0)] == list(range(9))
     assert [i for i in (0x7FF, 0x800, 0x800 | ID_EXTENDED) if is_legal(i, 8, 0)] == [0x7FF, 0x800 | ID_EXTENDED]
 
 
-def test_one_channel_for_all_buses() -> None:
+def test_channel_map_of_one_channel_serves_all_buses() -> None:
     assert parse_channel_map("vcan0", BUSES) == dict.fromkeys(BUSES, "vcan0")
 
 
-def test_a_channel_for_each_bus_in_any_order() -> None:
+def test_channel_map_accepts_the_buses_in_any_order() -> None:
     text = "right_leg=can1, left_leg=can0,right_sense=can3,left_sense=can0"
     assert list(parse_channel_map(text, BUSES).items()) == [
         ("left_leg", "can0"),
@@ -568,7 +566,7 @@ def test_a_channel_for_each_bus_in_any_order() -> None:
         ("left_leg=can0,right_sense=can1", "no channel for right_leg, left_sense; write left_leg=can0,right_leg=can1"),
     ],
 )
-def test_a_wrong_channel_map_says_what_is_right(text: str, sentence: str) -> None:
+def test_invalid_channel_map_is_rejected_with_the_valid_form(text: str, sentence: str) -> None:
     with pytest.raises(ChannelMapError, match=sentence):
         parse_channel_map(text, BUSES)
 
@@ -580,7 +578,7 @@ def test_each_channel_is_opened_once() -> None:
     buses["left_leg"].close()
 
 
-def test_a_channel_that_cannot_be_opened_closes_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_channels_are_closed_if_one_cannot_be_opened(monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[Bus] = []
 
     def open_first_two(interface: str, channel: str) -> Bus:
@@ -615,7 +613,7 @@ def frames_of(network: Network, *names: str) -> Frames:
     return frames
 
 
-def test_joined_sends_each_frame_where_its_message_lives(network: Network) -> None:
+def test_joined_bus_sends_each_frame_to_the_bus_of_its_message(network: Network) -> None:
     joined, far = four_pairs(network)
     frames = frames_of(network, *(m.name for m in network.messages if m.cycle_ms == 1))
     for cycle in range(3):
@@ -632,7 +630,7 @@ def _places(network: Network, frames: Frames) -> list[int]:
     return [ids.index(frame_id) for frame_id in frames["can_id"].tolist()]
 
 
-def test_joined_receives_from_every_channel_with_its_stamps(network: Network) -> None:
+def test_joined_bus_receives_frames_and_time_stamps_of_every_channel(network: Network) -> None:
     joined, far = four_pairs(network)
     for cycle in range(4):  # every channel is first once
         for place, bus in enumerate(BUSES):
@@ -646,7 +644,7 @@ def test_joined_receives_from_every_channel_with_its_stamps(network: Network) ->
         assert joined.stamps[:8].tolist() == [1000 * cycle + BUSES.index(bus) for bus in buses]
 
 
-def test_joined_refuses_a_frame_that_has_no_bus_and_sends_nothing(network: Network) -> None:
+def test_joined_bus_rejects_a_batch_with_an_unknown_frame(network: Network) -> None:
     joined, far = four_pairs(network)
     frames = frames_of(network, "SYNC_LEFT_LEG", "SYNC_RIGHT_LEG")
     frames["can_id"][1] = 0x7FE
@@ -655,7 +653,7 @@ def test_joined_refuses_a_frame_that_has_no_bus_and_sends_nothing(network: Netwo
     assert far["left_leg"].receive(new_frames(1)) == 0
 
 
-def test_joined_serves_the_other_channels_when_one_is_full_or_gone(network: Network) -> None:
+def test_joined_bus_serves_other_channels_if_one_is_full_or_closed(network: Network) -> None:
     joined, far = four_pairs(network)
     syncs = frames_of(network, *(f"SYNC_{bus.upper()}" for bus in BUSES))
     for _ in range(8):
@@ -674,6 +672,6 @@ def test_joined_serves_the_other_channels_when_one_is_full_or_gone(network: Netw
         receive_all(far[bus], 1)
 
 
-def test_joined_needs_a_channel_for_every_bus(network: Network) -> None:
+def test_joined_bus_requires_a_channel_for_every_bus(network: Network) -> None:
     with pytest.raises(ValueError, match="; right_leg is missing"):
         JoinedBus(network, {"left_leg": lockstep_pair()[0]})

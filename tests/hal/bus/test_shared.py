@@ -77,7 +77,7 @@ def asker(ends: tuple[SharedBus, SharedBus]) -> Iterator[tuple[SharedBus, Answer
     answering.join()
 
 
-def test_the_asker_hands_over_everything_at_once_and_gets_the_answer(asker: tuple[SharedBus, Answering]) -> None:
+def test_receive_passes_all_sent_frames_and_returns_the_answer(asker: tuple[SharedBus, Answering]) -> None:
     ours, answering = asker
     block = new_frames(8)
     for cycle in range(50):
@@ -88,7 +88,7 @@ def test_the_asker_hands_over_everything_at_once_and_gets_the_answer(asker: tupl
     assert answering.heard == [[cycle] * 3 + [cycle + 1] for cycle in range(50)]
 
 
-def test_every_receive_without_frames_is_one_step_as_in_a_pair(asker: tuple[SharedBus, Answering]) -> None:
+def test_each_receive_without_queued_frames_runs_one_step(asker: tuple[SharedBus, Answering]) -> None:
     ours, answering = asker
     block = new_frames(8)
     assert ours.receive(block) == 0
@@ -100,14 +100,14 @@ def test_every_receive_without_frames_is_one_step_as_in_a_pair(asker: tuple[Shar
     assert answering.heard == [[], [100], [7], []]
 
 
-def test_what_does_not_fit_comes_with_the_next_receive_without_asking(asker: tuple[SharedBus, Answering]) -> None:
+def test_frames_beyond_the_buffer_are_returned_without_another_step(asker: tuple[SharedBus, Answering]) -> None:
     ours, answering = asker
     ours.send(frames_of(1, 5))
     assert [ours.receive(new_frames(2)) for _ in range(3)] == [2, 2, 1]
     assert len(answering.heard) == 1
 
 
-def test_a_late_answer_wakes_the_asker_and_a_late_question_the_other(asker: tuple[SharedBus, Answering]) -> None:
+def test_both_ends_wake_up_when_frames_arrive_late(asker: tuple[SharedBus, Answering]) -> None:
     """Both ends fall asleep, as they do on a machine with one core."""
     ours, answering = asker
     answering.pause = 0.01
@@ -119,7 +119,7 @@ def test_a_late_answer_wakes_the_asker_and_a_late_question_the_other(asker: tupl
         assert block["data"][0, 0] == cycle
 
 
-def test_patience_with_an_end_that_never_serves_is_limited(ends: tuple[SharedBus, SharedBus]) -> None:
+def test_wait_for_an_end_that_never_serves_times_out(ends: tuple[SharedBus, SharedBus]) -> None:
     ours, _ = ends
     ours.patience = 0.03
     ours.send(frames_of(1))
@@ -130,7 +130,7 @@ def test_patience_with_an_end_that_never_serves_is_limited(ends: tuple[SharedBus
         ours.meet(0.03)
 
 
-def test_a_queue_goes_round_and_refuses_whole_batches_when_nobody_reads(ends: tuple[SharedBus, SharedBus]) -> None:
+def test_full_ring_queue_rejects_whole_batches(ends: tuple[SharedBus, SharedBus]) -> None:
     one, other = ends
     received = []
     for batch in range(20):
@@ -145,7 +145,7 @@ def test_a_queue_goes_round_and_refuses_whole_batches_when_nobody_reads(ends: tu
     assert received == [value for batch in range(20) for value in [batch] * 4 + [100 + batch] * 3]
 
 
-def test_stamps_are_the_time_of_the_receive(ends: tuple[SharedBus, SharedBus]) -> None:
+def test_time_stamps_are_the_time_of_the_receive(ends: tuple[SharedBus, SharedBus]) -> None:
     one, other = ends
     one.send(frames_of(0, 2))
     before = time.time_ns()
@@ -154,7 +154,7 @@ def test_stamps_are_the_time_of_the_receive(ends: tuple[SharedBus, SharedBus]) -
     assert other.stamps.dtype == np.int64
 
 
-def test_what_was_sent_before_closing_arrives_and_then_the_last_words(ends: tuple[SharedBus, SharedBus]) -> None:
+def test_frames_sent_before_closing_arrive_then_the_closing_reason(ends: tuple[SharedBus, SharedBus]) -> None:
     one, other = ends
     other.send(frames_of(1))  # makes the kernel report a broken connection first
     one.send(frames_of(5))
@@ -168,7 +168,7 @@ def test_what_was_sent_before_closing_arrives_and_then_the_last_words(ends: tupl
 
 
 @pytest.mark.parametrize("patience", [0.0, LONG])
-def test_a_killed_process_at_the_other_end_is_noticed(patience: float) -> None:
+def test_killed_process_at_the_other_end_raises_bus_down(patience: float) -> None:
     memory, bell, theirs = descriptors()
     program = (
         "import sys\n"

@@ -9,7 +9,7 @@ from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.wire.frame import new_frames
 
 
-def test_what_nobody_changes_is_the_bus_itself() -> None:
+def test_wrapped_bus_forwards_every_call() -> None:
     near, far = lockstep_pair(names=("near", "far"))
     bus, frames = WrappedBus(near), new_frames(2)
     frames["can_id"], frames["len"] = (1, 2), 8
@@ -22,7 +22,7 @@ def test_what_nobody_changes_is_the_bus_itself() -> None:
     np.testing.assert_array_equal(bus.stamps[:2], 5)
 
 
-def test_closing_it_closes_the_bus() -> None:
+def test_closing_the_wrapper_closes_the_bus() -> None:
     near, _ = lockstep_pair()
     bus, frames = WrappedBus(near), new_frames(1)
     bus.close()

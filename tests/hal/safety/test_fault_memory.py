@@ -18,13 +18,13 @@ def told(memory: FaultMemory) -> list[tuple[int, str, str, str, float]]:
     return [(e.cycle, e.code, e.node, e.severity, e.value) for e in memory.events]
 
 
-def test_nothing_is_active_at_first(memory: FaultMemory):
+def test_new_fault_memory_has_no_active_diagnostics(memory: FaultMemory):
     assert (memory.bits, memory.confirmed) == (0, frozenset())
     memory.close_cycle(1)
     assert (memory.active, memory.bits, memory.confirmed, [*memory.events]) == ({}, 0, frozenset(), [])
 
 
-def test_a_diagnostic_is_told_when_it_begins_and_not_while_it_lasts(memory: FaultMemory):
+def test_persistent_diagnostic_is_logged_once(memory: FaultMemory):
     for cycle in range(5, 2000):
         memory.raise_dtc(cycle, Dtc.NODE_TIMEOUT, "LEFT_SK", value=cycle)
         memory.close_cycle(cycle)
@@ -35,7 +35,7 @@ def test_a_diagnostic_is_told_when_it_begins_and_not_while_it_lasts(memory: Faul
     assert memory.events[0].text == "LEFT_SK: a node is silent"
 
 
-def test_what_is_not_raised_again_is_over(memory: FaultMemory):
+def test_diagnostic_ends_when_it_is_not_raised_again(memory: FaultMemory):
     memory.raise_dtc(1, Dtc.NODE_TIMEOUT, "LEFT_SK")
     memory.raise_dtc(1, Dtc.E2E_CRC, "LEFT_SA", confirmed=False)
     memory.close_cycle(1)
@@ -47,7 +47,7 @@ def test_what_is_not_raised_again_is_over(memory: FaultMemory):
     assert (memory.bits, memory.active) == (0, {})
 
 
-def test_pending_is_told_as_a_warning_and_confirmed_once_more_as_what_it_is(memory: FaultMemory):
+def test_pending_is_logged_as_warning_and_confirmed_as_error(memory: FaultMemory):
     for cycle, confirmed in ((1, False), (2, False), (3, True), (4, True)):
         memory.raise_dtc(cycle, Dtc.E2E_CRC, "LEFT_SK", confirmed=confirmed, text=f"in cycle {cycle}", value=cycle)
         memory.close_cycle(cycle)
@@ -56,7 +56,7 @@ def test_pending_is_told_as_a_warning_and_confirmed_once_more_as_what_it_is(memo
     assert [e.text for e in memory.events] == ["in cycle 1", "in cycle 3"]
 
 
-def test_what_was_confirmed_and_is_pending_again_does_not_act_any_more(memory: FaultMemory):
+def test_diagnostic_pending_again_is_no_longer_confirmed(memory: FaultMemory):
     memory.raise_dtc(1, Dtc.E2E_CRC, "LEFT_SK")
     memory.close_cycle(1)
     memory.raise_dtc(2, Dtc.E2E_CRC, "LEFT_SK", confirmed=False)
@@ -65,14 +65,14 @@ def test_what_was_confirmed_and_is_pending_again_does_not_act_any_more(memory: F
 
 
 @pytest.mark.parametrize("order", [(True, False), (False, True)])
-def test_confirmed_wins_in_one_cycle_whatever_is_raised_first(memory: FaultMemory, order: tuple[bool, bool]):
+def test_confirmed_overrides_pending_in_the_same_cycle(memory: FaultMemory, order: tuple[bool, bool]):
     for confirmed in order:
         memory.raise_dtc(1, Dtc.E2E_CRC, "LEFT_SK", confirmed=confirmed)
     memory.close_cycle(1)
     assert memory.confirmed == {Dtc.E2E_CRC}
 
 
-def test_information_stays_information(memory: FaultMemory):
+def test_pending_information_keeps_its_severity(memory: FaultMemory):
     memory.raise_dtc(1, Dtc.E2E_SOME_LOST, "LEFT_SK", confirmed=False)
     memory.raise_dtc(1, Dtc.TORQUE_SATURATED, "HAL", confirmed=False)
     memory.raise_dtc(1, Dtc.TELEMETRY_DROPPED, "HAL")
@@ -80,7 +80,7 @@ def test_information_stays_information(memory: FaultMemory):
 
 
 @pytest.mark.parametrize(("confirmed", "quiet"), [(False, QUIET_PENDING), (True, QUIET_CONFIRMED)])
-def test_what_comes_and_goes_is_told_anew_after_a_while(memory: FaultMemory, confirmed: bool, quiet: int):
+def test_intermittent_diagnostic_is_logged_again_after_the_quiet_time(memory: FaultMemory, confirmed: bool, quiet: int):
     for cycle in range(0, 2 * quiet + 1, 2):
         memory.raise_dtc(cycle, Dtc.E2E_CRC, "LEFT_SK", confirmed=confirmed)
         memory.close_cycle(cycle)
@@ -88,19 +88,19 @@ def test_what_comes_and_goes_is_told_anew_after_a_while(memory: FaultMemory, con
     assert [e.cycle for e in memory.events] == [0, quiet, 2 * quiet]
 
 
-def test_nodes_and_codes_are_told_apart(memory: FaultMemory):
+def test_each_pair_of_node_and_code_is_logged(memory: FaultMemory):
     for node in ("LEFT_SK", "LEFT_SA"):
         for dtc in (Dtc.E2E_CRC, Dtc.NODE_TIMEOUT):
             memory.raise_dtc(7, dtc, node)
     assert len(memory.events) == 4
 
 
-def test_an_emergency_carries_its_code(memory: FaultMemory):
+def test_emergency_event_contains_the_error_code(memory: FaultMemory):
     memory.raise_dtc(7, Dtc.EMCY_CURRENT, "LEFT_SK", value=0x2310)
     assert memory.events[0].code == "EMCY_2310"
 
 
-def test_who_and_what_is_meant(memory: FaultMemory):
+def test_nodes_and_texts_of_confirmed_codes_are_returned(memory: FaultMemory):
     memory.raise_dtc(1, Dtc.ENC_STUCK, "LEFT_SK", text="stuck")
     memory.raise_dtc(1, Dtc.OVER_TEMP, "LEFT_SA", text="hot")
     memory.raise_dtc(1, Dtc.OVER_TEMP, "LEFT_HA", confirmed=False)
@@ -112,12 +112,12 @@ def test_who_and_what_is_meant(memory: FaultMemory):
     assert memory.text_of(frozenset({Dtc.BUS_OFF})) == ""
 
 
-def test_what_is_raised_without_a_value_has_none(memory: FaultMemory):
+def test_diagnostic_without_a_value_has_value_zero(memory: FaultMemory):
     memory.raise_dtc(3, Dtc.NODE_RESET, "LEFT_SK")
     assert told(memory) == [(3, "NODE_RESET", "LEFT_SK", "error", 0.0)]
 
 
-def test_events_that_never_end_take_bounded_memory_and_are_counted(memory: FaultMemory):
+def test_event_log_is_bounded_and_counts_dropped_events(memory: FaultMemory):
     total = EVENTS_KEPT + 100
     for number in range(total):
         memory.raise_dtc(number * QUIET_CONFIRMED, Dtc.OVER_TEMP, "LEFT_SK", value=number)
@@ -128,7 +128,7 @@ def test_events_that_never_end_take_bounded_memory_and_are_counted(memory: Fault
     assert [event.value for event in events] == list(range(100, total))
 
 
-def test_events_since_a_number_are_each_returned_once_while_older_ones_are_dropped():
+def test_since_returns_each_event_once_while_older_ones_are_dropped():
     log, seen, number = EventLog(4), [], 0
     for burst in (0, 1, 3, 4, 2, 4):
         for _ in range(burst):
@@ -140,7 +140,7 @@ def test_events_since_a_number_are_each_returned_once_while_older_ones_are_dropp
 
 
 @pytest.mark.parametrize(("number", "cycles"), [(0, [2, 3, 4, 5]), (1, [2, 3, 4, 5]), (4, [4, 5]), (6, []), (9, [])])
-def test_events_since_a_number_are_those_that_are_kept(number: int, cycles: list[int]):
+def test_since_returns_only_events_that_are_kept(number: int, cycles: list[int]):
     log = EventLog(4)
     for cycle in range(6):
         log.append(Event(cycle, "READY", ""))

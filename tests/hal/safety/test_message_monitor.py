@@ -68,7 +68,7 @@ def flip(row: int) -> Change:
     return change
 
 
-def test_a_sender_is_trusted_after_sixteen_good_cycles(bench: MonitorBench):
+def test_sender_is_trusted_after_16_good_cycles(bench: MonitorBench):
     assert not bench.cycle(times=15).message_monitor.nodes_well
     assert not bench.message_monitor.valid.any()
     assert bench.message_monitor.missing() == {"LEFT_SK", "RIGHT_SK", "IMU_PELVIS", "FOOT_LEFT"}
@@ -83,7 +83,7 @@ def test_a_sender_is_trusted_after_sixteen_good_cycles(bench: MonitorBench):
     assert bench.active == {}
 
 
-def test_who_was_never_heard_has_no_timeout(bench: MonitorBench):
+def test_node_without_any_frame_has_no_timeout(bench: MonitorBench):
     bench.cycle(lose(IMU), times=40)
     assert bench.active == {}
     assert not bench.message_monitor.nodes_well
@@ -94,7 +94,7 @@ def test_who_was_never_heard_has_no_timeout(bench: MonitorBench):
 @pytest.mark.parametrize(
     ("row", "node", "timeout"), [(KNEE, "LEFT_SK", 5), (IMU, "IMU_PELVIS", 10), (FOOT, "FOOT_LEFT", 10)]
 )
-def test_a_silent_node_times_out_at_its_timeout_exactly(bench: MonitorBench, row: int, node: str, timeout: int):
+def test_silent_node_times_out_exactly_at_its_timeout(bench: MonitorBench, row: int, node: str, timeout: int):
     bench.well().cycle(lose(row), times=timeout - 1)
     assert bench.active == {}
     assert bench.message_monitor.nodes_well
@@ -108,7 +108,7 @@ def test_a_silent_node_times_out_at_its_timeout_exactly(bench: MonitorBench, row
     assert event.text == f"{node}: a node is silent; its data is {timeout} cycles old"
 
 
-def test_a_frame_after_lost_ones_is_used_and_told(bench: MonitorBench):
+def test_first_frame_after_lost_frames_is_used_and_reported(bench: MonitorBench):
     bench.well().cycle(lose(KNEE), times=4).cycle()
     assert bench.active == {("E2E_SOME_LOST", "LEFT_SK"): False}
     assert bench.message_monitor.valid.all()
@@ -120,7 +120,7 @@ def test_a_frame_after_lost_ones_is_used_and_told(bench: MonitorBench):
     assert bench.message_monitor.settled
 
 
-def test_after_a_timeout_trust_takes_sixteen_good_cycles(bench: MonitorBench):
+def test_node_is_trusted_16_good_cycles_after_a_timeout(bench: MonitorBench):
     bench.well().cycle(lose(KNEE), times=5).cycle()
     assert bench.active == {("E2E_SEQUENCE", "LEFT_SK"): True}  # more than four are missing
     bench.cycle(times=15)
@@ -135,7 +135,7 @@ def repeat(frames: Frames) -> Frames:
     return np.concatenate([frames, frames[[KNEE]]])
 
 
-def test_a_repeated_frame_is_told_and_changes_nothing(bench: MonitorBench):
+def test_repeated_frame_is_reported_and_not_committed(bench: MonitorBench):
     bench.well().cycle(repeat)
     assert bench.active == {("E2E_REPEATED", "LEFT_SK"): False}
     assert bench.image.age[KNEE] == 0
@@ -152,7 +152,7 @@ def frozen(bench: MonitorBench) -> Change:
     return change
 
 
-def test_a_counter_that_stands_still_is_as_bad_as_silence(bench: MonitorBench):
+def test_constant_counter_is_confirmed_after_the_timeout(bench: MonitorBench):
     bench.well()
     stuck = frozen(bench)
     bench.cycle(stuck, times=4)
@@ -161,14 +161,14 @@ def test_a_counter_that_stands_still_is_as_bad_as_silence(bench: MonitorBench):
     assert bench.active == {("E2E_REPEATED", "LEFT_SK"): False, ("E2E_FROZEN", "LEFT_SK"): True}
 
 
-def test_damage_is_told_at_once_and_confirmed_when_the_data_is_too_old(bench: MonitorBench):
+def test_crc_error_is_pending_until_the_data_times_out(bench: MonitorBench):
     bench.well().cycle(flip(KNEE), times=4)
     assert bench.active == {("E2E_CRC", "LEFT_SK"): False}
     bench.cycle(flip(KNEE))
     assert bench.active == {("E2E_CRC", "LEFT_SK"): True}
 
 
-def test_another_length_is_told_at_once(bench: MonitorBench):
+def test_wrong_length_is_pending_until_the_data_times_out(bench: MonitorBench):
     def shorten(frames: Frames) -> Frames:
         frames["len"][KNEE] = 8
         return frames
@@ -186,7 +186,7 @@ def test_another_length_is_told_at_once(bench: MonitorBench):
         (IMU, "IMU_PELVIS_STATE", "GyroX", np.nan, "IMU_INVALID"),
     ],
 )
-def test_an_invalid_code_is_the_imus_own_diagnostic(row, message, signal, value, code):
+def test_invalid_code_is_reported_as_range_or_imu_fault(row, message, signal, value, code):
     bench = MonitorBench()
     bench.well()
     bench.tx.values[bench.tx.codec.index(message, signal)] = value
@@ -198,7 +198,7 @@ def test_an_invalid_code_is_the_imus_own_diagnostic(row, message, signal, value,
     assert bench.active == {(code, node): True}
 
 
-def test_what_a_right_frame_says_does_not_fill_the_bucket(bench: MonitorBench):
+def test_invalid_values_do_not_fill_the_leaky_bucket(bench: MonitorBench):
     bench.well()
     place = bench.tx.codec.index("IMU_PELVIS_STATE", "GyroX")
     for _ in range(20):  # two bad of three
@@ -223,7 +223,7 @@ def late(bench: MonitorBench, row: int, by: int) -> Change:
 
 
 @pytest.mark.parametrize("by", [1, 2, 3, 4])
-def test_a_late_answer_is_used_with_its_age(bench: MonitorBench, by: int):
+def test_late_answer_is_used_with_its_age(bench: MonitorBench, by: int):
     bench.well().cycle(late(bench, KNEE, by), times=40)
     assert bench.active == {("NODE_LATE", "LEFT_SK"): False}
     assert bench.memory.active[Dtc.NODE_LATE, "LEFT_SK"].value == by
@@ -233,7 +233,7 @@ def test_a_late_answer_is_used_with_its_age(bench: MonitorBench, by: int):
 
 
 @pytest.mark.parametrize("by", [5, 6])
-def test_an_answer_later_than_the_timeout_is_no_answer(bench: MonitorBench, by: int):
+def test_answer_later_than_the_timeout_counts_as_silence(bench: MonitorBench, by: int):
     bench.well().cycle(late(bench, KNEE, by), times=5)
     assert bench.active == {("NODE_TIMEOUT", "LEFT_SK"): True}
     bench.cycle(times=0)
@@ -246,7 +246,7 @@ def test_an_answer_later_than_the_timeout_is_no_answer(bench: MonitorBench, by: 
     assert not bench.message_monitor.nodes_well
 
 
-def test_steady_loss_trips_the_bucket_and_the_pendants_is_not_the_nodes(bench: MonitorBench):
+def test_steady_loss_trips_the_leaky_bucket_of_each_sender(bench: MonitorBench):
     bench.well()
     loss = lose(KNEE, PENDANT)
     for _ in range(5):
@@ -260,14 +260,14 @@ def test_steady_loss_trips_the_bucket_and_the_pendants_is_not_the_nodes(bench: M
     assert not bench.message_monitor.trusts(PENDANT)
 
 
-def test_a_lost_pendant_is_no_lost_node(bench: MonitorBench):
+def test_lost_pendant_is_not_reported_as_a_lost_node(bench: MonitorBench):
     bench.well().cycle(lose(PENDANT), times=20)
     assert bench.active == {}
     assert bench.message_monitor.nodes_well
     assert not bench.message_monitor.trusts(PENDANT)
 
 
-def test_what_is_implausible_is_not_valid_and_is_told_by_who_found_it(bench: MonitorBench):
+def test_implausible_row_is_invalid_without_another_diagnostic(bench: MonitorBench):
     bench.well()
     for age in range(1, 7):
         bench.number += 1
@@ -284,7 +284,7 @@ def test_what_is_implausible_is_not_valid_and_is_told_by_who_found_it(bench: Mon
     assert bench.active == {}
 
 
-def test_a_replayed_answer_does_not_disturb_the_next_one(bench: MonitorBench):
+def test_replayed_frame_is_rejected_and_the_next_frame_accepted(bench: MonitorBench):
     bench.well()
     old = bench.tx.frames[[KNEE]].copy()
     bench.cycle(times=30)
@@ -294,14 +294,14 @@ def test_a_replayed_answer_does_not_disturb_the_next_one(bench: MonitorBench):
     assert old["data"][0, COUNTER_BYTE] == 16
 
 
-def test_values_of_what_was_never_committed_have_no_age(bench: MonitorBench):
+def test_rejected_first_frame_is_reported_with_age_zero(bench: MonitorBench):
     bench.cycle(flip(KNEE))
     assert bench.memory.events[0].value == 0
     bench.well().cycle(flip(KNEE), times=2)
     assert bench.memory.active[Dtc.E2E_CRC, "LEFT_SK"].value == 2
 
 
-def test_before_the_first_cycle_nothing_may_be_used(bench: MonitorBench) -> None:
+def test_no_row_is_valid_before_the_first_cycle(bench: MonitorBench) -> None:
     message_monitor = bench.message_monitor
     assert message_monitor.valid.tolist() == [False] * len(MESSAGES)
     assert message_monitor.valid.dtype == np.bool_
@@ -311,7 +311,7 @@ def test_before_the_first_cycle_nothing_may_be_used(bench: MonitorBench) -> None
     assert not any(message_monitor.trusts(row) for row in range(len(MESSAGES)))
 
 
-def test_what_says_the_impossible_came_well_and_fills_no_bucket(bench: MonitorBench) -> None:
+def test_value_out_of_range_does_not_affect_trust(bench: MonitorBench) -> None:
     drive_state = MESSAGES[KNEE].signal("DriveState")
 
     def impossible(frames: Frames) -> Frames:
@@ -329,7 +329,7 @@ def test_what_says_the_impossible_came_well_and_fills_no_bucket(bench: MonitorBe
         bench.cycle()
 
 
-def test_the_age_of_what_comes_late_after_a_loss_is_told_with_it(bench: MonitorBench) -> None:
+def test_late_frame_after_a_loss_is_reported_with_its_age(bench: MonitorBench) -> None:
     bench.well()
     bench.cycle(lose(KNEE))
     kept: list[Frames] = []
@@ -353,7 +353,7 @@ class TestSwingLeg:
         bench.swing = 0
         return bench
 
-    def test_a_joint_that_is_not_heard_for_a_moment_has_its_step_finished(self, bench: MonitorBench):
+    def test_timeout_of_a_swing_joint_lets_the_step_finish(self, bench: MonitorBench):
         bench.cycle(lose(KNEE), times=4)
         assert bench.active == {}
         for _ in range(5):
@@ -362,20 +362,20 @@ class TestSwingLeg:
             assert {entry.value for entry in bench.memory.active.values()} == {bench.image.age[KNEE]}
         assert bench.cycle(lose(KNEE)).active == {("NODE_TIMEOUT", "LEFT_SK"): True}
 
-    def test_a_joint_of_the_leg_it_stands_on_is_held_at_once(self, bench: MonitorBench):
+    def test_timeout_of_a_stance_joint_is_confirmed_immediately(self, bench: MonitorBench):
         assert bench.cycle(lose(OTHER_KNEE), times=5).active == {("NODE_TIMEOUT", "RIGHT_SK"): True}
 
-    def test_of_a_robot_on_both_legs_every_joint_is(self, bench: MonitorBench):
+    def test_timeout_in_double_stance_is_confirmed_immediately(self, bench: MonitorBench):
         bench.swing = None
         assert bench.cycle(lose(KNEE), times=5).active == {("NODE_TIMEOUT", "LEFT_SK"): True}
 
-    def test_who_is_no_joint_is_silent_as_ever(self, bench: MonitorBench):
+    def test_timeout_of_imu_and_foot_is_confirmed_immediately(self, bench: MonitorBench):
         assert bench.cycle(lose(IMU, FOOT), times=10).active == {
             ("NODE_TIMEOUT", "IMU_PELVIS"): True,
             ("NODE_TIMEOUT", "FOOT_LEFT"): True,
         }
 
-    def test_the_frame_after_five_lost_ones_is_refused_and_the_next_one_is_not(self, bench: MonitorBench):
+    def test_second_frame_after_five_lost_frames_is_accepted(self, bench: MonitorBench):
         bench.cycle(lose(KNEE), times=5)
         assert bench.cycle().active == {("SWING_TIMEOUT", "LEFT_SK"): True, ("E2E_SEQUENCE", "LEFT_SK"): False}
         assert bench.cycle().active == {}
@@ -401,7 +401,7 @@ class TestTwoSenders:
 
     @pytest.mark.parametrize("first", [False, True])
     @pytest.mark.parametrize("row", range(len(MESSAGES)))
-    def test_they_are_confirmed_in_the_fourth_cycle_for_every_node(self, bench: MonitorBench, row: int, first: bool):
+    def test_two_senders_are_confirmed_in_the_fourth_cycle(self, bench: MonitorBench, row: int, first: bool):
         node = MESSAGES[row].sender
         bench.well().cycle(self.rival(row, first=first), times=3)
         assert bench.active == {("NODE_DUPLICATE", node): False}
@@ -420,7 +420,7 @@ class TestTwoSenders:
         told = [event for event in bench.memory.events if event.code == "NODE_DUPLICATE"]
         assert [event.severity for event in told] == ["warning", "error"]
 
-    def test_trust_comes_back_after_sixteen_clean_cycles_and_one_more_rival_takes_it_again(self, bench: MonitorBench):
+    def test_trust_returns_after_16_clean_cycles_until_another_second_sender(self, bench: MonitorBench):
         bench.well().cycle(self.rival(KNEE), times=4).cycle(times=15)
         assert bench.active == {}
         assert not bench.message_monitor.nodes_well
@@ -434,7 +434,7 @@ class TestTwoSenders:
         bench.cycle()
         assert bench.message_monitor.settled
 
-    def test_a_node_of_two_senders_is_never_trusted_and_the_reason_is_raised(self, bench: MonitorBench):
+    def test_node_with_two_senders_is_never_trusted(self, bench: MonitorBench):
         bench.cycle()
         for _ in range(10):
             bench.cycle(self.rival(IMU)).cycle(times=5)
@@ -442,13 +442,13 @@ class TestTwoSenders:
         assert any(e.code == "NODE_DUPLICATE" and e.severity == "error" for e in bench.memory.events)
 
     @pytest.mark.parametrize("ahead", [-2, 2, 30])
-    def test_a_counter_that_does_not_follow_is_a_second_senders_too(self, bench: MonitorBench, ahead: int):
+    def test_second_sender_with_another_counter_is_found(self, bench: MonitorBench, ahead: int):
         bench.well().cycle(self.rival(KNEE, ahead=ahead), times=3)
         assert bench.active == {("E2E_SEQUENCE", "LEFT_SK"): False}
         bench.cycle(self.rival(KNEE, ahead=ahead))
         assert bench.active == {("E2E_SEQUENCE", "LEFT_SK"): False, ("NODE_DUPLICATE", "LEFT_SK"): True}
 
-    def test_a_rejected_frame_after_the_second_sender_is_reported_too(self, bench: MonitorBench):
+    def test_crc_error_beside_a_second_sender_is_reported(self, bench: MonitorBench):
         def change(frames: Frames) -> Frames:
             frames = self.rival(KNEE, first=True)(frames)
             frames["data"][1 + IMU, 5] ^= 1
@@ -457,17 +457,17 @@ class TestTwoSenders:
         bench.well().cycle(change)
         assert bench.active == {("NODE_DUPLICATE", "LEFT_SK"): False, ("E2E_CRC", MESSAGES[IMU].sender): False}
 
-    def test_a_frame_accepted_after_a_loss_and_another_are_two_senders(self):
+    def test_conflict_beside_an_accepted_frame_is_a_second_sender(self):
         assert rivals_of([(1, Check.CONFLICT)], [Check.OK, Check.SOME_LOST]) == {1}
         assert rivals_of([(1, Check.CONFLICT)], [Check.OK, Check.CONFLICT]) == set()
 
-    def test_a_second_sender_beside_a_frame_out_of_range_is_noticed(self, bench: MonitorBench):
+    def test_second_sender_beside_a_value_out_of_range_is_found(self, bench: MonitorBench):
         bench.well()
         bench.tx.values[bench.tx.codec.index("LEFT_SK_STATE", "Torque")] = np.nan
         bench.cycle(self.rival(KNEE), times=4)
         assert bench.active["NODE_DUPLICATE", "LEFT_SK"]
 
-    def test_a_counter_that_stands_still_under_other_data_is_one_sender(self, bench: MonitorBench):
+    def test_constant_counter_with_changing_data_is_one_sender(self, bench: MonitorBench):
         bench.well()
         last = bench.tx.frames[[KNEE]].copy()
         changed = self.rival(0)
@@ -482,7 +482,7 @@ class TestTwoSenders:
         bench.cycle(stuck)
         assert bench.active == {("E2E_REPEATED", "LEFT_SK"): False, ("E2E_FROZEN", "LEFT_SK"): True}
 
-    def test_what_is_heard_is_younger_than_its_timeout(self, bench: MonitorBench):
+    def test_sender_counts_as_heard_until_its_timeout(self, bench: MonitorBench):
         assert not bench.message_monitor.hears(PENDANT)
         bench.cycle()
         assert bench.message_monitor.hears(PENDANT)

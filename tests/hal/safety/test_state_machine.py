@@ -63,7 +63,7 @@ TABLE = [
 
 
 @pytest.mark.parametrize(("before", "facts", "then"), TABLE)
-def test_without_a_diagnostic(before: S, facts: dict[str, bool], then: S):
+def test_next_state_without_diagnostics(before: S, facts: dict[str, bool], then: S):
     assert after(before, **facts) is then
 
 
@@ -79,12 +79,12 @@ WORSE = {
 
 
 @pytest.mark.parametrize("dtc", Dtc)
-def test_each_code_does_to_a_moving_robot_what_its_reaction_says(dtc: Dtc):
+def test_each_code_leads_a_moving_robot_to_its_reaction(dtc: Dtc):
     assert tuple(after(s, dtc, **RUN) for s in (S.ACTIVE, S.FULL_ASSIST, S.FINISH_STEP)) == WORSE[dtc.reaction]
 
 
 @pytest.mark.parametrize("dtc", [d for d in Dtc if d.reaction is not R.INFO])
-def test_no_code_but_information_lets_the_robot_start(dtc: Dtc):
+def test_every_code_except_information_prevents_the_start(dtc: Dtc):
     assert after(S.OFF, dtc, **GO) is (S.FAULT if dtc.reaction is R.FAULT else S.OFF)
     assert after(S.READY, dtc, **GO) is (S.FAULT if dtc.reaction is R.FAULT else S.OFF)
     assert after(S.HOLD, dtc, **GO) is {R.LOWER: S.LOWER, R.FAULT: S.FAULT}.get(dtc.reaction, S.HOLD)
@@ -94,20 +94,20 @@ def test_no_code_but_information_lets_the_robot_start(dtc: Dtc):
 @pytest.mark.parametrize(
     ("before", "facts", "then"), [(S.FAULT, RUN, S.FAULT), (S.FAULT, GO, S.LOWER), (S.LOWER, GO, S.LOWER)]
 )
-def test_a_joint_that_cannot_hold_keeps_being_lowered(before: S, facts: dict[str, bool], then: S):
+def test_start_keeps_lowering_while_the_cause_lasts(before: S, facts: dict[str, bool], then: S):
     assert after(before, Dtc.OVER_TEMP, **facts) is then
 
 
-def test_a_fault_lasts_as_long_as_its_cause():
+def test_start_keeps_fault_while_its_cause_lasts():
     assert after(S.FAULT, Dtc.DRIVE_FAULT, **GO) is S.FAULT
 
 
-def test_a_finished_step_ends_in_hold_or_worse():
+def test_finished_step_leads_to_hold_or_a_safer_state():
     assert after(S.FINISH_STEP, Dtc.SUPPLY_LOW, **RUN, step_finished=True) is S.HOLD
     assert after(S.FINISH_STEP, Dtc.OVER_TEMP, **RUN, step_finished=True) is S.LOWER
 
 
-def test_laws_over_all_states_reactions_and_facts():
+def test_invariants_hold_for_all_states_reactions_and_facts():
     for before, reaction, conditions in EVERYTHING:
         check_laws(before, reaction, conditions)
 
@@ -138,7 +138,7 @@ def check_laws(before: S, reaction: R, c: Conditions):
 
 
 @given(st.sampled_from(S), st.frozensets(st.sampled_from(Dtc), max_size=6), st.tuples(*[st.booleans()] * len(FACTS)))
-def test_a_set_of_codes_acts_like_its_worst_and_the_reasons_are_the_worst(before, dtcs, facts):
+def test_most_severe_code_of_a_set_determines_state_and_reasons(before, dtcs, facts):
     then, reasons = next_state(before, Conditions(dtcs, *facts))
     alone, _ = next_state(before, Conditions(frozenset({ONE_OF[worst(dtcs)]}), *facts))
     assert then is alone
@@ -151,13 +151,13 @@ def test_a_set_of_codes_acts_like_its_worst_and_the_reasons_are_the_worst(before
 
 
 @given(st.sampled_from(S), st.frozensets(st.sampled_from(Dtc), max_size=5), st.sampled_from(Dtc))
-def test_one_code_more_never_makes_a_moving_robot_better(before, dtcs, more):
+def test_additional_code_never_leads_to_a_less_safe_state(before, dtcs, more):
     fewer, _ = next_state(before, Conditions(dtcs, **GO))
     then, _ = next_state(before, Conditions(dtcs | {more}, **GO))
     assert before not in MOVING or then >= fewer
 
 
-def test_while_nothing_changes_the_state_settles():
+def test_state_settles_under_constant_conditions():
     for before, _, conditions in EVERYTHING:
         then = before
         for _ in range(3):

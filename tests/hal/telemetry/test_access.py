@@ -128,7 +128,7 @@ def trusting(authority: Authority, certificate: tuple[Path, Path] | None = None)
 
 
 class TestLoopback:
-    def test_tls_and_a_user_let_in_who_has_both_and_nobody_else(self, authority: Authority, users: Path) -> None:
+    def test_tls_with_users_accepts_only_clients_with_both(self, authority: Authority, users: Path) -> None:
         access = Access(*authority.issue("robot"), users=users)
         stranger = Authority(users.parent, "stranger")
         with Publisher("exo", STREAMS, endpoint("tls"), access) as publisher:
@@ -141,7 +141,7 @@ class TestLoopback:
                 (user("lab", "secret"), publisher.endpoint.replace("tls/", "tcp/")),
             )
 
-    def test_with_a_client_authority_a_subscriber_needs_its_certificate(self, authority: Authority) -> None:
+    def test_client_authority_requires_a_client_certificate(self, authority: Authority) -> None:
         stranger = Authority(authority.certificate.parent, "stranger")
         access = Access(*authority.issue("robot"), client_ca=authority.certificate)
         with Publisher("exo", STREAMS, endpoint("tls"), access) as publisher:
@@ -149,21 +149,19 @@ class TestLoopback:
             spy = trusting(authority, stranger.issue("spy"))
             assert not anybody_hears(publisher, (spy, None), (trusting(authority), None))
 
-    def test_quic_lets_in_who_has_certificate_and_password_and_nobody_else(
-        self, authority: Authority, users: Path
-    ) -> None:
+    def test_quic_accepts_only_clients_with_certificate_and_password(self, authority: Authority, users: Path) -> None:
         access = Access(*authority.issue("robot"), client_ca=authority.certificate, users=users)
         desk, lab = trusting(authority, authority.issue("desk")), user("lab", "secret")
         with Publisher("exo", STREAMS, endpoint("quic"), access) as publisher:
             assert hears(publisher, desk | lab)
             assert not anybody_hears(publisher, (desk, None), (trusting(authority) | lab, None))
 
-    def test_users_without_tls(self, users: Path) -> None:
+    def test_tcp_with_users_requires_a_password(self, users: Path) -> None:
         with Publisher("exo", STREAMS, endpoint("tcp"), Access(users=users)) as publisher:
             assert hears(publisher, user("lab", "secret"))
             assert not hears(publisher, {})
 
-    def test_who_is_let_in_still_cannot_put(self, authority: Authority, users: Path) -> None:
+    def test_accepted_client_cannot_put(self, authority: Authority, users: Path) -> None:
         with (
             Publisher("exo", STREAMS, endpoint("tls"), Access(*authority.issue("robot"), users=users)) as publisher,
             publisher._session.declare_subscriber("**", zenoh.handlers.FifoChannel(1000)) as inside,
@@ -175,7 +173,7 @@ class TestLoopback:
             publisher.put("imu", b"ours", 0, 0)
             assert {sample.payload.to_bytes() for sample in iter(inside.try_recv, None)} == {b"ours"}
 
-    def test_the_default_endpoint_speaks_tls_when_there_is_a_certificate(self, authority: Authority) -> None:
+    def test_default_endpoint_uses_tls_with_a_certificate(self, authority: Authority) -> None:
         with Publisher("exo", STREAMS, None, Access(*authority.issue("robot"))) as publisher:
             assert publisher.endpoint.startswith("tls/127.0.0.1:")
 
@@ -190,7 +188,7 @@ class TestTelemetryFile:
         (folder / "telemetry.toml").write_text(text)
         return load_telemetry_file(folder / "telemetry.toml")
 
-    def test_says_what_the_configuration_needs(self, folder: Path) -> None:
+    def test_telemetry_file_gives_the_configuration(self, folder: Path) -> None:
         read = self.read(
             folder,
             'robot = "blue"\nlisten = "tls/127.0.0.1:7448"\ncertificate = "robot.pem"\nprivate_key = "robot.key"\n'
@@ -219,7 +217,7 @@ class TestTelemetryFile:
             ("listen", "telemetry.toml: "),
         ],
     )
-    def test_refuses_what_is_wrong_and_names_the_key(self, folder: Path, text: str, said: str) -> None:
+    def test_invalid_telemetry_file_is_rejected_with_its_key(self, folder: Path, text: str, said: str) -> None:
         (folder / "open.key").touch(0o644)
         (folder / "empty").touch(0o600)
         with pytest.raises(AccessError) as refused:
@@ -282,7 +280,7 @@ class TestTelemetryFile:
 
     @pytest.mark.parametrize("host", ["127.0.0.1", "[::1]", "robot-7.lab.example"])
     @pytest.mark.parametrize(("protocols", "files"), [(("tcp",), ()), (("tls", "quic"), ("robot.pem", "robot.key"))])
-    def test_addresses_and_names_of_hosts_are_accepted(
+    def test_host_names_and_addresses_are_accepted(
         self, folder: Path, host: str, protocols: tuple[str, ...], files: tuple[str, ...]
     ) -> None:
         access = Access(*(folder / name for name in files))
@@ -290,12 +288,12 @@ class TestTelemetryFile:
             access.check_endpoint(f"{protocol}/{host}:7447")
 
     @pytest.mark.parametrize("content", ["lab", "lab:", ":secret", "lab:secret\n\nother:x"])
-    def test_refuses_users_that_are_none(self, users: Path, content: str) -> None:
+    def test_invalid_user_file_is_rejected(self, users: Path, content: str) -> None:
         users.write_text(content)
         with pytest.raises(AccessError, match="name:password"):
             Access(users=users)
 
-    def test_f54_the_command_line_refuses_it_before_anything_moves(self, folder: Path) -> None:
+    def test_f54_invalid_telemetry_file_is_rejected_before_the_run(self, folder: Path) -> None:
         (folder / "telemetry.toml").write_text("lisen = 1")
         arguments = ["demo", "--telemetry", str(folder / "telemetry.toml"), "--out", str(folder / "run")]
         result = CliRunner().invoke(cli, arguments)
@@ -317,7 +315,7 @@ class TestCommand:
         ],
         ids=["plain", "users", "tls", "everything"],
     )
-    def test_a_run_ends_well_and_a_subscriber_gets_its_messages(
+    def test_subscriber_gets_the_messages_of_a_run(
         self, keys: tuple[str, ...], authority: Authority, users: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         folder, transport = users.parent, {}
@@ -361,12 +359,12 @@ class TestCommand:
         assert min(counts.values()) > 0
 
 
-def test_a_configuration_made_in_code_is_checked_as_well() -> None:
+def test_configuration_from_code_is_checked() -> None:
     with pytest.raises(TelemetryError, match="unless certificate and private_key are given"):
         TelemetryConfig(listen="tls/127.0.0.1:7447")
 
 
-def test_a_configuration_made_in_code_is_protected_by_its_certificate(authority: Authority) -> None:
+def test_configuration_from_code_with_certificate_requires_tls_or_quic(authority: Authority) -> None:
     certificate, key = authority.issue("robot")
     with pytest.raises(TelemetryError, match="listen must be tls/HOST:PORT or quic/HOST:PORT"):
         TelemetryConfig(listen="udp/127.0.0.1:7447", certificate=certificate, private_key=key)

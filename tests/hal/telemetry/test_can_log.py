@@ -48,7 +48,7 @@ def read(path: Path) -> list[can.Message]:
 
 class TestFormats:
     @pytest.mark.parametrize("suffix", FORMATS)
-    def test_every_frame_comes_back(self, suffix: str, network: atalante_dbc.Network, tmp_path: Path) -> None:
+    def test_every_frame_is_read_back(self, suffix: str, network: atalante_dbc.Network, tmp_path: Path) -> None:
         path = tmp_path / "logs" / f"run{suffix}"
         frames = random_frames(network, 500)
         stamps = np.arange(500) * 1_000_000 + 5_000_000_000
@@ -74,7 +74,7 @@ class TestFormats:
         times = np.array([message.timestamp - first for message in found])
         np.testing.assert_allclose(times, np.arange(500) * 1e-3, atol=2e-6)
 
-    def test_classic_extended_remote_and_error_frames_stay_what_they_are(
+    def test_classic_extended_remote_and_error_frames_keep_their_kind(
         self, network: atalante_dbc.Network, tmp_path: Path
     ) -> None:
         frames = new_frames(5)
@@ -96,9 +96,7 @@ class TestFormats:
         assert {message.channel for message in found if not message.is_error_frame} == {"foreign"}
 
     @pytest.mark.parametrize("suffix", [".log", ".blf"])
-    def test_the_same_frames_make_the_same_bytes(
-        self, suffix: str, network: atalante_dbc.Network, tmp_path: Path
-    ) -> None:
+    def test_same_frames_give_the_same_file(self, suffix: str, network: atalante_dbc.Network, tmp_path: Path) -> None:
         frames = random_frames(network, 2000)
         for name in ("one", "two"):
             with open_log(tmp_path / f"{name}{suffix}", network) as log:
@@ -106,16 +104,18 @@ class TestFormats:
         assert (tmp_path / f"one{suffix}").read_bytes() == (tmp_path / f"two{suffix}").read_bytes()
 
     @pytest.mark.parametrize("name", ["run.db", "run.csv", "run.trc", "run.blf.gz", "run.txt", "run", "run.log.bz2"])
-    def test_formats_that_lose_frames_are_refused_with_those_that_do_not(self, name: str, tmp_path: Path) -> None:
+    def test_lossy_format_is_rejected_with_the_valid_formats(self, name: str, tmp_path: Path) -> None:
         with pytest.raises(SinkError, match=r"end its name in one of \.log, \.asc, \.blf"):
             check_format(tmp_path / name)
 
-    def test_a_file_that_cannot_be_made_is_a_sentence(self, network: atalante_dbc.Network, tmp_path: Path) -> None:
+    def test_file_that_cannot_be_created_gives_an_error_message(
+        self, network: atalante_dbc.Network, tmp_path: Path
+    ) -> None:
         (tmp_path / "file").touch()
         with pytest.raises(SinkError, match="cannot be created"):
             open_log(tmp_path / "file" / "run.log", network)
 
-    def test_a_full_disk_is_a_sentence(self, network: atalante_dbc.Network, tmp_path: Path) -> None:
+    def test_full_disk_gives_an_error_message(self, network: atalante_dbc.Network, tmp_path: Path) -> None:
         path = tmp_path / "full.log"
         path.symlink_to("/dev/full")
         frames = random_frames(network, 1000)
@@ -155,7 +155,7 @@ class TestTap:
         assert sent.tolist() == [0] * 22 + [1] * 7
 
     @pytest.mark.parametrize("count", [0, 1, FRAMES_PER_RECORD, FRAMES_PER_RECORD + 1, 3 * FRAMES_PER_RECORD + 5])
-    def test_a_flood_takes_as_many_records_as_it_needs(self, network: atalante_dbc.Network, count: int) -> None:
+    def test_many_frames_are_split_into_several_records(self, network: atalante_dbc.Network, count: int) -> None:
         frames = random_frames(network, max(count, 1))
         stamps = np.arange(max(count, 1))
         with RingWriter(FRAME_RECORD.itemsize, 16) as ring, RingReader(os.dup(ring.fd)) as reader:
@@ -169,7 +169,7 @@ class TestTap:
                 assert found.tobytes() == frames[:count].tobytes()
                 assert times.tolist() == list(range(count))
 
-    def test_the_array_may_change_after_the_call(self, network: atalante_dbc.Network) -> None:
+    def test_array_may_be_overwritten_after_the_call(self, network: atalante_dbc.Network) -> None:
         frames = random_frames(network, 3)
         kept = frames.tobytes()
         with RingWriter(FRAME_RECORD.itemsize, 4) as ring, RingReader(os.dup(ring.fd)) as reader:
@@ -179,7 +179,7 @@ class TestTap:
             tap.flush()
             assert self.emptied(reader)[0].tobytes() == kept
 
-    def test_a_new_run_does_not_move_the_frames_of_the_last(self, network: atalante_dbc.Network) -> None:
+    def test_new_run_keeps_the_time_stamps_of_earlier_frames(self, network: atalante_dbc.Network) -> None:
         frames = random_frames(network, 1)
         with RingWriter(FRAME_RECORD.itemsize, 4) as ring, RingReader(os.dup(ring.fd)) as reader:
             tap = RingTap(ring, lambda: 7)

@@ -53,7 +53,7 @@ def decoded(encoder: Encoder, key: str, record: np.ndarray, start_ns: int = 0) -
 
 
 class TestSchema:
-    def test_the_committed_descriptor_set_is_that_of_the_proto_file(self, tmp_path: Path) -> None:
+    def test_committed_descriptor_set_matches_the_proto_file(self, tmp_path: Path) -> None:
         """By the command that the file itself gives."""
         folder, made = schema.DESCRIPTORS.parent, tmp_path / "messages.binpb"
         text = (folder / "messages.proto").read_text()
@@ -66,7 +66,7 @@ class TestSchema:
         regenerated = descriptor_pb2.FileDescriptorSet.FromString(made.read_bytes())
         assert ours == [file for file in regenerated.file if file.name == "messages.proto"]
 
-    def test_it_brings_its_imports_before_what_needs_them(self) -> None:
+    def test_descriptor_set_lists_imports_before_their_users(self) -> None:
         seen: set[str] = set()
         for file in descriptor_pb2.FileDescriptorSet.FromString(schema.descriptor_set()).file:
             assert set(file.dependency) <= seen
@@ -85,10 +85,10 @@ class TestSchema:
     def test_severities_are_in_the_order_of_the_enum(self) -> None:
         assert [value.name for value in _enum("Severity")] == [f"SEVERITY_{name.upper()}" for name in SEVERITIES]
 
-    def test_the_encoding_names_the_message(self) -> None:
+    def test_encoding_names_the_message(self) -> None:
         assert schema.encoding("JointStates") == "application/protobuf;atalante.v1.JointStates"
 
-    def test_an_unknown_message_is_a_key_error(self) -> None:
+    def test_unknown_message_raises_key_error(self) -> None:
         with pytest.raises(KeyError):
             schema.message_class("Nothing")
 
@@ -110,7 +110,7 @@ class TestStreams:
             assert message.timestamp.seconds * NANOSECONDS + message.timestamp.nanos == start + 1_234_000_000
             assert 0 <= message.timestamp.nanos < NANOSECONDS
 
-    def test_joint_states(self, layout: Layout, record: np.ndarray) -> None:
+    def test_joint_states_contain_the_recorded_values(self, layout: Layout, record: np.ndarray) -> None:
         message = decoded(Encoder(layout), "joint_states", record)
         assert list(message.name) == list(JOINTS)
         for field, name in {
@@ -123,7 +123,7 @@ class TestStreams:
         }.items():
             assert list(getattr(message, field)) == record[layout[name]].tolist(), field
 
-    def test_imus(self, layout: Layout, record: np.ndarray) -> None:
+    def test_imu_states_contain_the_recorded_values(self, layout: Layout, record: np.ndarray) -> None:
         message = decoded(Encoder(layout), "imu", record)
         assert [imu.name for imu in message.imu] == list(IMUS)
         for place, imu in enumerate(message.imu):
@@ -132,20 +132,20 @@ class TestStreams:
             assert [rate.x, rate.y, rate.z] == record[layout["imu_gyro"]].reshape(4, 3)[place].tolist()
             assert [force.x, force.y, force.z] == record[layout["imu_accel"]].reshape(4, 3)[place].tolist()
 
-    def test_foot_forces(self, layout: Layout, record: np.ndarray) -> None:
+    def test_foot_forces_contain_the_recorded_values(self, layout: Layout, record: np.ndarray) -> None:
         message = decoded(Encoder(layout), "foot_forces", record)
         assert [foot.name for foot in message.foot] == list(FEET)
         assert all(list(foot.cell) == list(CELLS) for foot in message.foot)
         forces = [[[force.x, force.y, force.z] for force in foot.force] for foot in message.foot]
         assert forces == record[layout["foot_force"]].reshape(2, 4, 3).tolist()
 
-    def test_haptics(self, layout: Layout, record: np.ndarray) -> None:
+    def test_haptics_contain_the_recorded_values(self, layout: Layout, record: np.ndarray) -> None:
         message = decoded(Encoder(layout), "haptics", record)
         assert list(message.name) == list(MOTORS)
         assert list(message.amplitude) == record[layout["vibration"]].tolist()
         assert list(message.commanded_amplitude) == record[layout["vibration_command"]].tolist()
 
-    def test_guide(self, layout: Layout, record: np.ndarray) -> None:
+    def test_guide_contains_the_values_of_the_swing_leg(self, layout: Layout, record: np.ndarray) -> None:
         message = decoded(Encoder(layout), "guide", record)
         assert list(message.name) == ["left_SH", "left_SK"]  # right stance: the left leg swings
         for field, name in {"error": "error", "bound": "q_bound", "h": "h", "lambda": "lambda"}.items():
@@ -157,14 +157,14 @@ class TestStreams:
         record[layout["controller.stance"]] = 0.0
         assert list(decoded(Encoder(layout), "guide", record).name) == ["right_SH", "right_SK"]
 
-    def test_what_no_message_knows_goes_into_controller(self, layout: Layout, record: np.ndarray) -> None:
+    def test_other_controller_fields_are_in_the_controller_message(self, layout: Layout, record: np.ndarray) -> None:
         message = decoded(Encoder(layout), "controller", record)
         fields = {field.name: list(field.value) for field in message.field}
         assert fields == {name: record[layout[f"controller.{name}"]].tolist() for name in fields}
         known = {"q_des", "error", "q_bound", "h", "lambda", "filter_active", "step", "phase", "stance"}
         assert set(fields) == {name for name, _ in AirwalkController.telemetry_fields} - known
 
-    def test_another_controller_has_no_guide_but_all_its_fields(
+    def test_controller_without_a_guide_publishes_all_its_fields(
         self, network: atalante_dbc.Network, robot: Robot
     ) -> None:
         layout = Hal(network, robot, lockstep_pair()[0], controller_fields=[("h", 2), ("gain", 1)]).layout
@@ -173,11 +173,11 @@ class TestStreams:
         message = decoded(encoder, "controller", np.arange(layout.size, dtype=float))
         assert [field.name for field in message.field] == ["h", "gain"]
 
-    def test_no_controller_no_controller_stream(self, network: atalante_dbc.Network, robot: Robot) -> None:
+    def test_no_controller_stream_without_a_controller(self, network: atalante_dbc.Network, robot: Robot) -> None:
         keys = [key for key, _ in Encoder(Hal(network, robot, lockstep_pair()[0]).layout).keys]
         assert keys == ["joint_states", "imu", "foot_forces", "haptics", "system", "loop"]
 
-    def test_system(self, layout: Layout, record: np.ndarray) -> None:
+    def test_system_state_contains_run_state_and_diagnostics(self, layout: Layout, record: np.ndarray) -> None:
         message = decoded(Encoder(layout, ["NODES_WELL", "DRIVES_ENABLED", "DEAD_MAN"]), "system", record)
         assert (message.run, message.run_name) == (2, "pinched")
         assert message.supervisor == SupervisorState.ACTIVE
@@ -185,7 +185,7 @@ class TestStreams:
         assert message.diagnostics == 5
         assert list(message.diagnostic) == ["NODES_WELL", "DEAD_MAN"]
 
-    def test_a_message_shows_nothing_of_the_one_before(self, layout: Layout, record: np.ndarray) -> None:
+    def test_encoder_keeps_no_values_of_the_last_message(self, layout: Layout, record: np.ndarray) -> None:
         used, empty = Encoder(layout, ["NODES_WELL"]), np.zeros_like(record)
         for stream in used.streams:
             decoded(used, stream.key, record)
@@ -193,7 +193,7 @@ class TestStreams:
 
 
 class TestLoop:
-    def test_mean_and_worst_of_the_window_and_counts_of_its_end(self, layout: Layout) -> None:
+    def test_loop_statistics_contain_mean_maximum_and_counts(self, layout: Layout) -> None:
         encoder = Encoder(layout)
         records = np.zeros((4, layout.size))
         records[:, layout["cycle"].start] = range(4)
@@ -213,7 +213,7 @@ class TestLoop:
         assert (second.cycles, second.frames) == (1, 80)
         assert (second.cost_max, second.lateness_max) == (pytest.approx(30e-6), 0.0)
 
-    def test_an_empty_window_is_not_a_division_by_zero(self, layout: Layout) -> None:
+    def test_empty_window_has_mean_zero(self, layout: Layout) -> None:
         assert self._decoded(Encoder(layout), np.zeros(layout.size), lost=0).cost_mean == 0.0
 
     @staticmethod
@@ -225,21 +225,21 @@ class TestLoop:
 class TestEvents:
     EVENT = Event(42, "NODE_TIMEOUT", "IMU_TORSO was not heard for 5 cycles", "error", "IMU_TORSO", 5.0)
 
-    def test_every_field_arrives(self, layout: Layout) -> None:
+    def test_event_message_contains_every_field(self, layout: Layout) -> None:
         message = schema.message_class("Event").FromString(Encoder(layout).event(self.EVENT, 3 * NANOSECONDS + 7))
         assert (message.timestamp.seconds, message.timestamp.nanos, message.cycle) == (3, 7, 42)
         assert (message.severity, message.code, message.node) == (2, "NODE_TIMEOUT", "IMU_TORSO")
         assert (message.value, message.text) == (5.0, self.EVENT.text)
 
-    def test_packing_keeps_it(self) -> None:
+    def test_event_is_unchanged_by_pack_and_unpack(self) -> None:
         assert unpack(pack(self.EVENT, 77)) == (self.EVENT, 77)
 
-    def test_too_long_a_text_is_cut_never_broken(self) -> None:
+    def test_long_text_is_cut_at_a_character(self) -> None:
         event, _ = unpack(pack(Event(1, "C" * 60, "é" * 300), 0))
         assert set(event.code) == {"C"}
         assert set(event.text) == {"é"}
         assert len(event.text) == 108
 
-    def test_an_unknown_severity_is_refused_with_the_valid_ones(self) -> None:
+    def test_unknown_severity_is_rejected_with_the_valid_ones(self) -> None:
         with pytest.raises(ValueError, match="info, warning, error"):
             Event(1, "X", "y", "fatal")

@@ -70,7 +70,7 @@ def drain(subscriber: Any) -> list[zenoh.Sample]:
 class TestSubscribers:
     @pytest.mark.parametrize("mode", ["client", "peer"])
     @pytest.mark.parametrize("key", ["atalante/exo/joint_states", "atalante/*/joint_states", "atalante/**", "**"])
-    def test_get_typed_messages_by_key_and_by_wildcard(self, publisher: Publisher, key: str, mode: str) -> None:
+    def test_subscriber_gets_typed_messages_by_key_or_wildcard(self, publisher: Publisher, key: str, mode: str) -> None:
         with client(publisher, mode) as session, session.declare_subscriber(key) as subscriber:
 
             def received() -> list[zenoh.Sample]:
@@ -85,7 +85,7 @@ class TestSubscribers:
             assert sample.priority == zenoh.Priority.REAL_TIME
             assert sample.congestion_control == zenoh.CongestionControl.DROP
 
-    def test_late_ones_get_the_events_from_before(self, publisher: Publisher) -> None:
+    def test_late_subscriber_gets_earlier_events(self, publisher: Publisher) -> None:
         for number in range(5):
             publisher.put("events", b"%d" % number, 0, 0)
         with (
@@ -105,7 +105,7 @@ class TestSubscribers:
             until(three)
             assert got == [b"2", b"3", b"4"]
 
-    def test_a_stopped_one_is_not_waited_for_and_comes_back(self, publisher: Publisher) -> None:
+    def test_stopped_subscriber_does_not_block_and_can_resume(self, publisher: Publisher) -> None:
         program = (
             "import sys, zenoh\n"
             "config = zenoh.Config.from_json5(sys.argv[1])\n"
@@ -174,12 +174,12 @@ class TestWalls:
             until(ended)
             return [sample.payload.to_bytes() for sample in drain(inside)], seen
 
-    def test_forged_puts_are_stopped(self, publisher: Publisher) -> None:
+    def test_foreign_puts_are_rejected(self, publisher: Publisher) -> None:
         inside, seen = self.forge(publisher, 200)
         assert set(inside) == {b"ours", b"end"}
         assert set(seen) == {b"ours", b"end"}
 
-    def test_it_is_the_access_control_that_stops_them(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_foreign_puts_arrive_without_access_control(self, monkeypatch: pytest.MonkeyPatch) -> None:
         def open_door(robot: str, listen: str) -> dict[str, Any]:
             return {**configuration(robot, listen), "access_control": {"enabled": False}}
 
@@ -188,7 +188,7 @@ class TestWalls:
             inside, _ = self.forge(publisher, 200)
             assert inside.count(b"forged") > 0
 
-    def test_it_listens_on_the_loopback_and_nowhere_else(self, publisher: Publisher) -> None:
+    def test_publisher_listens_only_on_the_loopback(self, publisher: Publisher) -> None:
         port = int(publisher.endpoint.rsplit(":", 1)[1])
         listening = [local for local, state in sockets("tcp", "tcp6") if state == "0A"]
         assert [local for local in listening if local.endswith(f":{port:04X}")] == [f"0100007F:{port:04X}"]
@@ -209,15 +209,15 @@ def sockets(*kinds: str) -> list[tuple[str, str]]:
 
 
 class TestEndpoint:
-    def test_a_taken_one_that_was_asked_for_is_a_sentence(self, publisher: Publisher) -> None:
+    def test_requested_port_in_use_gives_an_error_message(self, publisher: Publisher) -> None:
         with pytest.raises(SinkError, match=r"cannot listen on tcp/127\.0\.0\.1:\d+: the port is taken; give another"):
             Publisher("exo", STREAMS, publisher.endpoint)
 
-    def test_one_that_is_none_is_a_sentence(self) -> None:
+    def test_invalid_endpoint_gives_an_error_message(self) -> None:
         with pytest.raises(SinkError, match="cannot listen on nonsense"):
             Publisher("exo", STREAMS, "nonsense")
 
-    def test_without_asking_it_is_the_next_free_port(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_default_endpoint_is_the_next_free_port(self, monkeypatch: pytest.MonkeyPatch) -> None:
         with socket.socket() as taken:
             taken.bind(("127.0.0.1", 0))
             taken.listen()
@@ -228,7 +228,7 @@ class TestEndpoint:
                 assert host == "tcp/127.0.0.1"
                 assert port < int(found) < port + publisher_module.PORTS_TRIED
 
-    def test_no_free_port_is_a_sentence(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_no_free_port_gives_an_error_message(self, monkeypatch: pytest.MonkeyPatch) -> None:
         with socket.socket() as taken:
             taken.bind(("127.0.0.1", 0))
             taken.listen()
@@ -238,7 +238,7 @@ class TestEndpoint:
                 Publisher("exo", STREAMS)
 
 
-def test_a_process_that_crashes_with_a_session_open_is_gone_and_leaves_nothing() -> None:
+def test_crashed_process_leaves_no_shared_memory() -> None:
     program = (
         "from atalante_hal.telemetry.publisher import Publisher\n"
         f"with Publisher('exo', [('imu', 'ImuStates')], 'tcp/127.0.0.1:{free_port()}') as publisher:\n"

@@ -35,7 +35,7 @@ def file_size_limit(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_messages_come_back_by_a_decoder_that_knows_nothing_of_ours(tmp_path: Path) -> None:
+def test_messages_are_read_back_by_a_generic_mcap_decoder(tmp_path: Path) -> None:
     path = tmp_path / "run" / "recording.mcap"
     with Recorder(path, STREAMS, {}) as recorder:
         for cycle in range(0, 5000, 10):
@@ -69,7 +69,7 @@ def test_session_and_runs_are_metadata(tmp_path: Path) -> None:
     }
 
 
-def test_a_killed_recorder_leaves_what_it_had_flushed(tmp_path: Path) -> None:
+def test_file_of_a_killed_recorder_contains_the_flushed_messages(tmp_path: Path) -> None:
     path = tmp_path / "recording.mcap"
     rng = np.random.default_rng(1)
     recorder = Recorder(path, STREAMS, {})
@@ -90,7 +90,7 @@ def test_a_killed_recorder_leaves_what_it_had_flushed(tmp_path: Path) -> None:
     assert len(cycles) > 10_000
 
 
-def test_a_full_disk_stops_the_recording_with_a_sentence(tmp_path: Path) -> None:
+def test_full_disk_stops_the_recording_with_an_error_message(tmp_path: Path) -> None:
     path = tmp_path / "recording.mcap"
     rng = np.random.default_rng(1)
 
@@ -108,7 +108,7 @@ def test_a_full_disk_stops_the_recording_with_a_sentence(tmp_path: Path) -> None
     assert path.stat().st_size <= 1_000_000
 
 
-def test_a_file_that_cannot_be_made_is_a_sentence(tmp_path: Path) -> None:
+def test_file_that_cannot_be_created_gives_an_error_message(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(SinkError, match="cannot be created: File exists"):
         Recorder(tmp_path / "file" / "recording.mcap", STREAMS, {})
@@ -116,7 +116,7 @@ def test_a_file_that_cannot_be_made_is_a_sentence(tmp_path: Path) -> None:
         Recorder(Path("/dev/full"), STREAMS, {})
 
 
-def test_closing_twice_is_closing_once(tmp_path: Path) -> None:
+def test_second_close_changes_nothing(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "recording.mcap", STREAMS, {})
     recorder.close()
     size = recorder.path.stat().st_size

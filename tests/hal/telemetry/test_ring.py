@@ -63,12 +63,12 @@ class TestOrder:
                 writer.write(payload)
             np.testing.assert_array_equal(reader.read(), sent)
 
-    def test_takes_a_vector_of_floats_as_it_is(self) -> None:
+    def test_vector_of_floats_is_written_unchanged(self) -> None:
         with ends() as (writer, reader):
             writer.write(np.array([1.5, -2.0, np.inf]))
             assert reader.read().view(np.float64).tolist() == [[1.5, -2.0, np.inf]]
 
-    def test_refuses_a_record_of_another_size(self) -> None:
+    def test_record_of_another_size_is_rejected(self) -> None:
         with ends() as (writer, reader):
             with pytest.raises(IndexError):
                 writer.write(record(1, SIZE + 8))
@@ -82,13 +82,13 @@ class TestOrder:
                 assert writer.last() == record(number)
 
     @pytest.mark.parametrize(("size", "slots"), [(0, 8), (8, 1)])
-    def test_refuses_sizes_that_cannot_be(self, size: int, slots: int) -> None:
+    def test_invalid_sizes_are_rejected(self, size: int, slots: int) -> None:
         with pytest.raises(RingError, match="must have 2 slots and 1 byte"):
             RingWriter(size, slots)
 
 
 class TestOverwriting:
-    def test_the_oldest_are_lost_and_counted(self) -> None:
+    def test_oldest_records_are_overwritten_and_counted(self) -> None:
         with ends(8) as (writer, reader):
             for number in range(20):
                 writer.write(record(number))
@@ -98,7 +98,7 @@ class TestOverwriting:
             assert numbers(reader.read()) == [20]
             assert writer.lost == 13
 
-    def test_read_plus_lost_is_written_whatever_the_pattern(self) -> None:
+    def test_read_and_lost_records_add_up_to_written(self) -> None:
         rng = np.random.default_rng(5)
         with ends(8) as (writer, reader):
             written, got = 0, []
@@ -110,7 +110,7 @@ class TestOverwriting:
                 assert len(got) + reader.lost == written == writer.written
         assert got == sorted(set(got))
 
-    def test_a_record_overwritten_while_it_is_copied_is_lost_not_mixed(self) -> None:
+    def test_record_overwritten_during_the_read_counts_as_lost(self) -> None:
         with ends(4) as (writer, reader):
             for number in range(3):
                 writer.write(record(number))
@@ -121,7 +121,7 @@ class TestOverwriting:
             assert numbers(reader.read()) == [3, 4]
             assert reader.lost == 2
 
-    def test_a_record_half_written_is_never_read(self) -> None:
+    def test_half_written_record_is_not_read(self) -> None:
         with ends(4) as (writer, reader):
             for number in range(6):
                 writer.write(record(number))
@@ -152,7 +152,7 @@ def _write_half(writer: RingWriter) -> None:
 
 
 class TestLossless:
-    def test_the_writer_waits_for_the_reader(self) -> None:
+    def test_lossless_writer_waits_for_the_reader(self) -> None:
         with ends(4, lossless=True, patience=60.0) as (writer, reader):
             got: list[int] = []
             full = threading.Event()
@@ -173,7 +173,7 @@ class TestLossless:
             assert writer.lossless
             assert writer.lost == 0
 
-    def test_a_reader_that_does_not_read_is_given_up_once(self) -> None:
+    def test_writer_stops_waiting_for_a_reader_that_does_not_read(self) -> None:
         with ends(4, lossless=True, patience=0.05) as (writer, reader):
             for number in range(100):
                 writer.write(record(number))
@@ -181,13 +181,13 @@ class TestLossless:
             assert numbers(reader.read()) == [97, 98, 99]
             assert reader.lost == 97
 
-    def test_nobody_waits_without_a_reader(self) -> None:
+    def test_writer_does_not_wait_without_a_reader(self) -> None:
         with RingWriter(SIZE, 4, lossless=True, patience=3600.0) as writer:
             for number in range(100):
                 writer.write(record(number))
             assert not writer.lossless
 
-    def test_nobody_waits_for_a_closed_reader(self) -> None:
+    def test_writer_does_not_wait_for_a_closed_reader(self) -> None:
         with RingWriter(SIZE, 4, lossless=True, patience=3600.0) as writer:
             RingReader(os.dup(writer.fd)).close()
             for number in range(100):
@@ -196,7 +196,7 @@ class TestLossless:
 
 
 class TestNotes:
-    def test_a_note_comes_with_the_number_of_the_record_that_follows(self) -> None:
+    def test_note_contains_the_number_of_the_next_record(self) -> None:
         with ends() as (writer, reader):
             writer.note({"run": 0})
             writer.write(record(0))
@@ -208,7 +208,7 @@ class TestNotes:
             writer.note({"run": 2})
             assert reader.notes() == [{"run": 2, "from": 2}]
 
-    def test_the_room_for_notes_is_bounded_and_full_is_said(self) -> None:
+    def test_note_beyond_the_limit_is_rejected(self) -> None:
         with ends() as (writer, reader):
             for _ in range(60):
                 writer.note({"text": "x" * 1000})
@@ -218,7 +218,7 @@ class TestNotes:
             assert len(reader.notes()) == 60
             assert numbers(reader.read()) == [7]
 
-    def test_meta_is_read_as_written(self) -> None:
+    def test_metadata_is_read_unchanged(self) -> None:
         meta = {"layout": [["position", 12]], "name": "é"}
         with RingWriter(SIZE, meta=meta) as writer, RingReader(os.dup(writer.fd)) as reader:
             assert reader.meta == meta
@@ -226,13 +226,13 @@ class TestNotes:
 
 
 class TestEnds:
-    def test_finish_is_seen(self) -> None:
+    def test_reader_sees_the_finish(self) -> None:
         with ends() as (writer, reader):
             assert not reader.closed
             writer.finish()
             assert reader.closed
 
-    def test_the_reader_outlives_the_writer(self) -> None:
+    def test_reader_can_read_after_the_writer_closed(self) -> None:
         writer = RingWriter(SIZE, 4)
         writer.write(record(3))
         reader = RingReader(os.dup(writer.fd))
@@ -242,14 +242,14 @@ class TestEnds:
             assert reader.closed
             assert numbers(reader.read()) == [3]
 
-    def test_a_file_that_is_no_ring_is_refused(self, tmp_path: Path) -> None:
+    def test_file_that_is_no_ring_is_rejected(self, tmp_path: Path) -> None:
         for size in (10, 4096):
             path = tmp_path / f"{size}"
             path.write_bytes(b"\1" * size)
             with pytest.raises(RingError, match="not a telemetry ring"):
                 RingReader(os.open(path, os.O_RDWR))
 
-    def test_it_has_no_name_that_could_be_left_behind(self) -> None:
+    def test_shared_memory_has_no_name(self) -> None:
         with RingWriter(SIZE, 4) as writer:
             link = os.readlink(f"/proc/self/fd/{writer.fd}")
         assert link.endswith("(deleted)")
@@ -307,7 +307,7 @@ def ask(child: subprocess.Popen[str]) -> list[str]:
 
 
 class TestAcrossProcesses:
-    def test_records_arrive(self) -> None:
+    def test_records_arrive_in_another_process(self) -> None:
         with RingWriter(SIZE, 8) as writer, reader_process(writer) as child:
             for number in range(5):
                 writer.write(record(number))
@@ -317,7 +317,7 @@ class TestAcrossProcesses:
             assert ask(child) == ["12", "13", "True"]
             assert writer.lost == 13
 
-    def test_a_reader_that_is_overtaken_all_the_time_reads_no_mixture(self) -> None:
+    def test_slow_reader_never_reads_mixed_records(self) -> None:
         size = 1 << 16
         payloads = [np.full(size // 8, number, "<i8") for number in range(16)]
         with RingWriter(size, 4) as writer, reader_process(writer, MIXTURES) as child:
@@ -330,11 +330,11 @@ class TestAcrossProcesses:
         assert lost > 0
         assert mixed == 0
 
-    def test_a_second_reader_is_refused(self) -> None:
+    def test_second_reader_is_rejected(self) -> None:
         with RingWriter(SIZE, 8) as writer, reader_process(writer), pytest.raises(RingError, match="one reader"):
             RingReader(os.dup(writer.fd))
 
-    def test_a_killed_reader_is_noticed_before_anybody_has_waited_for_it(self) -> None:
+    def test_writer_does_not_wait_for_a_killed_reader(self) -> None:
         with RingWriter(SIZE, 4, lossless=True, patience=3600.0) as writer, reader_process(writer) as child:
             assert writer.reader_alive
             child.send_signal(signal.SIGKILL)
@@ -344,7 +344,7 @@ class TestAcrossProcesses:
                 writer.write(record(number))
             assert not writer.lossless
 
-    def test_a_stopped_reader_is_alive_and_waited_for_no_longer_than_patience(self) -> None:
+    def test_wait_for_a_stopped_reader_times_out(self) -> None:
         with RingWriter(SIZE, 4, lossless=True, patience=0.05) as writer, reader_process(writer) as child:
             child.send_signal(signal.SIGSTOP)
             for number in range(100):
@@ -354,7 +354,7 @@ class TestAcrossProcesses:
             child.send_signal(signal.SIGCONT)
             assert ask(child) == ["3", "97", "True"]
 
-    def test_a_killed_writer_is_noticed_and_its_records_are_still_there(self) -> None:
+    def test_records_of_a_killed_writer_can_be_read(self) -> None:
         program = (
             "import os, signal, sys\n"
             "from atalante_hal.telemetry.ring import RingWriter\n"
@@ -382,7 +382,7 @@ def _wait_for_the_end(child: subprocess.Popen[str]) -> None:
     os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
 
 
-def test_the_loop_side_imports_no_network_recording_or_can_library() -> None:
+def test_control_process_imports_no_network_recording_or_can_library() -> None:
     program = (
         "import sys\n"
         "import atalante_hal.telemetry.process, atalante_hal.telemetry.ring, atalante_hal.record_layout\n"

@@ -103,9 +103,7 @@ def bench(layout: Layout, *sinks: tuple[Sink, int], slots: int = 4096, loop_ever
 
 class TestRates:
     @pytest.mark.parametrize(("every", "batch"), [(1, 7), (10, 1), (10, 64), (100, 300)])
-    def test_each_sink_gets_every_so_many_cycles_however_they_are_batched(
-        self, layout: Layout, every: int, batch: int
-    ) -> None:
+    def test_each_sink_gets_its_rate_for_every_batch_size(self, layout: Layout, every: int, batch: int) -> None:
         sink, other = Sink(), Sink()
         with bench(layout, (sink, every), (other, 50)) as at:
             for first in range(1, 600, batch):
@@ -130,7 +128,7 @@ class TestRates:
         assert [message.cost_max for message in found] == pytest.approx([40e-6, 400e-6, 40e-6])
         assert found[1].cost_mean == pytest.approx(43.6e-6)
 
-    def test_nothing_there_is_nothing_done(self, layout: Layout) -> None:
+    def test_step_without_records_sends_nothing(self, layout: Layout) -> None:
         sink = Sink()
         with bench(layout, (sink, 10)) as at:
             assert not at.service.step()
@@ -154,7 +152,7 @@ class TestRuns:
             (1, {"name": "pinched", "start_ns": 9_000_000_000, "shape": "pinched"}),
         ]
 
-    def test_a_run_without_records_yet_changes_nothing_for_the_one_before(self, layout: Layout) -> None:
+    def test_new_run_without_records_keeps_the_time_of_the_last_run(self, layout: Layout) -> None:
         sink = Sink()
         with bench(layout, (sink, 10)) as at:
             at.begin_run(0, "constant", 0)
@@ -174,7 +172,7 @@ class TestRuns:
 
 
 class TestEvents:
-    def test_they_go_to_every_sink_at_once_with_the_time_of_their_run(self, layout: Layout) -> None:
+    def test_events_go_to_every_sink_with_the_time_of_their_run(self, layout: Layout) -> None:
         one, other = Sink(), Sink()
         with bench(layout, (one, 10), (other, 100)) as at:
             at.begin_run(0, "constant", 0)
@@ -192,7 +190,7 @@ class TestEvents:
 
 
 class TestLosses:
-    def test_lost_cycles_are_reported_and_the_rest_goes_on(self, layout: Layout) -> None:
+    def test_lost_cycles_are_reported_and_later_cycles_are_published(self, layout: Layout) -> None:
         sink = Sink()
         with bench(layout, (sink, 10), slots=32) as at:
             at.write(range(1, 101))
@@ -204,7 +202,7 @@ class TestLosses:
         assert at.service.notices == [event.text]
 
     @pytest.mark.parametrize("fails_at", [0, 3, 7])
-    def test_a_sink_that_fails_is_left_out_and_the_others_are_told(self, layout: Layout, fails_at: int) -> None:
+    def test_failed_sink_is_removed_and_reported_to_the_others(self, layout: Layout, fails_at: int) -> None:
         broken, well = Sink(fails_at), Sink()
         with bench(layout, (broken, 10), (well, 10)) as at:
             at.write(range(1, 301))
@@ -215,7 +213,7 @@ class TestLosses:
         assert (event.code, event.text, event.severity) == ("RECORD_STOPPED", "the disk is full", 2)
         assert at.service.notices == ["the disk is full"]
 
-    def test_without_any_sink_left_the_ring_is_still_emptied(self, layout: Layout) -> None:
+    def test_ring_is_emptied_after_all_sinks_failed(self, layout: Layout) -> None:
         broken = Sink(0)
         with bench(layout, (broken, 10)) as at:
             at.write(range(1, 101))
@@ -224,7 +222,7 @@ class TestLosses:
 
 
 class TestEnd:
-    def test_run_ends_with_the_closed_ring_and_empties_it_first(self, layout: Layout) -> None:
+    def test_closed_ring_is_emptied_before_the_service_ends(self, layout: Layout) -> None:
         sink = Sink()
         with bench(layout, (sink, 10)) as at:
             at.write(range(1, 31))
@@ -232,7 +230,7 @@ class TestEnd:
             at.service.run(stop=[])
         assert sink.cycles("joint_states") == [10, 20, 30]
 
-    def test_run_ends_when_it_is_told_and_empties_the_ring_first(self, layout: Layout) -> None:
+    def test_ring_is_emptied_before_the_service_stops_on_request(self, layout: Layout) -> None:
         sink = Sink()
         with bench(layout, (sink, 10)) as at:
             at.write(range(1, 31))

@@ -31,19 +31,19 @@ BY_QUICK_STOP = {S.READY_TO_SWITCH_ON: S.SWITCH_ON_DISABLED, S.SWITCHED_ON: S.SW
 
 
 @pytest.mark.parametrize("number", STANDARD)
-def test_transition_of_the_standard(number: int):
+def test_transitions_follow_the_standard(number: int):
     before, command, after = STANDARD[number]
     assert next_state(before, command) is after
 
 
-def test_nothing_else_moves_a_drive():
+def test_other_controlwords_change_no_state():
     moves = {(before, command): after for before, command, after in STANDARD.values()}
     moves |= {(before, C.QUICK_STOP): after for before, after in BY_QUICK_STOP.items()}
     for state, byte in itertools.product(S, range(256)):
         assert next_state(state, byte) is moves.get((state, byte), state)
 
 
-def test_a_latched_hold_is_not_left_by_enable_operation_alone():
+def test_latched_hold_is_not_left_by_enable_operation():
     for byte in range(256):
         after = next_state(S.QUICK_STOP_ACTIVE, byte, latched=True)
         assert after is (S.SWITCH_ON_DISABLED if byte == C.DISABLE_VOLTAGE else S.QUICK_STOP_ACTIVE)
@@ -54,7 +54,7 @@ def test_latching_changes_no_other_state():
         assert next_state(state, byte, latched=True) is next_state(state, byte)
 
 
-def test_the_way_up_reaches_operation_from_every_state_that_has_one():
+def test_enable_sequence_reaches_operation_from_every_possible_state():
     for start in set(S) - {S.NOT_READY_TO_SWITCH_ON, S.FAULT_REACTION_ACTIVE}:
         state = start
         for _ in range(5):
@@ -64,5 +64,5 @@ def test_the_way_up_reaches_operation_from_every_state_that_has_one():
         assert controlword_towards_operation(state) is C.DISABLE_VOLTAGE
 
 
-def test_state_values_are_the_statusword_under_its_mask():
+def test_state_values_are_masked_statusword_bits():
     assert all(state & 0x6F == state for state in S)

@@ -74,7 +74,7 @@ def test_encode_agrees_with_cantools_bit_for_bit_on_random_images():
             assert frames["data"][row, : MESSAGES[row].length].tobytes() == expected
 
 
-def test_values_survive_a_round_trip_to_the_bit():
+def test_values_are_unchanged_by_encode_and_decode():
     codec = Codec(MESSAGES)
     frames, out, again = codec.template(), np.empty(codec.size), np.empty(codec.size)
     values = np.random.default_rng(3).uniform(*limits(codec))
@@ -87,7 +87,7 @@ def test_values_survive_a_round_trip_to_the_bit():
     assert np.all(np.abs(out - values) <= 0.5 * resolution * (1 + 1e-6))
 
 
-def test_values_outside_their_range_are_sent_as_the_nearest_valid_one():
+def test_values_out_of_range_are_sent_as_the_nearest_valid_value():
     codec = Codec(MESSAGES)
     low, high = limits(codec)
     frames, out = codec.template(), np.empty(codec.size)
@@ -97,7 +97,7 @@ def test_values_outside_their_range_are_sent_as_the_nearest_valid_one():
         assert np.allclose(out, expected, rtol=1e-12)
 
 
-def test_nan_is_sent_as_the_invalid_code_and_found_on_receipt():
+def test_nan_is_sent_as_invalid_code_and_received_as_invalid():
     for message in MESSAGES:
         codec = Codec([message])
         for signal in message.signals:
@@ -115,7 +115,7 @@ def test_nan_is_sent_as_the_invalid_code_and_found_on_receipt():
             assert codec.rows_outside() == [0]
 
 
-def test_every_raw_code_just_outside_its_range_is_found():
+def test_raw_codes_just_outside_their_range_are_reported():
     for message in MESSAGES:
         codec = Codec([message])
         for signal in message.signals:
@@ -134,7 +134,7 @@ def test_every_raw_code_just_outside_its_range_is_found():
                 assert not codec.decode(frames, np.empty(codec.size)), (message.name, signal.name, raw)
 
 
-def test_bits_no_signal_owns_are_sent_as_zero():
+def test_unused_bits_are_sent_as_zero():
     codec = Codec(MESSAGES)
     frames = codec.template()
     frames["data"] = 0xFF
@@ -147,7 +147,7 @@ def test_bits_no_signal_owns_are_sent_as_zero():
     assert not bits[~owned].any()
 
 
-def test_a_quantity_of_many_rows_is_one_slice_in_joint_order():
+def test_quantity_of_all_joints_is_one_slice_in_order():
     states = [m for m in NETWORK.received_by("HAL") if m.cycle_ms == 1]
     codec = Codec(states)
     positions = codec.signals[codec.slice("Position")]
@@ -165,7 +165,7 @@ def test_group_names():
     ]  # fmt: skip
 
 
-def test_unknown_names_are_answered_with_the_valid_ones():
+def test_unknown_name_error_lists_the_valid_names():
     codec = Codec(MESSAGES)
     with pytest.raises(KeyError, match="SYNC_LEFT_LEG"):
         codec.index("LEFT_KNEE", "Position")
@@ -177,7 +177,7 @@ def read_one(codec: Codec, row: int, frames, offset: int = 0) -> int:
     return read_row(frames.view(np.int64), offset, row, codec.table)
 
 
-def test_an_invalid_code_is_told_from_a_value_outside_its_range():
+def test_invalid_code_and_value_out_of_range_are_distinguished():
     message = load().message("LEFT_FH_STATE")
     codec = Codec([message])
     drive_state = next(s for s in message.signals if s.name == "DriveState")
@@ -191,7 +191,7 @@ def test_an_invalid_code_is_told_from_a_value_outside_its_range():
             assert read_one(codec, 0, frames) == expected, signal.name
 
 
-def test_a_row_alone_is_decoded_like_all_of_them_and_nothing_else_is_touched():
+def test_single_row_is_decoded_without_changing_other_rows():
     codec = Codec(MESSAGES)
     rng = np.random.default_rng(5)
     low, high = limits(codec)

@@ -77,7 +77,7 @@ def rows_of_frames() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return octets, protected_spans([SHORT, LONG]), np.array([7, 250])
 
 
-def test_spans_tell_where_the_payload_of_each_row_is():
+def test_spans_give_the_payload_of_each_row():
     spans = protected_spans([SHORT, LONG])
     assert spans.dtype == np.int64
     assert spans.tolist() == [[8, 8 + SHORT.length, SHORT.data_id], [80, 80 + LONG.length, LONG.data_id]]
@@ -86,7 +86,7 @@ def test_spans_tell_where_the_payload_of_each_row_is():
     assert frames.view(np.uint8)[spans[1, 0]] == 99
 
 
-def test_checksum_is_the_crc_of_the_payload_alone():
+def test_checksum_covers_only_the_payload():
     octets, spans, _ = rows_of_frames()
     for begin, end, data_id in spans.tolist():
         for ours in (data_id, 0, 0xFFFF, 0x0102):
@@ -95,7 +95,7 @@ def test_checksum_is_the_crc_of_the_payload_alone():
     assert checksum(octets, 0, 2, 0x1234) == crc(b"", data_id_bytes(0x1234))
 
 
-def test_protect_writes_three_bytes_a_row_and_nothing_else():
+def test_protect_changes_only_crc_and_counter_bytes():
     octets, spans, counters = rows_of_frames()
     before = octets.copy()
     protect(octets, spans, counters)
@@ -107,7 +107,7 @@ def test_protect_writes_three_bytes_a_row_and_nothing_else():
         assert oracle.p05.e2e_p05_check(payload, message.data_id)
 
 
-def test_rows_are_intact_only_if_every_byte_of_them_is():
+def test_every_changed_byte_makes_its_row_damaged():
     octets, spans, counters = rows_of_frames()
     assert not intact(octets, spans, counters)
     protect(octets, spans, counters)
@@ -121,7 +121,7 @@ def test_rows_are_intact_only_if_every_byte_of_them_is():
         assert intact(octets, spans, np.array(other)) is False
 
 
-def test_every_step_of_the_counter_is_judged():
+def test_every_counter_step_has_a_check_result():
     for last in (0, 1, 200, 255):
         for delta in range(256):
             judged = check_counter(last, (last + delta) & 0xFF)
@@ -153,7 +153,7 @@ def flips(chance: random.Random, kind: int, bits: int) -> int:
 
 
 @pytest.mark.exhaustive
-def test_frames_with_one_two_or_an_odd_number_of_flipped_bits_are_refused():
+def test_one_two_or_odd_numbers_of_flipped_bits_are_rejected():
     """100,000 of them, among all messages the HAL receives."""
     tx, _, _ = _received(CYCLIC)
     good = tx.seal().copy()
@@ -173,7 +173,7 @@ def test_frames_with_one_two_or_an_odd_number_of_flipped_bits_are_refused():
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("row", range(len(CYCLIC)), ids=[m.name for m in CYCLIC])
-def test_damaged_replayed_swapped_shortened_and_lengthened_frames_leave_the_values_alone(row):
+def test_rejected_frames_leave_the_values_unchanged(row):
     for kind, expected in (
         ("damaged", Check.CRC), ("replayed", Check.WRONG_SEQUENCE), ("repeated", Check.REPEATED),
         ("swapped", Check.CRC), ("shortened", Check.LENGTH), ("lengthened", Check.LENGTH), ("classic", Check.LENGTH),
@@ -214,7 +214,7 @@ def test_damaged_replayed_swapped_shortened_and_lengthened_frames_leave_the_valu
         assert (rx.age[others] == 0).all()
 
 
-def test_a_frame_under_another_messages_identifier_is_refused_for_every_pair_of_ids():
+def test_frame_with_the_identifier_of_another_message_is_rejected():
     for sender in NETWORK.messages:
         payload = bytes(range(3, 3 + sender.length - 2))
         value = crc(payload, data_id_bytes(sender.data_id))
@@ -233,13 +233,13 @@ def evidence_after(history: str, evidence: int = 0) -> int:
     return evidence
 
 
-def test_four_rival_cycles_in_a_row_are_full_evidence_and_clean_ones_take_it_away():
+def test_four_cycles_with_two_senders_are_full_evidence():
     assert [evidence_after("r" * n) for n in range(6)] == [0, 16, 32, 48, 64, 64]
     assert [evidence_after("c" * n, 64) for n in (1, 63, 64, 65)] == [63, 1, 0, 0]
     assert evidence_after("r" + "c" * 16) == 0
 
 
-def test_a_rival_in_every_other_cycle_is_full_evidence_too_and_one_in_seventeen_never():
+def test_second_sender_in_every_other_cycle_is_full_evidence():
     assert evidence_after("rc" * 4) == 60
     assert evidence_after("rc" * 4 + "r") == FULL
     assert evidence_after(("r" + "c" * 16) * 50) == 0
@@ -256,20 +256,20 @@ def after(history: str, start: Qualification | None = None) -> Qualification:
     return now
 
 
-def test_trust_takes_sixteen_good_cycles_in_a_row():
+def test_trust_requires_16_good_cycles_in_a_row():
     assert not after("g" * 15).trusted
     assert after("g" * 16).trusted
     assert not after("g" * 15 + "b" + "g" * 15).trusted
     assert after("g" * 15 + "b" + "g" * 16).trusted
 
 
-def test_a_perfect_sender_is_settled_and_stays_the_same_object():
+def test_good_cycle_of_a_settled_sender_returns_the_same_object():
     assert after("g" * 16) is SETTLED
     assert after("g" * 40) is SETTLED
     assert after("g" * 16) == (0, 16, True)
 
 
-def test_a_bad_cycle_fills_the_bucket_by_four_and_a_good_one_empties_it_by_one():
+def test_bad_cycle_fills_the_bucket_by_4_good_cycle_empties_by_1():
     now = after("b", SETTLED)
     assert now == (4, 0, True)
     assert after("ggg", now) == (1, 3, True)
@@ -278,13 +278,13 @@ def test_a_bad_cycle_fills_the_bucket_by_four_and_a_good_one_empties_it_by_one()
     assert after("g" * 16, now) is SETTLED
 
 
-def test_the_bucket_trips_when_it_is_full_and_not_before():
+def test_bucket_trips_exactly_when_it_is_full():
     assert after("b" * 15, SETTLED) == (60, 0, True)
     assert after("b" * 16, SETTLED) == (64, 0, False)
     assert after("b" * 40, SETTLED) == (64, 0, False)
 
 
-def test_what_tripped_is_trusted_again_after_sixteen_good_cycles():
+def test_tripped_sender_is_trusted_again_after_16_good_cycles():
     assert after("b" * 16 + "g" * 15, SETTLED) == (49, 15, False)
     assert after("b" * 16 + "g" * 16, SETTLED) == (48, 16, True)
     assert after("b" * 16 + "g" * 16 + "b" * 3, SETTLED).trusted
@@ -292,19 +292,19 @@ def test_what_tripped_is_trusted_again_after_sixteen_good_cycles():
 
 
 @pytest.mark.parametrize("cycle", "tT")
-def test_a_timeout_takes_the_trust_at_once_and_leaves_the_bucket(cycle: str):
+def test_timeout_clears_the_trust_and_keeps_the_bucket(cycle: str):
     assert after("bb" + cycle, SETTLED) == (8, 0, False)
     assert after(cycle + "g" * 15, SETTLED).trusted is False
     assert after(cycle + "g" * 16, SETTLED) is SETTLED
 
 
-def test_steady_loss_up_to_a_fifth_never_trips_and_above_it_does():
+def test_steady_loss_trips_only_above_20_percent():
     assert after("bgggg" * 500, SETTLED).trusted
     assert not after("bggg" * 500, SETTLED).trusted
 
 
 @given(st.text("gbtT", max_size=80))
-def test_laws_of_qualification(history: str):
+def test_qualification_keeps_its_invariants_for_any_history(history: str):
     now = Qualification()
     for place, cycle in enumerate(history):
         before, now = now, after(cycle, now)
@@ -316,7 +316,7 @@ def test_laws_of_qualification(history: str):
             assert cycle in "tT" or now.bucket == FULL
 
 
-def test_a_cycle_is_in_time_unless_it_is_said_to_be_late():
+def test_cycle_counts_as_in_time_by_default():
     before = Qualification(8, 3, True)
     assert qualify(before, good=True) == Qualification(7, 4, True)
     assert qualify(before, good=True, timed_out=True) == Qualification(8, 0, False)
