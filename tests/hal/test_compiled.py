@@ -1,4 +1,4 @@
-"""Machine code of hot loops: the same answers, errors like Python's, and nothing stale out of the cache."""
+"""Compiled functions: same results and errors as Python, and no outdated code from the cache."""
 
 from __future__ import annotations
 

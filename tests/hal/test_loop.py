@@ -1,4 +1,4 @@
-"""The loop: order of a cycle, clocks, and what an exception or a late cycle does."""
+"""Control loop: order of a cycle, clocks, and reactions to exceptions and late cycles."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ S = SupervisorState
 
 
 class Recorder:
-    """A controller that remembers what it was asked."""
+    """Controller that counts its calls, and fails at call `fail_at`."""
 
     telemetry_fields = (("calls", 1),)
 
@@ -39,12 +39,12 @@ class Recorder:
     def update(self, state):
         self.telemetry[0] += 1
         if self.telemetry[0] == self.fail_at:
-            raise ZeroDivisionError("a controller's mistake")
+            raise ZeroDivisionError("a fault of the controller")
         return Command(np.zeros(12), np.full(8, 0.5))
 
 
 class Late:
-    """A clock that is late when it is told."""
+    """Clock that is late in the given cycles."""
 
     def __init__(self, lateness: dict[int, float]) -> None:
         self.lateness, self.cycle = lateness, 0
@@ -80,7 +80,7 @@ def test_controller_exception_leads_to_hold_and_the_loop_continues(make_rig):
     rig = make_rig(controller_fields=Recorder.telemetry_fields)
     controller = Recorder(fail_at=10)
     run(rig.hal, controller, LockStep(), until=after(600))
-    assert "ZeroDivisionError: a controller's mistake" in next(
+    assert "ZeroDivisionError: a fault of the controller" in next(
         e.text for e in rig.hal.events if e.code == "CONTROLLER_ERROR"
     )
     assert controller.telemetry[0] == 10
@@ -142,7 +142,7 @@ def test_loop_slower_than_the_monotonic_clock_leads_to_hold(make_rig, busy, expe
     assert bool(overruns) is (expected is S.HOLD)
     if overruns:
         assert overruns[0].value > DRIFT_TO_HOLD
-        # 5 ms are lost after 5 ms / (busy - 1 ms) cycles; the next cycle notices, the one after holds.
+        # 5 ms are lost after 5 ms / (busy - 1 ms) cycles. The next cycle detects it, and the cycle after that is in HOLD.
         assert states.count(S.ACTIVE) <= DRIFT_TO_HOLD / (busy - 1e-3) + 3
 
 
@@ -150,10 +150,10 @@ def test_drift_is_the_time_lost_within_the_window():
     drift = Drift()
     assert drift.add(0.0) == 0.0
     assert drift.add(0.9e-3) == pytest.approx(0.9e-3)
-    assert drift.add(0.9e-3) == pytest.approx(0.9e-3), "the deadlines did not move: nothing more is lost"
+    assert drift.add(0.9e-3) == pytest.approx(0.9e-3), "the deadlines did not move: no more time is lost"
     assert drift.add(1.8e-3) == pytest.approx(1.8e-3)
     assert drift.add(GAP_TO_HOLD) == pytest.approx(1.8e-3 + GAP_TO_HOLD)
-    assert drift.add(2.0) == pytest.approx(1.8e-3 + GAP_TO_HOLD), "a gap is a diagnostic of its own"
+    assert drift.add(2.0) == pytest.approx(1.8e-3 + GAP_TO_HOLD), "a gap has its own diagnostic"
     for _ in range(DRIFT_CYCLES):
         lost = drift.add(0.0)
     assert lost == pytest.approx(0.0, abs=1e-12)
@@ -191,7 +191,7 @@ def test_keyboard_interrupt_leaves_the_hal_in_hold(make_rig):
     assert rig.hal.state.supervisor is S.HOLD
 
 
-@pytest.mark.parametrize("frozen", [False, True], ids=["nobody froze before", "the caller froze"])
+@pytest.mark.parametrize("frozen", [False, True], ids=["not frozen before", "frozen by the caller"])
 def test_garbage_collector_ignores_objects_from_before_the_run(make_rig, monkeypatch, frozen):
     collected = []
     monkeypatch.setattr(gc, "collect", lambda: collected.append("collect"))
@@ -233,7 +233,7 @@ def test_deadlines_are_absolute_and_missed_ones_are_skipped():
 
 
 def test_cycles_missed_by_a_late_wake_up_are_skipped():
-    """As a process that was stopped in its sleep."""
+    """The process is stopped while it sleeps."""
     now, oversleeps = [0.0], [0.0]
 
     def sleep(seconds: float) -> None:

@@ -1,4 +1,4 @@
-"""What the HAL makes of the operator's words."""
+"""Pendant input: dead-man, stop, START presses and assistance factor."""
 
 from __future__ import annotations
 
@@ -9,19 +9,21 @@ from hypothesis import strategies as st
 
 from atalante_dbc import load
 from atalante_hal.pendant import Demand, Pendant, demand_of, safest
+from atalante_hal.wire.codec import Codec
 from atalante_hal.wire.process_image import ReceiveImage
 
 NETWORK = load()
+#: The values of other messages surround those of the pendant.
+CODEC = Codec([NETWORK.message(name) for name in ("LEFT_SK_STATE", "PENDANT_STATE", "IMU_TORSO_STATE")])
 START, STOP, HOLD = 1, 2, 3
 
 
 @pytest.fixture
 def pendant() -> Pendant:
-    names = ("LEFT_SK_STATE", "PENDANT_STATE", "IMU_TORSO_STATE")  # there are values before and after the pendant's
-    return Pendant(ReceiveImage([NETWORK.message(name) for name in names]))
+    return Pendant(ReceiveImage(CODEC.messages))
 
 
-def say(
+def send(
     pendant: Pendant, dead_man: int = 1, request: int = 0, press: int = 0, factor: float = 0.0, factor_set: int = 0
 ):
     pendant.signals[:] = dead_man, request, press, factor, factor_set
@@ -40,67 +42,65 @@ def test_nothing_is_pressed_before_the_first_frame(pendant: Pendant):
 
 
 def test_dead_man_follows_its_signal(pendant: Pendant):
-    say(pendant, dead_man=1)
+    send(pendant, dead_man=1)
     assert pendant.dead_man
     assert pendant.heard == pendant.signals.tobytes()
-    say(pendant, dead_man=0)
+    send(pendant, dead_man=0)
     assert not pendant.dead_man
 
 
 @pytest.mark.parametrize("request_", [STOP, HOLD])
 def test_stop_and_hold_requests_last_as_long_as_they_are_sent(pendant: Pendant, request_: int):
-    say(pendant, request=request_)
+    send(pendant, request=request_)
     assert pendant.stop_requested
     assert not pendant.started
-    say(pendant, request=0)
+    send(pendant, request=0)
     assert not pendant.stop_requested
 
 
 def test_each_start_press_counts_once(pendant: Pendant):
-    say(pendant, request=START, press=4)  # pressed before anybody listened
+    send(pendant, request=START, press=4)  # pressed before the first frame
     assert not pendant.started
-    say(pendant, request=START, press=5)
+    send(pendant, request=START, press=5)
     assert pendant.started
     assert not pendant.stop_requested
-    say(pendant, request=START, press=5)
+    send(pendant, request=START, press=5)
     assert not pendant.started
-    say(pendant, request=STOP, press=6)
+    send(pendant, request=STOP, press=6)
     assert not pendant.started
-    say(pendant, request=START, press=255)
+    send(pendant, request=START, press=255)
     assert pendant.started
-    say(pendant, request=START, press=0)
+    send(pendant, request=START, press=0)
     assert pendant.started
 
 
 def test_presses_while_the_pendant_is_lost_do_not_count(pendant: Pendant):
-    say(pendant, request=STOP, press=1)
+    send(pendant, request=STOP, press=1)
     pendant.hear(False)
     assert [pendant.dead_man, pendant.stop_requested, pendant.started] == [False] * 3
     assert pendant.heard == b""
-    say(pendant, request=START, press=2)
+    send(pendant, request=START, press=2)
     assert pendant.dead_man
     assert not pendant.started
-    say(pendant, request=START, press=3)
+    send(pendant, request=START, press=3)
     assert pendant.started
     pendant.hear(False)
     assert not pendant.started
 
 
 def test_assistance_factor_follows_the_dial_only_while_it_is_set(pendant: Pendant):
-    say(pendant, factor=0.25, factor_set=1)
+    send(pendant, factor=0.25, factor_set=1)
     assert pendant.assistance_factor == 0.25
-    say(pendant, factor=0.25, factor_set=0)
+    send(pendant, factor=0.25, factor_set=0)
     assert pendant.assistance_factor is None
 
 
-def others(pendant: Pendant, *frames: tuple[int, int, int]) -> list[np.ndarray]:
-    """What further frames of a cycle say: dead-man, request and its counter each, as the image hands it over."""
-    image = np.zeros(pendant._slice.stop + 3)
-    said = []
-    for frame in frames:
-        image[pendant._slice] = *frame, 0.0, 0.0
-        said.append(image.copy())
-    return said
+def others(*frames: tuple[int, int, int]) -> list[np.ndarray]:
+    """Return the decoded values of further frames of a cycle, given dead-man, request and press counter of each."""
+    values = np.zeros((len(frames), CODEC.size))
+    columns = [CODEC.index("PENDANT_STATE", name) for name in ("DeadMan", "Request", "RequestCounter")]
+    values[:, columns] = frames
+    return list(values)
 
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=4))
@@ -120,21 +120,21 @@ def test_unknown_request_counts_as_stop(request_: int, stop: bool):
 
 def test_safest_of_several_frames_counts_in_its_cycle(pendant: Pendant):
     pendant.signals[:] = 1, 0, 0, 0.5, 1
-    pendant.hear(True, beside=others(pendant, (1, STOP, 0)))
+    pendant.hear(True, beside=others((1, STOP, 0)))
     assert (pendant.dead_man, pendant.stop_requested) == (True, True)
-    pendant.hear(True, beside=others(pendant, (1, 0, 0), (0, 0, 0)))
+    pendant.hear(True, beside=others((1, 0, 0), (0, 0, 0)))
     assert (pendant.dead_man, pendant.stop_requested) == (False, False)
     pendant.hear(True)
     assert (pendant.dead_man, pendant.stop_requested, pendant.assistance_factor) == (True, False, 0.5)
     pendant.signals[:2] = 0, STOP
-    pendant.hear(True, beside=others(pendant, (1, 0, 0)))
+    pendant.hear(True, beside=others((1, 0, 0)))
     assert (pendant.dead_man, pendant.stop_requested) == (False, True)
 
 
 def test_press_in_a_cycle_with_different_frames_counts_one_cycle_later(pendant: Pendant):
-    say(pendant, press=3)
+    send(pendant, press=3)
     pendant.signals[:3] = 1, START, 4
-    pendant.hear(True, beside=others(pendant, (1, 0, 3)))
+    pendant.hear(True, beside=others((1, 0, 3)))
     assert not pendant.started
     pendant.hear(True)
     assert pendant.started
@@ -143,11 +143,11 @@ def test_press_in_a_cycle_with_different_frames_counts_one_cycle_later(pendant: 
 
 
 def test_press_of_a_second_sender_does_not_count(pendant: Pendant):
-    say(pendant, request=START, press=3)
+    send(pendant, request=START, press=3)
     pendant.signals[:3] = 1, START, 9
-    pendant.hear(True, beside=others(pendant, (1, START, 3)))
+    pendant.hear(True, beside=others((1, START, 3)))
     assert not pendant.started
-    say(pendant, request=START, press=3)
+    send(pendant, request=START, press=3)
     assert not pendant.started
 
 
@@ -164,16 +164,16 @@ def test_press_before_qualification_counts_once_after_it(pendant: Pendant):
     qualify(pendant, press=6)
     for _ in range(10):
         qualify(pendant, request=START, press=7)
-    say(pendant, request=START, press=7)
+    send(pendant, request=START, press=7)
     assert pendant.started
-    say(pendant, request=START, press=7)
+    send(pendant, request=START, press=7)
     assert not pendant.started
 
 
 def test_press_counter_of_the_first_frame_is_no_press(pendant: Pendant):
     for _ in range(20):
         qualify(pendant, request=START, press=7)
-    say(pendant, request=START, press=7)
+    send(pendant, request=START, press=7)
     assert not pendant.started
 
 
@@ -183,7 +183,7 @@ def test_press_released_before_qualification_does_not_count(pendant: Pendant, ta
     qualify(pendant, request=START, press=7)
     qualify(pendant, *taken_back)
     qualify(pendant, request=START, press=taken_back[2])
-    say(pendant, request=START, press=taken_back[2])
+    send(pendant, request=START, press=taken_back[2])
     assert not pendant.started
 
 
@@ -191,7 +191,7 @@ def test_press_without_dead_man_is_not_kept(pendant: Pendant):
     qualify(pendant, dead_man=0, press=6)
     qualify(pendant, dead_man=0, request=START, press=7)
     qualify(pendant, request=START, press=7)
-    say(pendant, request=START, press=7)
+    send(pendant, request=START, press=7)
     assert not pendant.started
 
 
@@ -199,9 +199,9 @@ def test_press_without_dead_man_is_not_kept(pendant: Pendant):
 def test_stop_of_a_second_sender_clears_a_kept_press(pendant: Pendant, beside: tuple[int, int, int]):
     qualify(pendant, press=6)
     qualify(pendant, request=START, press=7)
-    pendant.hear(False, qualifying=True, beside=others(pendant, beside))
+    pendant.hear(False, qualifying=True, beside=others(beside))
     qualify(pendant, request=START, press=7)
-    say(pendant, request=START, press=7)
+    send(pendant, request=START, press=7)
     assert not pendant.started
 
 

@@ -1,4 +1,4 @@
-"""The layout names every place of the vector once, and travels as JSON."""
+"""Record layout: each element of the vector has one name, and the layout is sent as JSON."""
 
 from __future__ import annotations
 

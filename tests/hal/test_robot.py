@@ -1,4 +1,4 @@
-"""The robot file: mirrored, read-only, and strict about what it says."""
+"""Robot file: mirrored legs, read-only arrays and strict validation."""
 
 from __future__ import annotations
 

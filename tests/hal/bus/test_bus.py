@@ -1,4 +1,4 @@
-"""Behaviour every bus has, run against each transport; and what only one of them has.
+"""Behaviour of every bus, run on each transport, and the special behaviour of some transports.
 
 `FrameReceiver` is what receiving means, `FrameSender` what sending means; a transport subclasses them with its two ends
 and nothing else. The SocketCAN subclass is in tests/vcan, which needs a kernel that has it.
@@ -21,7 +21,7 @@ from atalante_hal.bus import Bus, BusAbsent, BusDown, BusError, BusFull, open_bu
 from atalante_hal.bus.batch import is_legal
 from atalante_hal.bus.channel_map import ChannelMapError, open_channels, parse_channel_map
 from atalante_hal.bus.joined import JoinedBus
-from atalante_hal.bus.pair import lockstep_pair
+from atalante_hal.bus.pair import PairBus, lockstep_pair
 from atalante_hal.bus.python_can import PythonCanBus, message_of
 from atalante_hal.bus.replay import LogUnreadable, ReplayBus
 from atalante_hal.bus.shared import shared_pair
@@ -54,7 +54,7 @@ def random_frames(count: int, seed: int = 0, lengths: tuple[int, ...] = FD_LENGT
 
 
 def other_frames() -> Frames:
-    """The kinds of frame the robot's network does not use and a bus must carry: classic, extended, remote, ESI."""
+    """Frame kinds that the robot does not use but a bus must transfer: classic, extended, remote, ESI."""
     frames = new_frames(5)
     frames["can_id"] = [0x123, 0x7FF, 0x12345678 | ID_EXTENDED, 0x42 | ID_REMOTE, 0x1FFFFFFF | ID_EXTENDED]
     frames["len"] = [8, 0, 5, 0, 64]
@@ -66,7 +66,7 @@ def other_frames() -> Frames:
 
 
 def receive_all(bus: Bus, count: int, timeout: float = 5.0) -> Frames:
-    """Exactly `count` frames, in as many `receive()` as it takes."""
+    """Receive exactly `count` frames, with as many calls as necessary."""
     received = new_frames(count)
     have = 0
     while have < count:
@@ -79,10 +79,10 @@ def receive_all(bus: Bus, count: int, timeout: float = 5.0) -> Frames:
 
 
 class FrameReceiver:
-    """What every bus does with frames that are there to be received; subclasses supply `deliver`."""
+    """Tests of receiving, for every bus; subclasses define `deliver`."""
 
     def deliver(self, frames: Frames) -> Bus:
-        """A bus on which exactly these frames have arrived."""
+        """Return a bus on which exactly these frames have arrived."""
         raise NotImplementedError
 
     def test_frames_arrive_bit_for_bit_in_order(self) -> None:
@@ -158,11 +158,11 @@ class FrameReceiver:
 
 
 class FrameSender:
-    """What every bus does with frames to send; subclasses supply the two `ends` of a wire."""
+    """Tests of sending, for every bus; subclasses define the fixture `ends`."""
 
     @pytest.fixture
     def ends(self) -> Iterator[tuple[Bus, Bus]]:
-        """Two buses that hear each other."""
+        """Two connected buses."""
         raise NotImplementedError
 
     def deliver(self, frames: Frames) -> Bus:
@@ -243,7 +243,7 @@ class FrameSender:
 
 
 class FrameWaiter:
-    """What a bus does that can wait; the lock-step pair and a recording never do."""
+    """Tests of waiting, for every bus except the lock-step pair and the replay, which never wait."""
 
     sender: Bus
     receiver: Bus
@@ -297,7 +297,7 @@ class TestPythonCanVirtual(FrameSender, FrameReceiver, FrameWaiter):
 
 
 def network_of(bus_of: dict[int, str]) -> Network:
-    """A network in which every identifier has a bus."""
+    """Return a network with one message per identifier, on the given bus."""
     messages = tuple(
         Message(f"M{i}", frame_id, 8, "HAL", (), bus, "cyclic", 1, 0, 0, i, "")
         for i, (frame_id, bus) in enumerate(bus_of.items())
@@ -306,7 +306,7 @@ def network_of(bus_of: dict[int, str]) -> Network:
 
 
 class TestJoinedBus(FrameSender, FrameReceiver, FrameWaiter):
-    """Two channels; these frames are all at home on one of them, where their order is defined."""
+    """A joined bus with two channels. All frames of these tests are on one channel, so that their order is defined."""
 
     @pytest.fixture
     def ends(self, request: pytest.FixtureRequest) -> Iterator[tuple[Bus, Bus]]:
@@ -349,7 +349,7 @@ class TestReplayZipped(TestReplayLog):
 
 
 def write_log(path: Path, frames: Frames) -> Path:
-    """A log of these frames, a millisecond apart, by python-can's writers."""
+    """Write a log of these frames, 1 ms apart, with python-can."""
     with can.Logger(path) as log:
         for index, (can_id, length, flags, _, data) in enumerate(frames.tolist()):
             message = message_of(can_id, length, flags, bytes(data))
@@ -596,16 +596,15 @@ def test_channels_are_closed_if_one_cannot_be_opened(monkeypatch: pytest.MonkeyP
             bus.receive(new_frames(1))
 
 
-def four_pairs(network: Network) -> tuple[JoinedBus, dict[str, Bus]]:
-    """The network's four buses joined, and the far end of each."""
+def four_pairs(network: Network) -> tuple[JoinedBus, dict[str, PairBus], dict[str, PairBus]]:
+    """Return a joined bus, the channels of its four buses, and the far end of each channel."""
     pairs = {bus: lockstep_pair(capacity=8, names=(bus, f"{bus} peer")) for bus in BUSES}
-    return JoinedBus(network, {bus: near for bus, (near, _) in pairs.items()}), {
-        bus: far for bus, (_, far) in pairs.items()
-    }
+    near, far = ({bus: ends[end] for bus, ends in pairs.items()} for end in (0, 1))
+    return JoinedBus(network, near), near, far
 
 
 def frames_of(network: Network, *names: str) -> Frames:
-    """Empty frames of these messages."""
+    """Return empty frames of these messages."""
     frames = new_frames(len(names))
     for frame, name in zip(frames, names, strict=True):
         message = network.message(name)
@@ -614,38 +613,38 @@ def frames_of(network: Network, *names: str) -> Frames:
 
 
 def test_joined_bus_sends_each_frame_to_the_bus_of_its_message(network: Network) -> None:
-    joined, far = four_pairs(network)
+    joined, _, far = four_pairs(network)
     frames = frames_of(network, *(m.name for m in network.messages if m.cycle_ms == 1))
     for cycle in range(3):
         frames["data"][:, 3] = cycle
         joined.send(frames)
         for bus, end in far.items():
-            expected = frames[[network.messages[i].bus == bus for i in _places(network, frames)]]
+            expected = frames[[network.messages[i].bus == bus for i in _message_indices(network, frames)]]
             assert receive_all(end, len(expected)).tobytes() == expected.tobytes()
             assert end.receive(new_frames(1)) == 0
 
 
-def _places(network: Network, frames: Frames) -> list[int]:
+def _message_indices(network: Network, frames: Frames) -> list[int]:
     ids = [m.frame_id for m in network.messages]
     return [ids.index(frame_id) for frame_id in frames["can_id"].tolist()]
 
 
 def test_joined_bus_receives_frames_and_time_stamps_of_every_channel(network: Network) -> None:
-    joined, far = four_pairs(network)
-    for cycle in range(4):  # every channel is first once
-        for place, bus in enumerate(BUSES):
+    joined, near, far = four_pairs(network)
+    for cycle in range(4):  # as many cycles as channels: receiving starts with another channel each cycle
+        for index, bus in enumerate(BUSES):
             frames = frames_of(network, *[m.name for m in network.messages if m.bus == bus and m.cycle_ms == 1][:2])
             far[bus].send(frames)
-            joined._links[place].now_ns = 1000 * cycle + place  # type: ignore[attr-defined]
+            near[bus].now_ns = 1000 * cycle + index
         block = new_frames(16)
         assert joined.receive(block) == 8
-        buses = [network.messages[i].bus for i in _places(network, block[:8])]
+        buses = [network.messages[i].bus for i in _message_indices(network, block[:8])]
         assert sorted(buses) == sorted(BUSES * 2)
         assert joined.stamps[:8].tolist() == [1000 * cycle + BUSES.index(bus) for bus in buses]
 
 
 def test_joined_bus_rejects_a_batch_with_an_unknown_frame(network: Network) -> None:
-    joined, far = four_pairs(network)
+    joined, _, far = four_pairs(network)
     frames = frames_of(network, "SYNC_LEFT_LEG", "SYNC_RIGHT_LEG")
     frames["can_id"][1] = 0x7FE
     with pytest.raises(ValueError, match=r"frame 1 \(id 0x7FE\) is not a message of the network"):
@@ -654,7 +653,7 @@ def test_joined_bus_rejects_a_batch_with_an_unknown_frame(network: Network) -> N
 
 
 def test_joined_bus_serves_other_channels_if_one_is_full_or_closed(network: Network) -> None:
-    joined, far = four_pairs(network)
+    joined, near, far = four_pairs(network)
     syncs = frames_of(network, *(f"SYNC_{bus.upper()}" for bus in BUSES))
     for _ in range(8):
         joined.send(syncs)
@@ -665,7 +664,7 @@ def test_joined_bus_serves_other_channels_if_one_is_full_or_closed(network: Netw
     assert refusal.value.sent == 3
     for bus in BUSES[1:]:
         receive_all(far[bus], 1)
-    joined._links[0].close()
+    near[BUSES[0]].close()
     with pytest.raises(BusDown, match="left_leg is closed"):
         joined.send(syncs)
     for bus in BUSES[1:]:

@@ -1,4 +1,4 @@
-"""What only the shared-memory bus has: lock-step between two processes, sleep, and noticing who is gone.
+"""Special behaviour of the shared-memory bus: lock-step of two processes, waiting, and loss of the other process.
 
 The behaviour it shares with every bus is in test_bus.
 """
@@ -20,7 +20,7 @@ from atalante_hal.bus import BusDown, BusFull
 from atalante_hal.bus.shared import SharedBus, descriptors, shared_pair
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, Frames, new_frames
 
-#: s; a test that waits this long has failed.
+#: A test that waits this long has failed [s].
 LONG = 60.0
 
 
@@ -40,10 +40,10 @@ def ends() -> Iterator[tuple[SharedBus, SharedBus]]:
 
 
 class Answering:
-    """The other end in a thread: answers frames below 100 with as many, takes the others without a word."""
+    """The other end, in a thread: it echoes frames with a payload below 100 and ignores the others."""
 
     def __init__(self, bus: SharedBus) -> None:
-        self.heard: list[list[int]] = []
+        self.received: list[list[int]] = []
         self.pause = 0.0
         self._bus = bus
         self._block = new_frames(8)
@@ -55,8 +55,8 @@ class Answering:
             self._bus.serve(self._step)
 
     def _step(self) -> None:
-        count = self._bus.receive(self._block, LONG)  # which does not wait
-        self.heard.append(self._block["data"][:count, 0].tolist())
+        count = self._bus.receive(self._block, LONG)  # does not wait within a step
+        self.received.append(self._block["data"][:count, 0].tolist())
         time.sleep(self.pause)
         if count and self._block["data"][0, 0] < 100:
             self._bus.send(self._block[:count].copy())
@@ -85,7 +85,7 @@ def test_receive_passes_all_sent_frames_and_returns_the_answer(asker: tuple[Shar
         ours.send(frames_of(cycle + 1))
         assert ours.receive(block) == 4
         assert block["data"][:4, 0].tolist() == [cycle] * 3 + [cycle + 1]
-    assert answering.heard == [[cycle] * 3 + [cycle + 1] for cycle in range(50)]
+    assert answering.received == [[cycle] * 3 + [cycle + 1] for cycle in range(50)]
 
 
 def test_each_receive_without_queued_frames_runs_one_step(asker: tuple[SharedBus, Answering]) -> None:
@@ -97,18 +97,18 @@ def test_each_receive_without_queued_frames_runs_one_step(asker: tuple[SharedBus
     ours.send(frames_of(7))
     assert ours.receive(block) == 1
     assert ours.receive(block) == 0
-    assert answering.heard == [[], [100], [7], []]
+    assert answering.received == [[], [100], [7], []]
 
 
 def test_frames_beyond_the_buffer_are_returned_without_another_step(asker: tuple[SharedBus, Answering]) -> None:
     ours, answering = asker
     ours.send(frames_of(1, 5))
     assert [ours.receive(new_frames(2)) for _ in range(3)] == [2, 2, 1]
-    assert len(answering.heard) == 1
+    assert len(answering.received) == 1
 
 
 def test_both_ends_wake_up_when_frames_arrive_late(asker: tuple[SharedBus, Answering]) -> None:
-    """Both ends fall asleep, as they do on a machine with one core."""
+    """Both ends sleep while they wait, as on a machine with one core."""
     ours, answering = asker
     answering.pause = 0.01
     block = new_frames(4)
@@ -158,13 +158,13 @@ def test_frames_sent_before_closing_arrive_then_the_closing_reason(ends: tuple[S
     one, other = ends
     other.send(frames_of(1))  # makes the kernel report a broken connection first
     one.send(frames_of(5))
-    one.close("the body exploded")
+    one.close("the simulation failed")
     block = new_frames(1)
     assert other.receive(block, LONG) == 1
     for _ in range(2):
-        with pytest.raises(BusDown, match=r"^embedded peer: the body exploded$"):
+        with pytest.raises(BusDown, match=r"^embedded peer: the simulation failed$"):
             other.receive(block, LONG)
-    other.send(frames_of(2))  # a wire nobody listens to
+    other.send(frames_of(2))  # the other end is closed: the frames are discarded
 
 
 @pytest.mark.parametrize("patience", [0.0, LONG])

@@ -1,4 +1,4 @@
-"""Diagnostic codes as data: complete, distinct, and what each demands."""
+"""Diagnostic codes: completeness, distinct bits and the reaction of each code."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from atalante_hal.safety.events import SEVERITIES
 
 R = Reaction
 
-#: What every code demands, written a second time: a reaction is changed on purpose or not at all.
+#: Expected reaction of every code; an accidental change of a reaction fails the test.
 DEMANDS = {
     R.INFO: "E2E_SOME_LOST E2E_REPEATED FRAME_UNKNOWN CMD_SOME_LOST CMD_E2E GUIDE_OUTSIDE RECORD_STOPPED TELEMETRY_DOWN "
     "TELEMETRY_DROPPED",
@@ -60,7 +60,7 @@ def test_what_the_loop_can_find_fits_into_one_number_of_the_record():
     assert {d.value for d in outside} == {
         "RECORD_STOPPED", "TELEMETRY_DOWN", "TELEMETRY_DROPPED", "DBC_INVALID", "CONFIG_INVALID", "GAIT_INVALID"
     }  # fmt: skip
-    assert outside[0].bit <= 1 << 53  # so that all bits below it together are a float64 without rounding
+    assert outside[0].bit <= 1 << 53  # float64 represents the sum of all lower bits exactly
 
 
 def test_worst():

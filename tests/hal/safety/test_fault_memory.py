@@ -1,4 +1,4 @@
-"""The fault memory: what is active, what is told once, and what is told again."""
+"""Fault memory: active diagnostics, and when each diagnostic is logged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether messages may be used: trust, age and what is raised, cycle by cycle."""
+"""Message monitor: trust, age and diagnostics of each message."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Change = Callable[[Frames], Frames]
 
 
 class MonitorBench:
-    """Nodes and the HAL's message monitor; a cycle may lose, change or delay frames."""
+    """Simulated nodes and the message monitor; the frames of a cycle may be lost, changed or delayed."""
 
     def __init__(self) -> None:
         self.tx, self.image = TransmitImage(MESSAGES), ReceiveImage(MESSAGES)
@@ -201,7 +201,7 @@ def test_invalid_code_is_reported_as_range_or_imu_fault(row, message, signal, va
 def test_invalid_values_do_not_fill_the_leaky_bucket(bench: MonitorBench):
     bench.well()
     place = bench.tx.codec.index("IMU_PELVIS_STATE", "GyroX")
-    for _ in range(20):  # two bad of three
+    for _ in range(20):  # two of three frames are invalid
         bench.tx.values[place] = np.nan
         bench.cycle(times=2)
         bench.tx.values[place] = 0.0
@@ -211,7 +211,7 @@ def test_invalid_values_do_not_fill_the_leaky_bucket(bench: MonitorBench):
 
 
 def late(bench: MonitorBench, row: int, by: int) -> Change:
-    """A node that answers each SYNC `by` cycles late."""
+    """Delay the frame of one node by `by` cycles."""
     waiting: list[Frames] = []
 
     def change(frames: Frames) -> Frames:
@@ -250,7 +250,7 @@ def test_steady_loss_trips_the_leaky_bucket_of_each_sender(bench: MonitorBench):
     bench.well()
     loss = lose(KNEE, PENDANT)
     for _ in range(5):
-        bench.cycle(loss, times=3).cycle()  # 55 in the bucket in the end
+        bench.cycle(loss, times=3).cycle()  # fills the bucket to 55
     bench.cycle(loss, times=2)
     assert bench.message_monitor.trusts(KNEE)
     bench.cycle(loss)
@@ -345,7 +345,7 @@ def test_late_frame_after_a_loss_is_reported_with_its_age(bench: MonitorBench) -
 
 
 class TestSwingLeg:
-    """A robot that stands on its right leg."""
+    """The robot stands on its right leg."""
 
     @pytest.fixture
     def bench(self) -> MonitorBench:
@@ -382,11 +382,11 @@ class TestSwingLeg:
 
 
 class TestTwoSenders:
-    """A second sender of a message, each of whose frames is right."""
+    """A second sender of a message; each of its frames is valid."""
 
     @staticmethod
     def rival(row: int, *, first: bool = False, ahead: int = 0) -> Change:
-        """A frame more of a row: another bit of its last byte, and a counter that many ahead."""
+        """Add a second frame of a row, with a changed bit in its last byte and its counter increased by `ahead`."""
 
         def change(frames: Frames) -> Frames:
             message, other = MESSAGES[row], frames[[row]].copy()

@@ -1,4 +1,4 @@
-"""The supervisor, exhaustively: every state with every reaction and every combination of facts; laws over sets of codes."""
+"""Supervisor state machine: every state with every reaction and condition, and invariants over sets of codes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from atalante_hal.types import SupervisorState
 
 S, R = SupervisorState, Reaction
 FACTS = ("nodes_well", "drives_enabled", "dead_man", "stop_requested", "start_wanted", "step_finished")
-#: One code for each reaction: conditions fold into reactions first, so that these stand for all.
+#: One code per reaction. The next state depends only on the most severe reaction, so these represent all codes.
 ONE_OF = {reaction: next(d for d in Dtc if d.reaction is reaction) for reaction in Reaction}
 RUN = {"nodes_well": True, "drives_enabled": True, "dead_man": True}
 GO = RUN | {"start_wanted": True}
@@ -126,13 +126,13 @@ def check_laws(before: S, reaction: R, c: Conditions):
         assert c.nodes_well
         assert c.drives_enabled
         assert reaction is R.INFO
-    # Recovery is the operator's: without START nothing gets better, but OFF to READY, which moves nothing.
+    # Only START of the operator leads to a less safe state; OFF to READY is excepted, because it moves nothing.
     if not (c.start_wanted and c.dead_man and not c.stop_requested) and (before, then) != (S.OFF, S.READY):
         assert then >= before or (before, then) == (S.READY, S.OFF)
-    # A robot that has moved does not go limp.
+    # After a movement the drives stay enabled.
     if before not in (S.OFF, S.READY):
         assert then not in (S.OFF, S.READY)
-    # Whatever is demanded is the least that happens to a robot that moves.
+    # A moving robot reaches at least the safety of the demanded reaction.
     if before in MOVING and reaction > R.NOT_READY:
         assert then >= S[reaction.name]
 

@@ -1,4 +1,4 @@
-"""Who may subscribe: TLS and users on the loopback, and a telemetry file that is read strictly."""
+"""Access control of telemetry: TLS and users on the loopback, and strict checks of the telemetry file."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Authority:
         self.certificate = self._write(name, self._key, self._sign(name, self._key, of_authority=True))[0]
 
     def issue(self, name: str) -> tuple[Path, Path]:
-        """Certificate and private key, for server or client."""
+        """Issue a certificate and private key, for server or client."""
         key = ec.generate_private_key(ec.SECP256R1())
         return self._write(name, key, self._sign(name, key, of_authority=False))
 
@@ -95,8 +95,8 @@ def client(where: str, transport: dict[str, Any]) -> Iterator[zenoh.Session]:
         yield session
 
 
-def hears(publisher: Publisher, transport: dict[str, Any], where: str | None = None) -> bool:
-    """Whether a client with that configuration gets telemetry; it may not even be let in."""
+def receives(publisher: Publisher, transport: dict[str, Any], where: str | None = None) -> bool:
+    """Return whether a client with this configuration receives telemetry."""
     try:
         with client(where or publisher.endpoint, transport) as session, session.declare_subscriber("**") as subscriber:
             for _ in range(TRIES):
@@ -109,10 +109,10 @@ def hears(publisher: Publisher, transport: dict[str, Any], where: str | None = N
     return False
 
 
-def anybody_hears(publisher: Publisher, *clients: tuple[dict[str, Any], str | None]) -> bool:
-    """Whether one of several does, all at the same time: who is turned away tries until its time is over."""
+def any_receives(publisher: Publisher, *clients: tuple[dict[str, Any], str | None]) -> bool:
+    """Return whether any client receives telemetry. They run in parallel, because a rejected client retries until its timeout."""
     with ThreadPoolExecutor() as pool:
-        return any(pool.map(lambda one: hears(publisher, *one), clients))
+        return any(pool.map(lambda one: receives(publisher, *one), clients))
 
 
 def user(name: str, password: str) -> dict[str, Any]:
@@ -132,12 +132,15 @@ class TestLoopback:
         access = Access(*authority.issue("robot"), users=users)
         stranger = Authority(users.parent, "stranger")
         with Publisher("exo", STREAMS, endpoint("tls"), access) as publisher:
-            assert hears(publisher, trusting(authority) | user("lab", "secret"))
-            assert not anybody_hears(
+            assert receives(publisher, trusting(authority) | user("lab", "secret"))
+            assert not any_receives(
                 publisher,
                 (trusting(authority) | user("lab", "guess"), None),
                 (trusting(authority), None),
-                (trusting(stranger) | user("lab", "secret"), None),  # it is not the robot he knows
+                (
+                    trusting(stranger) | user("lab", "secret"),
+                    None,
+                ),  # the client does not trust the authority of the publisher
                 (user("lab", "secret"), publisher.endpoint.replace("tls/", "tcp/")),
             )
 
@@ -145,21 +148,21 @@ class TestLoopback:
         stranger = Authority(authority.certificate.parent, "stranger")
         access = Access(*authority.issue("robot"), client_ca=authority.certificate)
         with Publisher("exo", STREAMS, endpoint("tls"), access) as publisher:
-            assert hears(publisher, trusting(authority, authority.issue("desk")))
+            assert receives(publisher, trusting(authority, authority.issue("desk")))
             spy = trusting(authority, stranger.issue("spy"))
-            assert not anybody_hears(publisher, (spy, None), (trusting(authority), None))
+            assert not any_receives(publisher, (spy, None), (trusting(authority), None))
 
     def test_quic_accepts_only_clients_with_certificate_and_password(self, authority: Authority, users: Path) -> None:
         access = Access(*authority.issue("robot"), client_ca=authority.certificate, users=users)
         desk, lab = trusting(authority, authority.issue("desk")), user("lab", "secret")
         with Publisher("exo", STREAMS, endpoint("quic"), access) as publisher:
-            assert hears(publisher, desk | lab)
-            assert not anybody_hears(publisher, (desk, None), (trusting(authority) | lab, None))
+            assert receives(publisher, desk | lab)
+            assert not any_receives(publisher, (desk, None), (trusting(authority) | lab, None))
 
     def test_tcp_with_users_requires_a_password(self, users: Path) -> None:
         with Publisher("exo", STREAMS, endpoint("tcp"), Access(users=users)) as publisher:
-            assert hears(publisher, user("lab", "secret"))
-            assert not hears(publisher, {})
+            assert receives(publisher, user("lab", "secret"))
+            assert not receives(publisher, {})
 
     def test_accepted_client_cannot_put(self, authority: Authority, users: Path) -> None:
         with (
@@ -169,7 +172,7 @@ class TestLoopback:
         ):
             for _ in range(100):
                 session.put("atalante/exo/command", b"forged")
-            list(session.get("atalante/exo/none", timeout=1.0))  # answered after what came before it
+            list(session.get("atalante/exo/none", timeout=1.0))  # the answer follows all earlier puts
             publisher.put("imu", b"ours", 0, 0)
             assert {sample.payload.to_bytes() for sample in iter(inside.try_recv, None)} == {b"ours"}
 
@@ -303,7 +306,7 @@ class TestTelemetryFile:
 
 
 class TestCommand:
-    """`atalante airwalk --telemetry FILE` from start to end, with each kind of file that the README has."""
+    """The command `atalante airwalk --telemetry FILE`, with each kind of telemetry file in the README."""
 
     @pytest.mark.parametrize(
         "keys",

@@ -1,4 +1,4 @@
-"""The CAN log: every frame the HAL sent and received, bit for bit, whatever the format; and how frames get there."""
+"""CAN log: every frame that the HAL sent or received is logged without change, in every format."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ class TestFormats:
 
 
 class TestTap:
-    """From the HAL's arrays through the ring to the log's."""
+    """The path of frames from the HAL through the ring to the log."""
 
     @staticmethod
     def emptied(reader: RingReader) -> tuple[Frames, np.ndarray, np.ndarray]:

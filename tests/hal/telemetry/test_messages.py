@@ -1,4 +1,4 @@
-"""From record to protobuf: every number arrives in its field, and the committed schema is the one that is written down."""
+"""Protobuf messages: every value of a record is in its field, and the committed schema matches the .proto file."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ NANOSECONDS = 1_000_000_000
 
 @pytest.fixture
 def layout(network: atalante_dbc.Network, robot: Robot) -> Layout:
-    """What the HAL records with the guide running."""
+    """Layout of the records of the HAL with the airwalk controller."""
     return Hal(network, robot, lockstep_pair()[0], controller_fields=AirwalkController.telemetry_fields).layout
 
 
 @pytest.fixture
 def record(layout: Layout) -> np.ndarray:
-    """Every place a number of its own that float32 holds exactly."""
+    """A record with a different value at each index; float32 represents each value exactly."""
     values = np.arange(layout.size) / 8 + 1.0
     values[layout["cycle"]], values[layout["time"]] = 1234, 1.234
     values[layout["supervisor"]], values[layout["diagnostics"]] = SupervisorState.ACTIVE, 0b101
@@ -54,7 +54,7 @@ def decoded(encoder: Encoder, key: str, record: np.ndarray, start_ns: int = 0) -
 
 class TestSchema:
     def test_committed_descriptor_set_matches_the_proto_file(self, tmp_path: Path) -> None:
-        """By the command that the file itself gives."""
+        """Regenerate with the command given in the .proto file."""
         folder, made = schema.DESCRIPTORS.parent, tmp_path / "messages.binpb"
         text = (folder / "messages.proto").read_text()
         command = next(line for line in text.splitlines() if "-m grpc_tools.protoc" in line).strip("/ ").split()

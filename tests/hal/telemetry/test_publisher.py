@@ -1,4 +1,4 @@
-"""Zenoh on the loopback: telemetry leaves, nothing enters, and nobody who listens can hold it up."""
+"""Zenoh publisher on the loopback: it publishes telemetry, accepts no data, and is never blocked by a subscriber."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from atalante_hal.telemetry.schema import message_class
 from atalante_hal.telemetry.sink import SinkError
 
 STREAMS = [("joint_states", "JointStates"), ("imu", "ImuStates")]
-TRIES = 400  # of 50 ms, for what another thread or process has to do
+TRIES = 400  # polls of another thread or process, every 50 ms
 
 
 def free_port() -> int:
@@ -60,7 +60,7 @@ def until(wanted: Callable[[], Any]) -> Any:
         if found := wanted():
             return found
         time.sleep(0.05)
-    raise AssertionError("it did not happen")
+    raise AssertionError(f"timeout while waiting for {wanted.__name__}")
 
 
 def drain(subscriber: Any) -> list[zenoh.Sample]:
@@ -141,11 +141,11 @@ class TestSubscribers:
                 child.kill()
 
 
-class TestWalls:
+class TestAccessControl:
     KEYS = ("joint_states", "imu", "events", "command", "anything/else")
 
     def forge(self, publisher: Publisher, count: int) -> tuple[list[bytes], list[bytes]]:
-        """Puts of a stranger on every key: those seen inside the telemetry process, and by another subscriber."""
+        """Let a foreign client put on every key; return what the telemetry process and another subscriber received."""
         with (
             publisher._session.declare_subscriber("**", zenoh.handlers.FifoChannel(10_000)) as inside,
             client(publisher) as other,
@@ -163,7 +163,7 @@ class TestWalls:
             for number in range(count):
                 stranger.put(f"atalante/exo/{self.KEYS[number % len(self.KEYS)]}", b"forged")
                 stranger.delete(f"atalante/exo/{self.KEYS[number % len(self.KEYS)]}")
-            # What came in has come in when the stranger's question after it has been answered: none, but in order.
+            # The reply to this query follows all earlier puts of the client.
             list(stranger.get("atalante/exo/none", timeout=1.0))
             publisher.put("imu", b"end", 0, 0)
 
@@ -197,7 +197,7 @@ class TestWalls:
 
 
 def sockets(*kinds: str) -> list[tuple[str, str]]:
-    """(local address, state) of this process's sockets, as the kernel writes them."""
+    """Return (local address, state) of the sockets of this process, in the notation of the kernel."""
     links = []
     for fd in Path("/proc/self/fd").iterdir():
         try:

@@ -1,4 +1,4 @@
-"""The recording: what was put in comes out by the schema in the file, and a full disk is said once."""
+"""MCAP recorder: messages are read back with the schema in the file, and a full disk is reported once."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def joint_states(cycle: int) -> bytes:
 
 @contextmanager
 def file_size_limit(size: int) -> Iterator[None]:
-    """A full disk: writing beyond `size` bytes fails."""
+    """Simulate a full disk: writing beyond `size` bytes fails."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -77,7 +77,7 @@ def test_file_of_a_killed_recorder_contains_the_flushed_messages(tmp_path: Path)
         payload = message_class("JointStates")(cycle=cycle, position=rng.random(12)).SerializeToString()
         recorder.put("joint_states", payload, cycle, cycle)
     torn = tmp_path / "torn.mcap"
-    torn.write_bytes(path.read_bytes())  # what is on the disk at this moment
+    torn.write_bytes(path.read_bytes())  # the content of the file at this moment
     recorder.close()
     cycles = []
     with torn.open("rb") as file:

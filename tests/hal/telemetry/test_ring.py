@@ -1,4 +1,4 @@
-"""The ring: what is written is read, what is overwritten is counted, nobody waits for the dead."""
+"""Ring buffer: written records are read in order, overwritten records are counted, and no end waits for a dead process."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SIZE = 24
 
 
 def record(number: int, size: int = SIZE) -> bytes:
-    """Bytes that show a mixture of two records: the number, again and again."""
+    """Return a record that repeats one number, so that a mixture of two records is visible."""
     return np.full(size // 8, number, "<i8").tobytes()
 
 
@@ -36,7 +36,7 @@ def ends(
 
 
 def numbers(read: np.ndarray) -> list[int]:
-    """The numbers of intact records."""
+    """Return the number of each record, and check that no record is mixed."""
     values = np.ascontiguousarray(read).view("<i8")
     assert (values == values[:, :1]).all()
     return [int(number) for number in values[:, 0]]
@@ -131,7 +131,7 @@ class TestOverwriting:
 
 
 class _Overtaken:
-    """The records of a ring, with a writer that gets in between the copy and the check."""
+    """Records of a ring; a writer overwrites them between the copy and the check of the reader."""
 
     def __init__(self, array: np.ndarray, between: object) -> None:
         self.array, self._between = array, between
@@ -147,7 +147,7 @@ class _Overtaken:
 
 
 def _write_half(writer: RingWriter) -> None:
-    """A writer stopped in the middle of a record: some of its bytes are there, it is not announced."""
+    """Write the first bytes of a record that is not yet announced, as a writer that is stopped in the middle."""
     writer._map[writer._offset : writer._offset + 8] = b"\xff" * 8
 
 
@@ -338,7 +338,7 @@ class TestAcrossProcesses:
         with RingWriter(SIZE, 4, lossless=True, patience=3600.0) as writer, reader_process(writer) as child:
             assert writer.reader_alive
             child.send_signal(signal.SIGKILL)
-            _wait_for_the_end(child)  # a zombie still: its pid is there, its lock is not
+            _wait_for_the_end(child)  # a zombie: its process id still exists, but its lock does not
             assert not writer.reader_alive
             for number in range(100):
                 writer.write(record(number))
@@ -378,7 +378,7 @@ class TestAcrossProcesses:
 
 
 def _wait_for_the_end(child: subprocess.Popen[str]) -> None:
-    """Until the process has ended, without taking its exit status: it stays a zombie."""
+    """Wait until the process has ended, and leave it as a zombie."""
     os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
 
 

@@ -1,4 +1,4 @@
-"""What the telemetry process does with what is in the rings, message by message, without a process around it."""
+"""Telemetry service: each record and event in the rings reaches the sinks; it runs in the process of the test."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TYPES = {"joint_states": "JointStates", "system": "SystemState", "loop": "LoopSt
 
 @dataclass
 class Sink:
-    """Keeps what it gets; fails at message number `fails_at`."""
+    """Sink that keeps its messages, and fails at message number `fails_at`."""
 
     fails_at: int | None = None
     got: list[tuple[str, bytes, int, int]] = field(default_factory=list)
@@ -54,7 +54,7 @@ class Sink:
 
 @dataclass
 class ServiceBench:
-    """Both ends of the rings, and the service between them and its sinks."""
+    """The writers of both rings, and the service that reads them."""
 
     layout: Layout
     records: RingWriter

@@ -1,4 +1,4 @@
-"""The array codec against cantools, which is not in the loop and therefore an independent witness."""
+"""Codec compared with cantools, an independent implementation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def limits(codec: Codec) -> tuple[np.ndarray, np.ndarray]:
 
 
 def layouts() -> list[list[int]]:
-    """Rows of the network's messages, those with the same signals together: ten layouts for 68 messages."""
+    """Return the rows of the messages, grouped by equal signals: ten layouts for 68 messages."""
     rows: dict[object, list[int]] = {}
     for row, message in enumerate(MESSAGES):
         signals = tuple((s.start, s.length, s.signed, s.factor, s.offset) for s in message.signals)
@@ -31,7 +31,7 @@ def layouts() -> list[list[int]]:
 
 
 def asked(image: int) -> list[int]:
-    """Rows the oracle, which is slow, is asked for: of every layout one message in turn."""
+    """Return the rows to compare with cantools, which is slow: one message of every layout, in turn."""
     return [rows[image % len(rows)] for rows in LAYOUTS]
 
 

@@ -1,4 +1,4 @@
-"""E2E Profile 5 against the AUTOSAR reference package, and its promise against damage."""
+"""E2E Profile 5 compared with the AUTOSAR reference package, and its detection of damaged frames."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ SHORT, LONG = NETWORK.message("LEFT_SK_STATE"), NETWORK.message("FOOT_LEFT_STATE
 
 
 def rows_of_frames() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Two frames of random bytes: octets, spans, and the counters 7 and 250 that are to be theirs."""
+    """Two frames of random bytes: octets, spans, and their counters 7 and 250."""
     octets = np.random.default_rng(3).integers(0, 256, 2 * FRAME_BYTES).astype(np.uint8)
     return octets, protected_spans([SHORT, LONG]), np.array([7, 250])
 
@@ -137,7 +137,7 @@ def test_every_counter_step_has_a_check_result():
 
 
 def _received(messages):
-    """A transmit and a receive image that have already talked."""
+    """A transmit and a receive process image after one exchanged cycle."""
     tx, rx = TransmitImage(messages), ReceiveImage(messages)
     buffer = tx.seal().copy()
     assert list(rx.accept(buffer, len(buffer))) == []
@@ -145,7 +145,7 @@ def _received(messages):
 
 
 def flips(chance: random.Random, kind: int, bits: int) -> int:
-    """Bits of a frame that are flipped: one, two, or any odd number of them."""
+    """Positions of flipped bits in a frame: one, two or any odd number of bits."""
     if kind < 2:
         return sum(1 << bit for bit in chance.sample(range(bits), kind + 1))
     pattern = chance.getrandbits(bits)
@@ -154,7 +154,7 @@ def flips(chance: random.Random, kind: int, bits: int) -> int:
 
 @pytest.mark.exhaustive
 def test_one_two_or_odd_numbers_of_flipped_bits_are_rejected():
-    """100,000 of them, among all messages the HAL receives."""
+    """100,000 damaged frames of all messages that the HAL receives."""
     tx, _, _ = _received(CYCLIC)
     good = tx.seal().copy()
     payloads = [
@@ -227,7 +227,7 @@ def test_frame_with_the_identifier_of_another_message_is_rejected():
 
 
 def evidence_after(history: str, evidence: int = 0) -> int:
-    """Evidence after cycles: r with a rival frame, c clean."""
+    """Return the evidence after cycles: r with a frame of a second sender, c without."""
     for cycle in history:
         evidence = suspect(evidence, rival=cycle == "r")
     return evidence
@@ -249,7 +249,7 @@ def test_second_sender_in_every_other_cycle_is_full_evidence():
 
 
 def after(history: str, start: Qualification | None = None) -> Qualification:
-    """Qualification after cycles: g good, b bad, t timed out (and bad), T timed out (and good)."""
+    """Return the qualification after cycles: g good, b bad, t bad and timed out, T good and timed out."""
     now = start or Qualification()
     for cycle in history:
         now = qualify(now, good=cycle in "gT", timed_out=cycle in "tT")

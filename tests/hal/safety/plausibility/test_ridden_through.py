@@ -1,8 +1,8 @@
-"""A disturbance of one message that is ridden through, beside every fault the plausibility checks find.
+"""Tolerated disturbances of one message do not hide the faults that the plausibility checks find.
 
     signals -> frames -> disturbance -> process image -> plausibility
 
-Whatever is wrong with one message for good, each check finds its fault within the bound of FAULTS.md, and the disturbance alone
+Under a permanent disturbance of one message, each check finds its fault within the bound of FAULTS.md. The disturbance alone
 raises nothing.
 """
 
@@ -41,7 +41,7 @@ SWING_PERIOD = round(2.0 * math.pi / RATE / PERIOD)
 JOINT, LEG_IMU = JOINTS.index("right_FH"), IMUS.index("right_tibia")
 
 Change = Callable[[Signals, int], object]
-#: What arrives of a cycle's frames, given those of this cycle and of the last one.
+#: Returns the received frames, given the sent frames of this cycle and of the last cycle.
 Disturbance = Callable[[Frames, Frames], Frames]
 
 
@@ -58,7 +58,7 @@ def late(row: int) -> Disturbance:
 
 
 def lost_when_sampled(row: int) -> Disturbance:
-    """Three frames of 16 are lost, those of the cycles in which the slow checks look; the leaky bucket bears one in five."""
+    """Lose three of 16 frames, in the cycles of the slow checks; the leaky bucket tolerates a loss of 20 %."""
 
     def disturb(frames: Frames, before: Frames) -> Frames:
         lost = int(frames["data"][0, COUNTER_BYTE]) % 16 in (0, 2, 8)
@@ -84,7 +84,7 @@ DISTURBANCES: dict[str, Disturbance] = {
 
 @functools.cache
 def motion() -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-    """Position, velocity, quaternions (4, 4) and gyros (4, 3) of every cycle of a swing, which closes."""
+    """Return position, velocity, quaternions (4, 4) and gyros (4, 3) in each cycle of one period of the motion."""
     model = pinocchio_model(urdf(ExoskeletonParameters(), ROBOT))
     data = model.model.createData()
     frames = [model.model.getFrameId(f"imu_{imu}") for imu in IMUS]
@@ -111,12 +111,12 @@ def noise() -> np.ndarray:
 
 
 class Line:
-    """A healthy robot at the other end of a disturbed line."""
+    """A healthy robot whose frames are disturbed."""
 
     def __init__(self, disturb: Disturbance) -> None:
         self.disturb = undisturbed
         self.transmit, self.receive = TransmitImage(MESSAGES), ReceiveImage(MESSAGES)
-        self.said = signals_of(self.transmit.codec, self.transmit.values)
+        self.sent = signals_of(self.transmit.codec, self.transmit.values)
         self.checks = Plausibility(ROBOT, self.receive, PERIOD)
         self.cycles = 0
         self.before = self.transmit.frames.copy()
@@ -126,14 +126,14 @@ class Line:
         self.run(40)
 
     def cycle(self, change: Change) -> tuple[Finding, ...]:
-        said, at, more = self.said, self.cycles % SWING_PERIOD, noise()[self.cycles % len(noise())]
-        position, velocity, said.quaternion[:], gyro = motion()[at]
-        said.position[:], said.velocity[:] = position * GEAR, velocity * GEAR
-        said.torque[:] = 20.0 * math.sin(0.05 * self.cycles) + 0.05 * more[:12]
-        said.gyro[:] = gyro + 4e-3 * more[12:24].reshape(4, 3)
-        said.accel[:] = [0.0, 0.0, 9.81] + 0.05 * more[24:36].reshape(4, 3)
-        said.force[:] = 3.0 * more[36:60].reshape(2, 4, 3) + [0.0, 0.0, 150.0 * self.standing]
-        change(said, self.cycles)
+        sent, index, noisy = self.sent, self.cycles % SWING_PERIOD, noise()[self.cycles % len(noise())]
+        position, velocity, sent.quaternion[:], gyro = motion()[index]
+        sent.position[:], sent.velocity[:] = position * GEAR, velocity * GEAR
+        sent.torque[:] = 20.0 * math.sin(0.05 * self.cycles) + 0.05 * noisy[:12]
+        sent.gyro[:] = gyro + 4e-3 * noisy[12:24].reshape(4, 3)
+        sent.accel[:] = [0.0, 0.0, 9.81] + 0.05 * noisy[24:36].reshape(4, 3)
+        sent.force[:] = 3.0 * noisy[36:60].reshape(2, 4, 3) + [0.0, 0.0, 150.0 * self.standing]
+        change(sent, self.cycles)
         self.transmit.seal(self.cycles & 0xFF)
         frames = self.transmit.frames.copy()
         arrived = self.disturb(frames, self.before)
@@ -142,7 +142,7 @@ class Line:
         self.cycles += 1
         return self.checks.check()
 
-    def run(self, cycles: int, change: Change = lambda said, cycle: None) -> tuple[Finding, ...]:
+    def run(self, cycles: int, change: Change = lambda sent, cycle: None) -> tuple[Finding, ...]:
         found: tuple[Finding, ...] = ()
         for _ in range(cycles):
             found = self.cycle(change)
@@ -151,7 +151,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Fault:
-    """What a check finds, and its bound in FAULTS.md; that of the swinging feet is exact, so a late foot adds its cycle."""
+    """A fault and its bound in FAULTS.md. The bound of the swinging feet is exact, so a late foot adds one cycle."""
 
     dtc: Dtc
     node: str
@@ -161,44 +161,44 @@ class Fault:
 
 
 def _velocity_off(first: int) -> Change:
-    return lambda said, cycle: said.velocity.__setitem__(JOINT, said.velocity[JOINT] + 1.0 * GEAR[JOINT])
+    return lambda sent, cycle: sent.velocity.__setitem__(JOINT, sent.velocity[JOINT] + 1.0 * GEAR[JOINT])
 
 
 def _velocity_zero(first: int) -> Change:
-    # Of a joint at rest nothing is wrong with it: this one goes at up to 1.9 rad/s.
-    def change(said: Signals, cycle: int) -> None:
-        said.position[5] += 1.0 * PERIOD * (cycle - first) * GEAR[5]
-        said.velocity[5] = 0.0
+    # At rest a velocity of zero is right, so this joint moves with up to 1.9 rad/s.
+    def change(sent: Signals, cycle: int) -> None:
+        sent.position[5] += 1.0 * PERIOD * (cycle - first) * GEAR[5]
+        sent.velocity[5] = 0.0
 
     return change
 
 
 def _drift(first: int) -> Change:
-    def change(said: Signals, cycle: int) -> None:
-        said.position[JOINT] += 0.1 * PERIOD * (cycle - first) * GEAR[JOINT]
-        said.velocity[JOINT] += 0.1 * GEAR[JOINT]
+    def change(sent: Signals, cycle: int) -> None:
+        sent.position[JOINT] += 0.1 * PERIOD * (cycle - first) * GEAR[JOINT]
+        sent.velocity[JOINT] += 0.1 * GEAR[JOINT]
 
     return change
 
 
 def _stuck(first: int) -> Change:
-    def change(said: Signals, cycle: int) -> None:
-        said.position[JOINT] = motion()[first % SWING_PERIOD][0][JOINT] * GEAR[JOINT]
-        said.velocity[JOINT] = 0.0
+    def change(sent: Signals, cycle: int) -> None:
+        sent.position[JOINT] = motion()[first % SWING_PERIOD][0][JOINT] * GEAR[JOINT]
+        sent.velocity[JOINT] = 0.0
 
     return change
 
 
 def _frozen(first: int) -> Change:
-    return lambda said, cycle: said.gyro.__setitem__(LEG_IMU, [0.1, 0.2, 0.3])
+    return lambda sent, cycle: sent.gyro.__setitem__(LEG_IMU, [0.1, 0.2, 0.3])
 
 
 def _dead_cell(first: int) -> Change:
-    return lambda said, cycle: said.force.__setitem__((1, 2), 0.0)
+    return lambda sent, cycle: sent.force.__setitem__((1, 2), 0.0)
 
 
 def _lone_cell(first: int) -> Change:
-    return lambda said, cycle: said.force.__setitem__((1, 2, 2), 200.0 + said.force[1, 2, 0])
+    return lambda sent, cycle: sent.force.__setitem__((1, 2, 2), 200.0 + sent.force[1, 2, 0])
 
 
 FAULTS = {
@@ -209,12 +209,12 @@ FAULTS = {
     "gyro repeats itself": Fault(Dtc.IMU_STUCK, "IMU_RIGHT_TIBIA", 100, _frozen),
     "cell repeats itself": Fault(Dtc.FOOT_CELL, "FOOT_RIGHT", 260, _dead_cell),
     "cell contradicts the others": Fault(Dtc.FOOT_CELL, "FOOT_RIGHT", 260, _lone_cell),
-    "both feet swing": Fault(Dtc.CONTACT_IMPLAUSIBLE, "FOOT_LEFT", 21, lambda first: lambda said, cycle: None, True),
+    "both feet swing": Fault(Dtc.CONTACT_IMPLAUSIBLE, "FOOT_LEFT", 21, lambda first: lambda sent, cycle: None, True),
 }
 
 
 def cycles_until_found(line: Line, fault: Fault) -> int:
-    """Cycles until it is found and confirmed, the first faulty one being 1."""
+    """Return the number of cycles until the fault is found and confirmed; the first faulty cycle is 1."""
     line.standing = fault.stands
     line.run(20)
     line.standing = False
@@ -227,22 +227,22 @@ def cycles_until_found(line: Line, fault: Fault) -> int:
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("name", DISTURBANCES)
-def test_a_disturbance_alone_raises_nothing(name: str):
+def test_disturbance_alone_raises_nothing(name: str):
     line = Line(DISTURBANCES[name])
     for _ in range(SWING_PERIOD):
-        assert line.cycle(lambda said, cycle: None) == ()
+        assert line.cycle(lambda sent, cycle: None) == ()
 
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("name", DISTURBANCES)
-def test_a_disturbance_hides_no_fault(name: str):
+def test_disturbance_hides_no_fault(name: str):
     for what, fault in FAULTS.items():
         line = Line(DISTURBANCES[name])
         assert cycles_until_found(line, fault) <= fault.bound, what
 
 
 class TestUnchecked:
-    """A check whose messages come without values says so at once, and counts as failed after `UNCHECKED_CYCLES`."""
+    """A check whose messages arrive without values is reported immediately, and confirmed after `UNCHECKED_CYCLES`."""
 
     @pytest.mark.parametrize(
         ("quantity", "index", "unchecked"),
@@ -259,8 +259,8 @@ class TestUnchecked:
     def test_each_check_needs_its_own_messages(self, quantity: str, index: int, unchecked: set[tuple[Dtc, str]]):
         line = Line(undisturbed)
 
-        def empty(said: Signals, cycle: int) -> None:
-            getattr(said, quantity)[index] = np.nan
+        def empty(sent: Signals, cycle: int) -> None:
+            getattr(sent, quantity)[index] = np.nan
 
         found = line.run(32, empty)
         assert {(f.dtc, f.node) for f in found} == unchecked
@@ -274,17 +274,17 @@ class TestUnchecked:
         assert line.run(17) == ()
 
     @pytest.mark.parametrize("name", NAMES)
-    def test_a_silent_node_is_the_message_monitors(self, name: str):
+    def test_silent_node_is_left_to_the_message_monitor(self, name: str):
         line = Line(lambda frames, before: np.delete(frames, NAMES.index(name)))
         assert line.run(2 * UNCHECKED_CYCLES) == ()
 
-    def test_what_never_had_values_is_not_counted(self):
+    def test_message_that_never_had_values_is_not_counted(self):
         line = Line(undisturbed)
         line.receive = ReceiveImage(MESSAGES)
         line.checks = Plausibility(ROBOT, line.receive, PERIOD)
 
-        def empty(said: Signals, cycle: int) -> None:
-            said.position[3] = said.quaternion[1] = said.force[0] = np.nan
+        def empty(sent: Signals, cycle: int) -> None:
+            sent.position[3] = sent.quaternion[1] = sent.force[0] = np.nan
 
         for _ in range(2 * UNCHECKED_CYCLES):
             assert line.cycle(empty) == ()
