@@ -74,7 +74,7 @@ class Hal:
             network, "HAL", bus, tap, cyclic=len(self.messages), surplus=robot.thresholds.surplus_frames
         )
         self._limiter = Limiter(robot, PERIOD)
-        self.state.torque_sent = self._limiter.last
+        self._torque_sent = self.state.torque_sent = self._limiter.last.copy()
         self._commands = Commands(network, self._transceiver, self._parts, self._limiter.limit)
         self._status = StatusReport(network, self._transceiver, robot.hash32, gait_hash)
         self._safety_monitor = SafetyMonitor(
@@ -148,6 +148,7 @@ class Hal:
         verdict = self._safety_monitor.judge(() if transceiver.quiet else transceiver.faults())
         if verdict is not None:
             self._apply(verdict)
+        self._torque_sent[:] = self._limiter.last
         header = self._header
         header[0], header[1] = cycle, state.time
         header[7] += count

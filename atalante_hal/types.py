@@ -58,7 +58,7 @@ class State:
     age: npt.NDArray[np.int64]  # (messages,) cycles since the SYNC that the data answers
     joints_valid: bool  # all twelve joint states are fresh
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty: their age is unknown
-    torque_sent: Vector | None = None  # (12,) Nm, last command after the limits; None: unknown
+    torque_sent: Vector | None = None  # (12,) Nm, last command after the limits, set by `read`; None: unknown
 
 
 @dataclass(slots=True)

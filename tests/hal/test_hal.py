@@ -183,9 +183,11 @@ def test_a_controller_is_told_what_the_limits_left_of_its_last_command(rig):
     asked = state.torque_sent + 1e3
     rig.hal.write(Command(asked, np.zeros(8)))
     assert (rig.hal.read().torque_sent < asked).all()
-    assert np.array_equal(state.torque_sent, rig.hal._limiter.last)
-    little = state.torque_sent - 0.1
-    rig.hal.write(Command(little, np.zeros(8)))
+    before = state.torque_sent.copy()
+    little = before - 0.1
+    sent = rig.hal.write(Command(little, np.zeros(8)))
+    assert sent.tobytes() == little.tobytes()
+    assert state.torque_sent.tobytes() == before.tobytes(), "the state of a cycle changes only with the next read"
     assert rig.hal.read().torque_sent.tobytes() == little.tobytes()
 
 

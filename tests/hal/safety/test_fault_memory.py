@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.events import Event
 from atalante_hal.safety.fault_memory import EVENTS_KEPT, QUIET_CONFIRMED, QUIET_PENDING, EventLog, FaultMemory
 
@@ -33,6 +33,13 @@ def test_persistent_diagnostic_is_logged_once(memory: FaultMemory):
         assert memory.active[Dtc.NODE_TIMEOUT, "LEFT_SK"].value == cycle
     assert told(memory) == [(5, "NODE_TIMEOUT", "LEFT_SK", "error", 5)]
     assert memory.events[0].text == "LEFT_SK: a node is silent"
+
+
+@pytest.mark.parametrize("confirmed", [False, True])
+def test_a_finding_is_raised_with_all_its_fields(memory: FaultMemory, confirmed: bool):
+    memory.raise_finding(7, Finding(Dtc.ENC_JUMP, "LEFT_SK", 0.25, confirmed, "the encoder jumped"))
+    entry = memory.active[Dtc.ENC_JUMP, "LEFT_SK"]
+    assert (entry.confirmed, entry.value, entry.text, entry.cycle) == (confirmed, 0.25, "the encoder jumped", 7)
 
 
 def test_diagnostic_ends_when_it_is_not_raised_again(memory: FaultMemory):
