@@ -10,9 +10,8 @@ import numpy as np
 from atalante_dbc import Network
 from atalante_hal.record import Record
 from atalante_hal.transceiver import Transceiver
-from atalante_hal.types import SupervisorState
+from atalante_hal.types import SupervisorState, Vector
 from atalante_hal.wire.cia402 import Controlword
-from atalante_hal.wire.codec import Vector
 from atalante_hal.wire.process_image import TransmitImage
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from atalante_hal.wire.codec import Vector
+from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import ReceiveImage
 
 #: Values of `PENDANT_STATE.Request`.

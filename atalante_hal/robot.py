@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from atalante_hal.types import Vector
+
 #: Joints of one leg, hip to foot: frontal, transverse and sagittal hip; sagittal knee; sagittal and Henke ankle.
 LEG_JOINTS = ("FH", "TH", "SH", "SK", "SA", "HA")
 SIDES = ("left", "right")
@@ -31,8 +33,6 @@ MOTORS = tuple(
 )
 
 ROBOT_FILE = Path(__file__).with_name("robot.toml")
-
-Vector = npt.NDArray[np.float64]
 
 
 class RobotError(ValueError):

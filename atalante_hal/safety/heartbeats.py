@@ -16,7 +16,7 @@ from atalante_dbc import Network
 from atalante_hal.robot import Thresholds
 from atalante_hal.safety.diagnostics import Dtc, Reaction, emergency
 from atalante_hal.safety.fault_memory import FaultMemory
-from atalante_hal.wire.codec import Vector
+from atalante_hal.types import Vector
 from atalante_hal.wire.e2e import FULL, Check, suspect
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import NEVER, ReceiveImage

@@ -39,7 +39,8 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.compiled import compiled
-from atalante_hal.robot import JOINTS, Robot, Vector
+from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.types import Vector
 
 _COUNT = len(JOINTS)
 #: Results of `limit`: torque unchanged, torque of at least one joint cut, input not finite.

@@ -14,9 +14,9 @@ import numpy.typing as npt
 
 from atalante_dbc import Message, Signal
 from atalante_hal.compiled import compiled
+from atalante_hal.types import Vector
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, WORDS, Frames, new_frames
 
-Vector = npt.NDArray[np.float64]
 Words = npt.NDArray[np.int64]
 
 #: Rows of the plan, with one column per signal: payload word, shift, mask, largest code, range of codes, invalid code.

@@ -15,13 +15,13 @@ import numpy.typing as npt
 
 from atalante_dbc import Message
 from atalante_hal.compiled import compiled
+from atalante_hal.types import Vector
 from atalante_hal.wire.codec import (
     INSIDE,
     NO_CODE,
     SAYS_INVALID,
     Codec,
     SignalTable,
-    Vector,
     Words,
     encode,
     read_codes,

@@ -13,16 +13,13 @@ from struct import Struct
 from typing import Any, Final, Protocol
 
 import numpy as np
-import numpy.typing as npt
 import pybullet
 
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS
+from atalante_hal.types import PERIOD, Vector
 
-Vector = npt.NDArray[np.float64]
 Vector3 = tuple[float, float, float]
 
-#: Time step of the mechanics and period of the bus cycle [s].
-PERIOD = 1e-3
 GRAVITY = 9.81  # m/s2
 #: Solver iterations of a time step. They are part of the model, not a speed setting: the standing pose depends on them.
 SOLVER_ITERATIONS = 50

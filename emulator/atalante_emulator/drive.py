@@ -16,18 +16,15 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from atalante_emulator import emergency
-from atalante_emulator.body import PERIOD
 from atalante_emulator.emergency import Emergency, Errors, FaultReaction, reaction_to
 from atalante_emulator.encoder import Encoders
 from atalante_emulator.motor import MotorParameters, Motors
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, LEG_JOINTS, SIDES, Robot
+from atalante_hal.types import PERIOD, Vector
 from atalante_hal.wire.cia402 import AUTOMATIC, Controlword, DriveState, next_state
-
-Vector = npt.NDArray[np.float64]
 
 #: Cycles without a valid new command, or without SYNC, after which an enabled drive starts its local hold.
 WATCHDOG: Final = 5

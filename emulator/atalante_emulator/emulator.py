@@ -15,10 +15,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from atalante_dbc import Network
-from atalante_emulator.body import PERIOD, Body
+from atalante_emulator.body import Body
 from atalante_emulator.collision import Senders
 from atalante_emulator.drive import WATCHDOG, DriveParameters, Drives, DriveSignals
 from atalante_emulator.emergency import COMMAND_LOST, COMMAND_REFUSED, LIFE_GUARD, TWO_SENDERS, Emergency
@@ -33,12 +32,11 @@ from atalante_emulator.noise import NOISE_CYCLES, SensorNoise
 from atalante_emulator.pendant import Operator, PendantNode
 from atalante_hal.bus import Bus, BusFull
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, SIDES, Robot
+from atalante_hal.types import PERIOD, Vector
 from atalante_hal.wire.codec import Codec
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.frame import FRAME_BYTES, Frames, new_frames
 from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
-
-Vector = npt.NDArray[np.float64]
 
 #: Capacity of the receive buffer, in frames; a cycle has seven frames, some cycles one more.
 _RECEIVE_BUDGET = 128

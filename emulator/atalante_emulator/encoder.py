@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
-from atalante_emulator.body import PERIOD
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, Robot
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import PERIOD, Vector
 
 COUNTS = 131072  # encoder counts per motor turn, 17 bits
 LSB = 2.0 * math.pi / COUNTS  # rad at the motor

@@ -8,14 +8,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import pybullet
 
 from atalante_emulator.body import GRAVITY, load_urdf
 from atalante_hal.closing import Closing
 from atalante_hal.robot import JOINTS
+from atalante_hal.types import Vector
 
-Vector = npt.NDArray[np.float64]
 Pose = tuple[Sequence[float], Sequence[float]]  # position [m], quaternion xyzw
 
 

@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from atalante_emulator.body import Vector3
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import Vector
 
 
 @dataclass(frozen=True)

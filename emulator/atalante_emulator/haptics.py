@@ -5,12 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
-
-from atalante_emulator.body import PERIOD
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import PERIOD, Vector
 
 #: Cycles without a valid command after which the motors stop.
 WATCHDOG = 50

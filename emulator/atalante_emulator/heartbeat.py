@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from atalante_dbc import Message, Network
-from atalante_emulator.body import PERIOD
+from atalante_hal.types import PERIOD
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import TransmitImage
 

@@ -11,12 +11,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from atalante_emulator.body import GRAVITY, LINK_STATE, PERIOD
+from atalante_emulator.body import GRAVITY, LINK_STATE
 from atalante_hal.compiled import compiled
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import PERIOD, Vector
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from atalante_emulator.body import PERIOD
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, SIDES, Robot
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import PERIOD, Vector
 
 
 @dataclass(frozen=True)

@@ -9,20 +9,18 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from atalante_dbc import Network
-from atalante_emulator.body import PERIOD
 from atalante_emulator.drive import NODES, Drives
 from atalante_emulator.emergency import ERROR_RESET, Emergency, register_of
 from atalante_emulator.faults import NODE_KINDS, SENSOR_KINDS, Fault, nodes_of
 from atalante_emulator.heartbeat import Heartbeats
 from atalante_emulator.supply import HoldUp
 from atalante_hal.robot import Robot
+from atalante_hal.types import PERIOD, Vector
 from atalante_hal.wire.cia402 import AUTOMATIC, DriveState
 from atalante_hal.wire.codec import Codec
 
-Vector = npt.NDArray[np.float64]
 Nodes = Sequence[str]
 
 #: IMU signals that an IMU fault changes.

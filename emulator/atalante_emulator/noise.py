@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from atalante_emulator.drive import Drives
 from atalante_emulator.foot import Feet
 from atalante_emulator.imu import Imus
+from atalante_hal.types import Vector
 from atalante_hal.wire.codec import Codec
-
-Vector = npt.NDArray[np.float64]
 
 #: Number of cycles that one `draw` covers.
 NOISE_CYCLES: Final = 128

@@ -8,12 +8,8 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
+from atalante_hal.types import Vector
 from atalante_hal.wire.codec import Codec
-
-Vector = npt.NDArray[np.float64]
 
 #: Value of the signal `HalState` in which the operator presses START.
 HAL_READY = 1

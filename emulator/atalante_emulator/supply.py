@@ -5,12 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
-from atalante_emulator.body import PERIOD
 from atalante_hal.robot import Robot
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import PERIOD, Vector
 
 IDLE = 40.0  # W, power of the electronics of all twelve drives
 #: Copper loss of a motor at its torque limit [W].

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from atalante_dbc import Network
 from atalante_dbc.network import wire_time
-from atalante_emulator.body import PERIOD
+from atalante_hal.types import PERIOD
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, Frames, new_frames
 
 

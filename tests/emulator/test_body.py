@@ -7,8 +7,9 @@ import pinocchio
 import pytest
 
 from atalante_control.model import ExoskeletonParameters, imu_link, pad_link, pinocchio_model, urdf
-from atalante_emulator.body import GRAVITY, PERIOD, PyBulletBody
+from atalante_emulator.body import GRAVITY, PyBulletBody
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, load_robot
+from atalante_hal.types import PERIOD
 
 ROBOT = load_robot()
 TEXT = urdf(ExoskeletonParameters(), ROBOT)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from atalante_emulator import emergency
-from atalante_emulator.body import PERIOD
 from atalante_emulator.drive import NODES, SLOW_CYCLES, WATCHDOG, DriveParameters, Drives, DriveSignals
 from atalante_emulator.emergency import Emergency
 from atalante_emulator.encoder import COUNTS
 from atalante_emulator.motor import MotorParameters
 from atalante_hal.robot import Robot, load_robot
+from atalante_hal.types import PERIOD
 from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_towards_operation
 
 ROBOT = load_robot()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from atalante_dbc import Network
-from atalante_emulator.body import PERIOD, PyBulletBody
+from atalante_emulator.body import PyBulletBody
 from atalante_emulator.drive import WATCHDOG
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
@@ -14,6 +14,7 @@ from atalante_hal.bus import Bus
 from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.types import PERIOD
 from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_towards_operation
 from atalante_hal.wire.e2e import crc, data_id_bytes
 from atalante_hal.wire.frame import Frames, new_frames

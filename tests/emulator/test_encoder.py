@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from atalante_emulator.body import PERIOD
 from atalante_emulator.encoder import COUNTS, Encoders
 from atalante_hal.robot import Robot
+from atalante_hal.types import PERIOD
 
 LSB = 2.0 * math.pi / COUNTS  # rad at the motor
 

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from atalante_emulator.body import PERIOD
 from atalante_emulator.haptics import WATCHDOG, Haptics, HapticsParameters
+from atalante_hal.types import PERIOD
 
 RISE = HapticsParameters().rise_time
 LEVEL = np.array([0.0, 0.25, 0.5, 1.0, 0.0, 0.0, 0.75, 0.1])

@@ -7,9 +7,10 @@ import pinocchio
 import pytest
 
 from atalante_control.model import imu_link, pinocchio_model
-from atalante_emulator.body import GRAVITY, PERIOD, PyBulletBody
+from atalante_emulator.body import GRAVITY, PyBulletBody
 from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
 from atalante_hal.robot import IMUS
+from atalante_hal.types import PERIOD
 
 
 def signals() -> ImuSignals:

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from atalante_emulator.body import PERIOD
 from atalante_emulator.motor import MotorParameters, Motors
 from atalante_hal.robot import Robot
+from atalante_hal.types import PERIOD
 
 SMOOTH = MotorParameters(coulomb=(0.0,) * 6, viscous=(0.0,) * 6)
 ALL, NONE = np.ones(12, np.bool_), np.zeros(12, np.bool_)

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from atalante_dbc import Network
-from atalante_emulator.body import PERIOD, PyBulletBody
+from atalante_emulator.body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.faults import Fault, FaultError
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus.pair import PairBus, lockstep_pair
 from atalante_hal.robot import Robot
+from atalante_hal.types import PERIOD
 from atalante_hal.wire.cia402 import DriveState, controlword_towards_operation
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_hal.wire.process_image import ReceiveImage, TransmitImage

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from atalante_emulator.body import PERIOD
 from atalante_emulator.supply import COPPER, IDLE, HoldUp
 from atalante_hal.robot import Robot
+from atalante_hal.types import PERIOD
 
 NOTHING = np.zeros(12)
 

@@ -4,8 +4,8 @@ import pytest
 
 from atalante_dbc import Network
 from atalante_dbc.network import wire_time
-from atalante_emulator.body import PERIOD
 from atalante_emulator.wire import Babble, Wire
+from atalante_hal.types import PERIOD
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, Frames
 from atalante_hal.wire.process_image import TransmitImage
 

@@ -19,9 +19,10 @@ from typing import NamedTuple
 import numpy as np
 
 from atalante_hal.compiled import compiled
-from atalante_hal.robot import JOINTS, Robot, Vector
+from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Cycles, Signals
+from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import NEVER
 
 #: Number of jumps in a row, without a good value between them, after which the diagnostic is confirmed.

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, Vector
+from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS
+from atalante_hal.types import Vector
 from atalante_hal.wire.codec import Codec
 from atalante_hal.wire.process_image import NEVER
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 import math
 
 from atalante_hal.compiled import compiled
-from atalante_hal.robot import IMUS, Robot, Vector
+from atalante_hal.robot import IMUS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import IMU_NODES, Signals
+from atalante_hal.types import Vector
 from atalante_hal.wire.codec import Codec
 
 #: Time without a good value after which the diagnostic of an IMU is confirmed [cycles].

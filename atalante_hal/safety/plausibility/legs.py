@@ -28,9 +28,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.robot import IMUS, JOINTS, SIDES, Robot, Vector
+from atalante_hal.robot import IMUS, JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Signals
+from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import NEVER
 
 #: Number of samples in a row after which a drift and a stuck encoder are reported.

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from atalante_hal.robot import Robot, Vector
+from atalante_hal.robot import Robot
 from atalante_hal.safety.diagnostics import Finding
 from atalante_hal.safety.plausibility.encoders import EncoderChecks
 from atalante_hal.safety.plausibility.feet import FootChecks
@@ -21,6 +21,7 @@ from atalante_hal.safety.plausibility.imus import Imus
 from atalante_hal.safety.plausibility.legs import Legs
 from atalante_hal.safety.plausibility.stillness import Stillness
 from atalante_hal.safety.plausibility.unchecked import Unchecked
+from atalante_hal.types import Vector
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 

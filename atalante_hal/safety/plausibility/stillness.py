@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, Robot, Vector
+from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import (
     FOOT_NODES,
@@ -24,6 +24,7 @@ from atalante_hal.safety.plausibility.finding import (
     Signals,
     measured,
 )
+from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Maximum detection times for an encoder and for a gyro or force cell, from the first repeated sample [cycles].

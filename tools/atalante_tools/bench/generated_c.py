@@ -19,14 +19,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from atalante_dbc import DBC_FILE, Message
+from atalante_hal.types import Vector
 from atalante_hal.wire.codec import Codec
 from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES, Frames
-
-Vector = npt.NDArray[np.float64]
 
 COMPILER = "gcc"
 _NODE = "HAL"

@@ -24,14 +24,12 @@ from atalante_dbc import Message, Network
 from atalante_hal.bus import Stamps
 from atalante_hal.hal import Hal
 from atalante_hal.robot import JOINTS, Robot, load_robot
-from atalante_hal.types import Command, State, SupervisorState
+from atalante_hal.types import PERIOD, Command, State, SupervisorState, Vector
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.e2e import COUNTER_BYTE
 from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES, Frames, new_frames
 from atalante_hal.wire.process_image import TransmitImage
 from atalante_tools.bench.measure import require
-
-Vector = npt.NDArray[np.float64]
 
 #: Number of cycles after which an alive counter starts again at 0.
 TURN = 256
@@ -41,7 +39,6 @@ POSES = 15
 ERROR = 0.01
 #: Rate of the tracking error of the recorded joints [rad/s].
 ERROR_RATE = 0.05
-PERIOD = 1e-3  # s
 ASSISTANCE = 0.5
 _E2E = Struct("<HB")
 

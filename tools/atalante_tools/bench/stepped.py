@@ -8,12 +8,10 @@ integrated together, which needs the fewest numpy operations per step.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from atalante_control.gait.gait import PERIOD
 from atalante_control.guide.filter import GuideFilter
-
-Vector = npt.NDArray[np.float64]
+from atalante_hal.types import Vector
 
 
 class SteppedRollouts:

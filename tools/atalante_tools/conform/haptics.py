@@ -6,14 +6,12 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from atalante_hal.types import Vector
 from atalante_hal.wire.frame import Frames
 from atalante_tools.conform.frames import ReceivedFrame
 from atalante_tools.conform.node_tester import NodeTester, NotTested
 from atalante_tools.conform.requirement import Outcome, Requirement
-
-Vector = npt.NDArray[np.float64]
 
 E2E: Final = "AUTOSAR E2E Profile 5"
 #: Largest time constant of a motor [s].

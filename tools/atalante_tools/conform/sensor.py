@@ -7,13 +7,10 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
-from atalante_hal.types import PERIOD
+from atalante_hal.types import PERIOD, Vector
 from atalante_tools.conform.node_tester import NodeTester, NotTested
 from atalante_tools.conform.requirement import Outcome, Requirement
-
-Vector = npt.NDArray[np.float64]
 
 GRAVITY: Final = 9.81  # m/s2
 #: Number of cycles over which a sensor is measured.

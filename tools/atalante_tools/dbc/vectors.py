@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc import Message, Signal
-from atalante_hal.wire.codec import Vector
+from atalante_hal.types import Vector
 from atalante_hal.wire.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
 from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES
 from atalante_hal.wire.process_image import TransmitImage

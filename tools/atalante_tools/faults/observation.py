@@ -10,10 +10,8 @@ import numpy.typing as npt
 from atalante_dbc import Network
 from atalante_hal.robot import Robot
 from atalante_hal.safety.events import Event
-from atalante_hal.types import SupervisorState
+from atalante_hal.types import SupervisorState, Vector
 from atalante_tools.faults.command_check import Commands
-
-Vector = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

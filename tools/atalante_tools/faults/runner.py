@@ -23,7 +23,7 @@ from atalante_dbc import Network
 from atalante_emulator.faults import Fault
 from atalante_hal.loop import run
 from atalante_hal.robot import Robot, load_robot
-from atalante_hal.types import State, SupervisorState
+from atalante_hal.types import State, SupervisorState, Vector
 from atalante_tools.console.options import EMBEDDED, Target
 from atalante_tools.faults.command_check import Commands, SentFrames
 from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, HostFaults
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from atalante_emulator.pendant import Operator
     from atalante_hal.safety.events import Event
 
-Vector = npt.NDArray[np.float64]
 #: Telemetry fields of the controller: tracking error of the assisted joints, and half-width of their guide [rad].
 _GUIDE: Final = ("error", "q_bound")
 #: Controller settings. The startup is short, because the robot is already in the first pose of the gait.

@@ -7,20 +7,18 @@ from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
-import numpy.typing as npt
 import pinocchio
 
 from atalante_control.dynamics.stance import stance_dynamics
 from atalante_control.gait.gait import Gait, motion
 from atalante_control.model import BASE_LINK, LEG_LINKS, ExoskeletonParameters, Patient, pinocchio_model, urdf
 from atalante_hal.robot import LEG_JOINTS, SIDES, load_robot
+from atalante_hal.types import Vector
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.patches import Rectangle
-
-Vector = npt.NDArray[np.float64]
 
 _SAMPLES = 101
 _FRAMES_A_SECOND = 25

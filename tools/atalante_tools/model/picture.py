@@ -8,15 +8,13 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
-import numpy.typing as npt
 
 from atalante_control.model import Box, Link
+from atalante_hal.types import Vector
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.patches import Polygon
-
-Vector = npt.NDArray[np.float64]
 
 #: Joint angles in the picture [rad].
 _POSE = {"SH": -0.25, "SK": 0.5, "SA": -0.25}

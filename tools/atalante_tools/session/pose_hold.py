@@ -10,8 +10,8 @@ import numpy as np
 
 from atalante_control.dynamics.gravity import Gravity
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
-from atalante_hal.robot import IMUS, JOINTS, MOTORS, Robot, Vector
-from atalante_hal.types import PERIOD, Command, State
+from atalante_hal.robot import IMUS, JOINTS, MOTORS, Robot
+from atalante_hal.types import PERIOD, Command, State, Vector
 
 _PELVIS: Final = IMUS.index("pelvis")
 #: Peak over mean speed of the minimum-jerk profile: s'(1/2).

@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from atalante_hal.types import Vector
 from atalante_tools.canlog.validate.report import Report, verdict
 from atalante_tools.canlog.validate.rules import RULES
 from atalante_tools.canlog.validate.timing_rules import BINS, BINS_A_CYCLE
-
-Vector = npt.NDArray[np.float64]
 
 _WIDTH, _HEIGHT = 760, 200
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 28, 24, 36

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from atalante_hal.types import Vector
 from atalante_hal.wire.codec import group_of
 from atalante_tools.canlog.plan import Family, Plan
 from atalante_tools.canlog.stream import Stream
@@ -18,7 +19,6 @@ from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.project import Project
 from atalante_tools.canlog.validate.value_rules import Decoded
 
-Vector = npt.NDArray[np.float64]
 _ELEMENTS = 4  # elements of a quaternion
 
 

@@ -9,13 +9,12 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from atalante_hal.types import Vector
 from atalante_tools.canlog.plan import Plan, Rows
 from atalante_tools.canlog.stream import Stream
 from atalante_tools.canlog.validate.e2e_rules import REPEATED, Steps
 from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.project import Project
-
-Vector = npt.NDArray[np.float64]
 
 #: Interval histogram: bins per cycle, and range in cycles. The last bin counts all longer intervals.
 BINS_A_CYCLE, CYCLES = 100, 4
