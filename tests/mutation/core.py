@@ -1,10 +1,10 @@
-"""The safety core, and the tests that have to notice a change of it: what is mutated, and what has to be covered whole."""
+"""Safety core: the files for mutation testing and coverage, and the tests that must detect errors in them."""
 
 from __future__ import annotations
 
 _PLAUSIBILITY = ("finding", "encoders", "imus", "legs", "feet", "stillness", "unchecked", "plausibility")
 _PLAUSIBILITY_TESTS = ("encoders", "imus", "legs", "feet", "stillness", "plausibility", "ridden_through")
-#: The safety core: files that are judged together, and the tests that have to notice a change of them.
+#: Part of the safety core -> files of the part, and the tests that must detect a change of these files.
 CORE = {
     "e2e": (("atalante_hal/wire/e2e.py",), ("hal/wire/test_e2e.py", "hal/wire/test_process_image.py")),
     "process_image": (("atalante_hal/wire/process_image.py",), ("hal/wire/test_process_image.py",)),

@@ -1,8 +1,8 @@
-"""Line and branch coverage of the safety core by its own tests alone: it ends with 1 when less than all of it is covered.
+"""Measure line and branch coverage of the safety core by its own tests. The exit code is 1 if the coverage is below 100 %.
 
     python tests/mutation/cover.py      or `make coverage`
 
-What a property test draws a hundred times is drawn a few times here: once is enough to come through a line.
+Property tests use only a few examples here, because a single example is enough to cover a line.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from pathlib import Path
 from core import CORE
 
 ROOT = Path(__file__).resolve().parents[2]
-#: Where the files of the core are, under the roots of their packages.
+#: Root folders of the packages.
 ROOTS = (".", "control", "emulator")
 
 
 def main() -> int:
-    """Run the tests of the core, report."""
+    """Run the tests of the safety core and print the coverage."""
     files = [
         path for files, _ in CORE.values() for file in files for root in ROOTS if (path := ROOT / root / file).exists()
     ]
@@ -29,7 +29,7 @@ def main() -> int:
     include = ",".join(map(str, files))
     coverage = [sys.executable, "-m", "coverage"]
     with tempfile.TemporaryDirectory() as folder:
-        # Machine code has no lines.
+        # Coverage cannot measure compiled functions, so compilation is off.
         environment = {**os.environ, "COVERAGE_FILE": str(Path(folder) / "coverage"), "NUMBA_DISABLE_JIT": "1"}
         run = [
             "run",

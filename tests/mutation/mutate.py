@@ -1,13 +1,15 @@
-"""Mutation testing of the safety core with mutmut: every surviving mutant is argued in SURVIVORS.md, or a test is missing.
+"""Mutation testing of the safety core with mutmut.
 
     python tests/mutation/mutate.py [PART...] [--without PART...]
 
-or `make mutation`; parts such as limiter, default: all of the core.
+or `make mutation`. PART is a part of the safety core, such as limiter. The default is the whole safety core.
 
-Each part is judged by its own tests alone, in a copy of the project under .mutation/ that is laid out as mutmut wants it. A
-mutant that was killed stays so until its function changes; one that lived is judged again every time. Take .mutation/ away to
-begin anew. It ends with 1 when fewer than 95 % of the mutants are killed, when a mutant survives that is not listed, or when a
-listed one does not exist any more.
+mutmut makes small changes (mutants) in the source code. A mutant is killed if a test fails, otherwise it survives. The file
+SURVIVORS.md lists the accepted survivors with reasons. Each part is tested by its own tests only, in a copy of the project in
+.mutation/. A killed mutant is not tested again until its function changes. A surviving mutant is tested in every run. Delete
+.mutation/ to test all mutants.
+
+The exit code is 1 if fewer than 95 % of the mutants are killed, if a survivor is not listed, or if a listed mutant is killed.
 """
 
 from __future__ import annotations
@@ -35,15 +37,13 @@ SURVIVORS = HERE / "SURVIVORS.md"
 REQUIRED = 0.95
 
 PACKAGES = ("atalante_hal", "dbc/atalante_dbc", "control/atalante_control", "emulator/atalante_emulator")
-#: mutmut's exit codes of a mutant that lives: survived, and no test at all.
-LIVES = (0, 33)
-#: And of one that was never judged.
-UNKNOWN = (None, 2, 37)
+#: Exit codes of mutmut for a survivor: all tests passed, and no test reaches the mutant.
+SURVIVED = (0, 33)
+#: Exit codes of mutmut for a mutant that was not tested.
+NOT_TESTED = (None, 2, 37)
 
-#: Each mutant is a pytest of its own, which spent most of its time on plugins and on collecting garbage.
-PLUGINS = (
-    "-p impatience -p _hypothesis_pytestplugin -p no:cacheprovider -p no:unraisableexception -p no:threadexception"
-)
+#: Options of pytest. Each mutant runs pytest once, so unnecessary plugins would take most of the time.
+PLUGINS = "-p mutant_time_limit -p _hypothesis_pytestplugin -p no:cacheprovider -p no:unraisableexception -p no:threadexception"
 PYPROJECT = """
 [tool.pytest.ini_options]
 testpaths = ["tests"]
@@ -63,7 +63,7 @@ timeout_multiplier = 3.0
 
 @dataclass(frozen=True)
 class Mutant:
-    """A mutant as its file would show it; the number mutmut gives it changes with every edit, this does not."""
+    """Mutant, identified by its change of the source code. The number that mutmut assigns depends on the other mutants."""
 
     function: str
     removed: tuple[str, ...]
@@ -74,31 +74,31 @@ class Mutant:
         return f"## `{self.function}`\n\n```diff\n" + "\n".join(lines) + "\n```\n"
 
 
-class Trial:
-    """The mutants of a part of the core and the tests that are to notice them, in a directory of their own."""
+class PartTest:
+    """Mutation test of one part of the safety core, in a directory of its own."""
 
     def __init__(self, part: str) -> None:
         self._part, (self._files, self._tests) = part, CORE[part]
         self._work = WORK / part
 
-    def lay_out(self) -> None:
-        """Copy the project; files that are as they were keep their time, and the mutants in them their verdicts."""
+    def prepare(self) -> None:
+        """Copy the project. Results of mutants in unchanged functions are kept."""
         self._work.mkdir(parents=True, exist_ok=True)
         before = self._sources()
-        # mutmut does not copy data again that it has copied once.
+        # Delete old copies, because mutmut does not update files that it has copied before.
         mutants = self._work / "mutants"
-        ours = (*self._files, "mutmut-stats.json")
+        kept = (*self._files, "mutmut-stats.json")
         for old in mutants.rglob("*"):
-            if old.is_file() and not str(old.relative_to(mutants)).startswith(ours):
+            if old.is_file() and not str(old.relative_to(mutants)).startswith(kept):
                 old.unlink()
-        # The witness of the tests reads the DBC where it is in the project.
+        # The tests read the DBC file in its folder of the project, so it is copied twice.
         for package in (*PACKAGES, "dbc", "tests"):
             target = self._work / Path(package).name
             if target.exists():
                 shutil.rmtree(target)
             shutil.copytree(ROOT / package, target, ignore=shutil.ignore_patterns("__pycache__", ".*", "mutation"))
         if self._sources() != before:
-            # Which tests reach a function was asked before it was there.
+            # The statistics are out of date: they list the tests that reach each function.
             (mutants / "mutmut-stats.json").unlink(missing_ok=True)
         text = PYPROJECT.format(
             packages=json.dumps([Path(package).name for package in PACKAGES]),
@@ -109,28 +109,28 @@ class Trial:
         (self._work / "pyproject.toml").write_text(text)
 
     def _sources(self) -> dict[str, bytes]:
-        """The files of the part and their tests, as they are laid out."""
+        """Return the copied files of the part and of its tests: name -> content."""
         paths = [self._work / name for name in (*self._files, *(f"tests/{test}" for test in self._tests))]
         return {path.name: path.read_bytes() for path in paths if path.exists()}
 
-    def judge(self, children: int) -> None:
-        """Let mutmut judge every mutant that was not killed before; it shows its progress itself, at a terminal.
+    def run(self, children: int) -> None:
+        """Test all mutants that were not killed before. On a terminal, mutmut shows its progress.
 
         Raises:
-            SystemExit: it failed.
+            SystemExit: If mutmut fails.
         """
         for file in self._files:
             meta = self._meta(file)
             if meta.exists():
-                said = json.loads(meta.read_text())
-                codes = said["exit_code_by_key"]
-                said["exit_code_by_key"] = {name: None if code in LIVES else code for name, code in codes.items()}
-                meta.write_text(json.dumps(said))
+                record = json.loads(meta.read_text())
+                codes = record["exit_code_by_key"]
+                record["exit_code_by_key"] = {name: None if code in SURVIVED else code for name, code in codes.items()}
+                meta.write_text(json.dumps(record))
         environment = {
             **os.environ,
             "PYTHONPATH": str(HERE),
             "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
-            "NUMBA_DISABLE_JIT": "1",  # machine code has no mutants
+            "NUMBA_DISABLE_JIT": "1",  # compiled functions have no mutants
             "HYPOTHESIS_STORAGE_DIRECTORY": str(self._work / ".hypothesis"),
         }
         command = [sys.executable, "-m", "mutmut", "run", "--max-children", str(children)]
@@ -139,27 +139,27 @@ class Trial:
             command, cwd=self._work, env=environment, stdout=output, stderr=subprocess.STDOUT, text=True, check=False
         )
         if done.returncode:
-            sys.exit(f"{done.stdout or ''}\nmutmut failed with the part {self._part} (exit code {done.returncode})")
+            sys.exit(f"{done.stdout or ''}\nmutmut failed in part {self._part} (exit code {done.returncode})")
 
-    def verdicts(self) -> Iterator[tuple[str, int, list[Mutant]]]:
-        """Each module's name, how many mutants it has, and those that live.
+    def results(self) -> Iterator[tuple[str, int, list[Mutant]]]:
+        """Yield the name, the number of mutants and the survivors of each module.
 
         Raises:
-            SystemExit: a mutant was not judged.
+            SystemExit: If a mutant was not tested.
         """
         for file in self._files:
             codes: dict[str, int | None] = json.loads(self._meta(file).read_text())["exit_code_by_key"]
             for name, code in codes.items():
-                if code in UNKNOWN:
-                    sys.exit(f"{name} was not judged (exit code {code}); run it again")
-            alive = [self._mutant(file, name) for name, code in codes.items() if code in LIVES]
-            yield _module(file), len(codes), alive
+                if code in NOT_TESTED:
+                    sys.exit(f"the mutant {name} was not tested (exit code {code}): run the command again")
+            survivors = [self._mutant(file, name) for name, code in codes.items() if code in SURVIVED]
+            yield _module(file), len(codes), survivors
 
     def _meta(self, file: str) -> Path:
         return self._work / "mutants" / f"{file}.meta"
 
     def _mutant(self, file: str, name: str) -> Mutant:
-        """The mutant of mutmut's name."""
+        """Return the mutant with a name of mutmut."""
         with chdir(self._work):
             shown = get_diff_for_mutant(name, path=file).splitlines()
         changed = [line for line in shown if line[:1] in "+-" and not line.startswith(("+++", "---"))]
@@ -177,50 +177,57 @@ _ENTRY = re.compile(r"^## `([^`]+)`\n\n```diff\n(.*?)\n```\n\n(\S.*?)(?=\n## |\Z
 
 
 def listed(text: str) -> dict[Mutant, str]:
-    """The survivors of SURVIVORS.md, each with its argument."""
+    """Return the survivors listed in SURVIVORS.md, each with its reason."""
     found = {}
-    for function, diff, argument in _ENTRY.findall(text):
+    for function, diff, reason in _ENTRY.findall(text):
         lines = diff.splitlines()
         removed, added = (tuple(line[1:].strip() for line in lines if line[0] == sign) for sign in "-+")
-        found[Mutant(function, removed, added)] = argument.strip()
+        found[Mutant(function, removed, added)] = reason.strip()
     return found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Mutate, judge, compare with the list."""
+    """Test the mutants and compare the survivors with SURVIVORS.md."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", nargs="*", choices=[*CORE, []], metavar="PART", help=", ".join(CORE) + "; default: all")
-    parser.add_argument("--without", nargs="+", choices=CORE, default=[], metavar="PART", help="parts to leave out")
-    parser.add_argument("--children", type=int, default=os.cpu_count() or 1, help="mutants at a time")
-    wanted = parser.parse_args(arguments)
+    parts_help = f"parts to test: {', '.join(CORE)}; default: all"
+    parser.add_argument("part", nargs="*", choices=[*CORE, []], metavar="PART", help=parts_help)
+    parser.add_argument(
+        "--without", nargs="+", choices=CORE, default=[], metavar="PART", help="parts that are not tested"
+    )
+    parser.add_argument(
+        "--children", type=int, default=os.cpu_count() or 1, help="mutants tested in parallel; default: number of cores"
+    )
+    options = parser.parse_args(arguments)
     known = listed(SURVIVORS.read_text(encoding="utf-8"))
     modules: list[str] = []
-    alive: list[Mutant] = []
+    survivors: list[Mutant] = []
     total = 0
-    parts = [part for part in wanted.part or CORE if part not in wanted.without]
+    parts = [part for part in options.part or CORE if part not in options.without]
     if not parts:
-        parser.error("no part is left")
+        parser.error("--without must leave at least one part, got all parts")
     for part in parts:
-        trial, start = Trial(part), time.monotonic()
-        trial.lay_out()
-        trial.judge(wanted.children)
-        for module, count, living in trial.verdicts():
+        part_test, start = PartTest(part), time.monotonic()
+        part_test.prepare()
+        part_test.run(options.children)
+        for module, count, alive in part_test.results():
             modules.append(module)
-            alive += living
+            survivors += alive
             total += count
-            print(f"{module}: {count - len(living)} of {count} mutants killed", flush=True)
+            print(f"{module}: {count - len(alive)} of {count} mutants killed", flush=True)
         print(f"{part}: {time.monotonic() - start:.0f} s", flush=True)
-    unlisted = [m for m in alive if m not in known]
-    gone = [m for m in known if m not in alive and any(m.function.startswith(f"{module}.") for module in modules)]
-    for survivor in unlisted:
-        print(f"\nlives and is not in SURVIVORS.md; kill it with a test, or argue it there:\n\n{survivor}")
-    for survivor in gone:
-        print(f"\nis in SURVIVORS.md and does not live; take it out:\n\n{survivor}")
-    for part in wanted.without:
-        print(f"\n{part} was left out")
-    score = 1.0 - len(alive) / total
-    print(f"\n{score:.1%} of {total} mutants killed, {REQUIRED:.0%} are required")
-    return int(score < REQUIRED or bool(unlisted) or bool(gone))
+    unlisted = [m for m in survivors if m not in known]
+    killed = [m for m in known if m not in survivors and any(m.function.startswith(f"{module}.") for module in modules)]
+    for mutant in unlisted:
+        print(
+            f"\nsurvived, but is not in SURVIVORS.md: add a test that kills it, or list it with a reason:\n\n{mutant}"
+        )
+    for mutant in killed:
+        print(f"\nis in SURVIVORS.md, but did not survive: remove it from the list:\n\n{mutant}")
+    for part in options.without:
+        print(f"\n{part} was not tested")
+    score = 1.0 - len(survivors) / total
+    print(f"\n{score:.1%} of {total} mutants killed, at least {REQUIRED:.0%} are required")
+    return int(score < REQUIRED or bool(unlisted) or bool(killed))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""A pytest plugin for mutants, so that they die soon.
+"""Pytest plugin that shortens the test runs of mutants.
 
-A test that takes much longer than it used to fails, where mutmut would wait for minutes. And of a test with many parameters one
-comes first, then another one of each: most mutants are noticed by some test, whatever its parameters.
+A test fails if it takes much longer than without a mutant; mutmut alone would wait for minutes. The plugin also sorts the tests:
+first one parameter set of every test, then the second parameter set of every test, and so on. Most mutants fail with any
+parameters.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ import pytest
 from mutmut.mutation.trampoline import get_mutant_under_test
 from mutmut.state import state
 
-#: In the name of every mutant.
+#: Part of the name of every mutant.
 MUTANT = "__mutmut_"
 
-#: CPU time [s] a test may take, and times its usual duration on top.
-AT_LEAST, TIMES = 2.0, 4.0
+#: The time limit of a test is the constant part plus a multiple of its usual duration [s of processor time].
+CONSTANT, MULTIPLE = 2.0, 4.0
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -32,16 +33,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _fail(number: int, frame: object) -> None:
-    pytest.fail("runs for ever")
+    pytest.fail("the test must end within its time limit")
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
     usual = state().duration_by_test.get(item.nodeid)
-    # Not in the run without a mutant: how long a test took is from the last run, and it may have grown since.
+    # No time limit without a mutant: the usual duration is from an earlier run, and the test may be longer now.
     if usual and MUTANT in get_mutant_under_test():
         signal.signal(signal.SIGPROF, _fail)
-        signal.setitimer(signal.ITIMER_PROF, AT_LEAST + TIMES * usual)
+        signal.setitimer(signal.ITIMER_PROF, CONSTANT + MULTIPLE * usual)
     try:
         return (yield)
     finally:
