@@ -1,1 +1,1 @@
-"""Emulated robot at the other end of the bus: nodes, PyBullet body and injected faults."""
+"""Emulated robot on a CAN bus: nodes, mechanics in PyBullet, and fault injection."""

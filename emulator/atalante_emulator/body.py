@@ -1,7 +1,7 @@
-"""Mechanics of the emulated robot: joint torques in, one millisecond of motion, sensor arrays out.
+"""Mechanics of the emulated robot: computes one millisecond of motion from the joint torques.
 
-`Body` is the interface between the nodes and a physics engine; `PyBulletBody` implements it from a URDF text. The pelvis is
-fixed: the exoskeleton is suspended in the air. A floating base would change `PyBulletBody` alone, not the interface.
+`Body` is the interface between the nodes and a physics engine. `PyBulletBody` implements it from a URDF text. The pelvis is
+fixed, because the exoskeleton is suspended in the air.
 """
 
 from __future__ import annotations
@@ -21,40 +21,40 @@ from atalante_hal.types import PERIOD, Vector
 Vector3 = tuple[float, float, float]
 
 GRAVITY = 9.81  # m/s2
-#: Solver iterations of a time step. They are part of the model, not a speed setting: the standing pose depends on them.
+#: Number of solver iterations in each time step. It changes the computed motion.
 SOLVER_ITERATIONS = 50
-#: Count of numbers in a link state, in world axes: quaternion xyzw, velocity [m/s], angular velocity [rad/s].
+#: Length of a link state in world axes: quaternion xyzw (4), velocity [m/s] (3), angular velocity [rad/s] (3).
 LINK_STATE: Final = 10
-#: Indices into the tuple that PyBullet returns as link state.
+#: Indices of attitude, velocity and angular velocity in the link state tuple of PyBullet.
 _ATTITUDE, _LINEAR, _ANGULAR = 5, 6, 7
 _PACK_JOINTS, _PACK_LINK = Struct(f"{2 * len(JOINTS)}d").pack_into, Struct(f"{LINK_STATE}d").pack_into
 
 
 class Body(Protocol):
-    """Interface of the mechanics to the nodes.
+    """Interface of the robot's mechanics, as the emulated nodes use it.
 
-    The array objects stay the same; only `reset` and `step` change their contents.
+    The properties always return the same array objects. Only `reset` and `step` change their contents.
     """
 
     @property
     def position(self) -> Vector:
-        """Joint positions, shape (12,) [rad], order of JOINTS."""
+        """Joint positions in the order of JOINTS, shape (12,) [rad]."""
 
     @property
     def velocity(self) -> Vector:
-        """Joint velocities, shape (12,) [rad/s], order of JOINTS."""
+        """Joint velocities in the order of JOINTS, shape (12,) [rad/s]."""
 
     @property
     def imu(self) -> Vector:
-        """Attitude and velocities of the IMU links, order of IMUS, shape (4, LINK_STATE)."""
+        """Link states of the four IMU links in the order of IMUS, shape (4, LINK_STATE)."""
 
     @property
     def contact(self) -> Sequence[tuple[int, int, Vector3]]:
-        """Contacts of the last step: index into FEET, index into CELLS, force on the cell in world axes [N]."""
+        """Contacts of the last step, each with index of the foot, index of the force cell, and force in world axes [N]."""
 
     @property
     def foot_rotation(self) -> Sequence[tuple[float, ...]]:
-        """Attitude of each foot, quaternion xyzw, order of FEET; updated only while a foot is in contact."""
+        """Attitude of each foot in the order of FEET, quaternion xyzw. It is updated only in steps with a contact."""
 
     def reset(self, position: Sequence[float]) -> None:
         """Set the joint positions and zero the velocities.
@@ -93,7 +93,7 @@ class PyBulletBody:
         Raises:
             ValueError: If the text is not a URDF, or a required joint or link is missing.
         """
-        # Every body gets a new client, which makes two runs identical; restoring a saved state does not.
+        # A new physics client makes two runs identical. Restoring a saved state does not.
         self._client = pybullet.connect(pybullet.DIRECT)
         client = {"physicsClientId": self._client}
         pybullet.setPhysicsEngineParameter(
@@ -112,11 +112,11 @@ class PyBulletBody:
             raise
         for link in range(-1, self._links):
             pybullet.changeDynamics(self._body, link, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, **client)
-        # PyBullet's default velocity motors would brake every joint.
+        # By default, PyBullet brakes every joint with a velocity motor. Zero force switches the motor off.
         pybullet.setJointMotorControlArray(
             self._body, self._joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * len(JOINTS), **client
         )
-        self._touches = ground is not None  # the links do not collide with each other
+        self._touches = ground is not None  # the only possible contacts are those with the floor
         if self._touches:
             plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, **client)
             pybullet.createMultiBody(0.0, plane, basePosition=[0.0, 0.0, ground], **client)
@@ -150,7 +150,7 @@ class PyBulletBody:
         self._feet = find([f"{foot}_foot" for foot in FEET], links, "link")
         pads = find([f"{foot}_foot_{cell}" for foot in FEET for cell in CELLS], links, "link")
         self._cell_of = {pad: divmod(index, len(CELLS)) for index, pad in enumerate(pads)}
-        #: Rows of the IMUs that a joint can move; the others are fixed to the pelvis.
+        #: Rows of the IMUs on moving links. The other IMUs are fixed to the pelvis.
         self._moving = [row for row, link in enumerate(self._imus) if _is_movable(link, set(self._joints), infos)]
         self._moving_links = [self._imus[row] for row in self._moving]
 
@@ -167,7 +167,7 @@ class PyBulletBody:
         for joint, angle in zip(self._joints, position, strict=True):
             pybullet.resetJointState(self._body, joint, angle, 0.0, physicsClientId=self._client)
         self._unpack(*self._read())
-        self.contact = ()  # contacts belong to a step, and there was no step since the reset
+        self.contact = ()  # no step since the reset, so no contacts
 
     def step(self, torque: Sequence[float]) -> None:
         """Apply joint torques for one `PERIOD` and update all arrays.
@@ -178,7 +178,7 @@ class PyBulletBody:
         self._unpack(*self.exchange(torque))
 
     def exchange(self, torque: Sequence[float]) -> tuple[Any, Any, Any]:
-        """Run the PyBullet calls of `step` without unpacking the results; benchmarks use it as baseline.
+        """Run the PyBullet calls of `step` without unpacking the results. Benchmarks use this as a baseline.
 
         Args:
             torque: joint torques, shape (12,) [Nm].
@@ -186,7 +186,7 @@ class PyBulletBody:
         Returns:
             Joint states, link states and contacts, as PyBullet returns them.
         """
-        # PyBullet forgets the torques after one step, so they are set before each.
+        # PyBullet resets the torques to zero after each step.
         pybullet.setJointMotorControlArray(
             self._body, self._joints, pybullet.TORQUE_CONTROL, forces=torque, physicsClientId=self._client
         )
@@ -201,7 +201,7 @@ class PyBulletBody:
         )
 
     def _unpack(self, joints: Any, links: Any, contacts: Any) -> None:
-        # Written out because a loop over the joints takes twice as long.
+        # A loop over the joints would take twice as long.
         a, b, c, d, e, f, g, h, i, j, k, m = joints
         position = a[0], b[0], c[0], d[0], e[0], f[0], g[0], h[0], i[0], j[0], k[0], m[0]
         velocity = a[1], b[1], c[1], d[1], e[1], f[1], g[1], h[1], i[1], j[1], k[1], m[1]
@@ -249,7 +249,7 @@ def load_urdf(urdf: str, client: int, *, fixed: bool = True) -> int:
         path = Path(folder, "exoskeleton.urdf")
         path.write_text(urdf)
         try:
-            # Fixed links are not merged, because IMUs and pads are found by their link names.
+            # No flag to merge fixed links: IMU links and contact pads must keep their names.
             return int(
                 pybullet.loadURDF(
                     str(path), useFixedBase=fixed, flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client
@@ -260,7 +260,7 @@ def load_urdf(urdf: str, client: int, *, fixed: bool = True) -> int:
 
 
 def _is_movable(link: int, joints: set[int], infos: Sequence[Any]) -> bool:
-    """Return whether one of the joints lies between a link and the base."""
+    """Return whether a joint between the link and the base can move the link."""
     while link >= 0:
         if link in joints:
             return True

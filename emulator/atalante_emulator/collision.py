@@ -1,8 +1,8 @@
-"""Detection of two senders of one message, from frames that are all valid by themselves.
+"""Detection of two senders that send the same message, from the alive counters of their frames.
 
-A sender increments its counter by one with each frame. CAN may lose or repeat a frame, but it keeps the order of a sender's
-frames. Two different frames with the same counter, or two frames of one cycle whose counters are not consecutive, therefore
-come from two senders.
+A sender increments its counter by one with each frame. CAN may lose or repeat a frame, but it keeps the order of the frames.
+Two different frames with the same counter therefore come from two senders. The same holds for two frames of one cycle with
+counters that are not consecutive.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from atalante_hal.wire.frame import Frames
 
 
 class Senders:
-    """Detector for two senders of one message; the emulator runs it in every imperfect cycle."""
+    """Detector for two senders of one message. The emulator runs it only in cycles with missing, rejected or extra frames."""
 
     def __init__(self, message: Message) -> None:
         self._message = message
@@ -22,11 +22,11 @@ class Senders:
         self._last_cycle = -1
 
     def are_two(self, frames: Frames, cycle: int) -> bool:
-        """Return whether the frames of a cycle come from two senders.
+        """Return whether the message's frames of a cycle come from two senders.
 
         Args:
-            frames: all frames received in the cycle, in the order of reception, shape (n,).
-            cycle: number of the cycle; it increases by one per cycle.
+            frames: all frames received in the cycle, in the order of reception, shape (n,). Other messages are ignored.
+            cycle: number of the cycle. It increases by one per cycle.
         """
         if self._last_cycle != cycle - 1:
             self._last = None
@@ -40,7 +40,7 @@ class Senders:
         return two
 
     def _intact(self, frames: Frames) -> list[bytes]:
-        """Return the payloads of the message's frames whose length and CRC are correct."""
+        """Return the payloads of all frames of the message with correct length and CRC."""
         message = self._message
         candidates = frames[(frames["can_id"] == message.frame_id) & (frames["len"] == message.length)]
         payloads = [frame["data"][: message.length].tobytes() for frame in candidates]

@@ -1,11 +1,13 @@
-"""Firmware of the twelve emulated drives: CiA 402 state machine, command watchdog, limits and local error reactions.
+"""Firmware of the twelve emulated drives: CiA 402 state machine, command watchdog, torque limits and local error reactions.
 
-One cycle is `sample` (fill the signals of the state frames), then `command` (latch the command of the HAL), then `drive`
-(compute the torques of the next millisecond). The drives are the last safety layer and need no HAL:
+One cycle calls three methods in this order. `sample` fills the signals of the state frames. `command` latches the command of
+the HAL. `drive` computes the torques of the next millisecond.
 
-- Local hold: no valid new command or no SYNC for `WATCHDOG` cycles, two senders of one command, or low supply voltage. The
-  drive latches QUICK STOP ACTIVE and its motor holds the position of its own encoder.
-- Lowering: over-temperature, over-current or encoder error, in which the drive cannot hold. The drive enters FAULT REACTION
+The drives are the last safety layer. They react to errors without the HAL, in one of two ways:
+
+- Local hold. Causes: no valid new command or no SYNC for `WATCHDOG` cycles, two senders of one command, low supply voltage.
+  The drive latches QUICK STOP ACTIVE, and its motor holds the position of its own encoder.
+- Lowering. Causes: over-temperature, over-current, encoder error. The drive cannot hold the joint. It enters FAULT REACTION
   ACTIVE and then FAULT. The power stage is off, and the brake lets the joint sink slowly. The same brake acts in every drive
   without power, so the HAL lowers a joint with DISABLE_VOLTAGE.
 """
@@ -26,9 +28,9 @@ from atalante_hal.robot import JOINTS, LEG_JOINTS, SIDES, Robot
 from atalante_hal.types import PERIOD, Vector
 from atalante_hal.wire.cia402 import AUTOMATIC, Controlword, DriveState, next_state
 
-#: Cycles without a valid new command, or without SYNC, after which an enabled drive starts its local hold.
+#: Timeout of commands and of SYNC [cycles]. After it, an enabled drive starts its local hold.
 WATCHDOG: Final = 5
-#: Cycles between two updates of the slow quantities: temperatures, and rest of the joints being lowered.
+#: Period of the temperature update and of the standstill check of lowered joints [cycles].
 SLOW_CYCLES: Final = 100
 #: Names of the drive nodes, in the order of JOINTS.
 NODES: Final = tuple(joint.upper() for joint in JOINTS)
@@ -39,31 +41,31 @@ _FAULTY: Final = (DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT)
 
 @dataclass(frozen=True)
 class DriveParameters:
-    """True parameters of the emulated drives, unknown to the HAL."""
+    """True parameters of the emulated drives. The HAL does not know them."""
 
     motor: MotorParameters = field(default_factory=MotorParameters)
-    velocity_bandwidth: float = 80.0  # Hz, low-pass of the velocity estimate
-    torque_noise: float = 0.05  # Nm rms, of the torque measurement
-    trip_temperature: float = 120.0  # degC, at and above which the drive switches its power stage off
-    cool_enough: float = 100.0  # degC, at and below which it may be enabled again
-    supply: float = 48.0  # V
-    hold_below: float = 40.0  # V, below which the drive starts its local hold
-    off_below: float = 20.0  # V, below which the power stage cannot work
-    rest_speed: float = 0.05  # rad/s, below which a joint being lowered is at rest
+    velocity_bandwidth: float = 80.0  # cut-off frequency of the velocity low-pass [Hz]
+    torque_noise: float = 0.05  # noise of the torque measurement [Nm rms]
+    trip_temperature: float = 120.0  # winding temperature that switches the power stage off [degC]
+    cool_enough: float = 100.0  # highest winding temperature at which a tripped drive may be enabled again [degC]
+    supply: float = 48.0  # nominal supply voltage [V]
+    hold_below: float = 40.0  # lowest supply voltage without a local hold [V]
+    off_below: float = 20.0  # lowest supply voltage at which the power stage works [V]
+    rest_speed: float = 0.05  # joint speed below which a lowered joint counts as at rest [rad/s]
 
 
 class DriveSignals(NamedTuple):
-    """Signals of the drives' state frames, shape (12,) each; `Drives` rewrites them."""
+    """Signals in the state frames of the twelve drives, shape (12,) each. `Drives` updates them."""
 
-    position: Vector  # rad at the motor
-    velocity: Vector  # rad/s at the motor
-    torque: Vector  # Nm at the joint
-    temperature: Vector  # degC
-    state: Vector  # DriveState
+    position: Vector  # at the motor [rad]
+    velocity: Vector  # at the motor [rad/s]
+    torque: Vector  # at the joint [Nm]
+    temperature: Vector  # of the winding [degC]
+    state: Vector  # value of `DriveState`
 
 
 def _within(target: Vector, limit: Vector, own_limit: Vector, wanted: Vector) -> None:
-    """Clip the target torque to the limits of HAL and drive, into `wanted`. Shape (12,) each [Nm]."""
+    """Clip the target torque to the limits of HAL and drive, and write the result to `wanted`. Shape (12,) each [Nm]."""
     for i in range(len(wanted)):
         most = min(limit[i], own_limit[i])
         wanted[i] = max(-most, min(target[i], most))
@@ -73,12 +75,12 @@ _ENABLED = np.full(len(JOINTS), float(DriveState.OPERATION_ENABLED)).tobytes()
 
 
 class Drives:
-    """Twelve drives, commanded by one frame a leg: leg 0 (left) has drives 0 to 5, leg 1 (right) drives 6 to 11."""
+    """Twelve drives of two legs. Leg 0 (left) has drives 0 to 5, leg 1 (right) has drives 6 to 11."""
 
     def __init__(
         self, robot: Robot, parameters: DriveParameters, signals: DriveSignals, outbox: list[Emergency] | None = None
     ) -> None:
-        """Power up the drives in SWITCH_ON_DISABLED.
+        """Create the drives in the state SWITCH_ON_DISABLED.
 
         Args:
             robot: joint properties that the firmware uses: torque limits, gear ratios and hold gains.
@@ -90,32 +92,32 @@ class Drives:
         self.parameters = parameters
         self.signals = signals
         self.state = [DriveState.SWITCH_ON_DISABLED] * len(JOINTS)
-        #: Whether each drive is in local hold and not yet acknowledged with QUICK_STOP.
+        #: Whether each drive is in a local hold that the HAL did not acknowledge with QUICK_STOP yet.
         self.latched = [False] * len(JOINTS)
         self.emergencies = [] if outbox is None else outbox
         self.errors = Errors(NODES, self.emergencies)
         #: Supply voltage of each drive [V].
         self.voltage = [parameters.supply] * len(JOINTS)
-        #: Consecutive cycles without a new command, per leg.
+        #: Number of consecutive cycles without a new command, per leg.
         self.missed = [0] * len(SIDES)
-        self._unsynced = [0] * len(SIDES)  # consecutive cycles without SYNC, per leg
+        self._unsynced = [0] * len(SIDES)  # number of consecutive cycles without SYNC, per leg
         self._unsynced_at = [-1] * len(SIDES)  # number of the last cycle without SYNC, per leg
         self.encoders = Encoders(robot, parameters.velocity_bandwidth, signals.position, signals.velocity)
         self.motors = Motors(robot, parameters.motor, signals.torque, signals.temperature)
         self._slow_phase = 0
         self._steady = b""  # controlwords that changed no drive state when last applied
-        self._hold_at = np.zeros(len(JOINTS))  # rad, position that a drive in local hold keeps
+        self._hold_at = np.zeros(len(JOINTS))  # setpoint of the local hold of each drive [rad]
         self._target, self._limit = np.zeros((2, len(JOINTS)))
-        self._own_limit = robot.torque_max.copy()  # Nm, torque limit at the present temperature
+        self._own_limit = robot.torque_max.copy()  # torque limit of each drive at its present temperature [Nm]
         self._within = compiled(_within)
-        # The first call compiles the kernel, which would be too slow within a cycle.
+        # Compiles the kernel now, because compilation takes longer than a cycle.
         self._within(self._target, self._limit, self._own_limit, self.motors.wanted)
         self._states_changed()
 
     # -- every cycle -------------------------------------------------------------------------------------------------
 
     def sample(self, position: Vector) -> None:
-        """Read the encoders into the signals of the state frames.
+        """Read the encoders and update the position and velocity signals.
 
         Args:
             position: joint positions, shape (12,) [rad].
@@ -125,13 +127,13 @@ class Drives:
     def command(self, fresh: tuple[bool, bool], controlword: Vector, target: Vector, limit: Vector) -> None:
         """Latch the last valid command and run the watchdog and the state machines.
 
-        The arrays `target` and `limit` are read again in every `drive` until the next command.
+        Every call of `drive` reads the arrays `target` and `limit` until the next command.
 
         Args:
             fresh: per leg, whether a valid new command arrived since the last cycle.
             controlword: `Controlword` values, shape (12,).
             target: target torques, shape (12,) [Nm at the joint].
-            limit: torque limits from the MaxTorque of the HAL, shape (12,) [Nm]. The drive's own limit applies as well.
+            limit: torque limits from the signal MaxTorque of the HAL, shape (12,) [Nm]. The drive's own limit applies too.
         """
         missed = self.missed
         for leg in (0, 1):
@@ -157,12 +159,12 @@ class Drives:
         """
         self._slow_phase += 1
         if self._slow_phase == SLOW_CYCLES:
-            self._slow_turn()
+            self._update_slow()
         wanted = self.motors.wanted
         self._within(self._target, self._limit, self._own_limit, wanted)
         if not self._all_enabled:
             self._without_command(wanted)
-        return self.motors.turn(velocity)
+        return self.motors.advance(velocity)
 
     def draw_noise(self, generator: np.random.Generator, out: Vector) -> None:
         """Draw the measurement noise of the torque signals for many cycles.
@@ -174,9 +176,9 @@ class Drives:
         np.multiply(generator.standard_normal(out.shape), self.parameters.torque_noise, out=out)
 
     def _without_command(self, wanted: Vector) -> None:
-        """Replace the torque of drives that are not enabled: position hold in local hold, else zero."""
+        """Set the torque of drives that are not enabled: hold torque in local hold, otherwise zero."""
         robot, limit = self._robot, self._own_limit
-        # The filtered velocity of the state frame has too much delay for this loop, so it uses the raw encoder difference.
+        # The filtered velocity has too much delay for this loop, so the loop uses the raw encoder difference.
         hold = robot.hold_kp * (self._hold_at - self.encoders.angle) - robot.hold_kd * self.encoders.speed
         np.clip(hold, -limit, limit, out=hold)
         wanted[:] = np.where(self._is_enabled, wanted, np.where(self._is_holding, hold, 0.0))
@@ -184,18 +186,18 @@ class Drives:
     # -- errors ------------------------------------------------------------------------------------------------------
 
     def hold(self, leg: int, code: int) -> None:
-        """Latch a local hold in every enabled drive of a leg, after a communication error.
+        """Start a latched local hold in every enabled drive of a leg.
 
         Args:
             leg: index of the leg, 0 is left.
-            code: emergency error code.
+            code: emergency error code of the communication error that causes the hold.
         """
         for drive in range(leg * _LEG, (leg + 1) * _LEG):
             if self.state[drive] is DriveState.OPERATION_ENABLED:
                 self.fail(drive, code)
 
     def miss_sync(self, leg: int, cycle: int) -> None:
-        """Count a cycle without SYNC for a leg, and start its local hold after `WATCHDOG` of them.
+        """Count a cycle without SYNC on the bus of a leg. After `WATCHDOG` consecutive ones, start the local hold of the leg.
 
         Args:
             leg: index of the leg, 0 is left.
@@ -207,33 +209,33 @@ class Drives:
         if self._unsynced[leg] >= WATCHDOG:
             self.hold(leg, emergency.LIFE_GUARD)
 
-    def find_sync(self, leg: int) -> None:
-        """Clear the SYNC watchdog of a leg whose SYNC arrived late in its cycle.
+    def restart_sync_watchdog(self, leg: int) -> None:
+        """Restart the SYNC watchdog of a leg after a SYNC that arrived late in its cycle.
 
         Args:
             leg: index of the leg, 0 is left.
         """
         self._unsynced[leg] = 0
 
-    def notice(self, leg: int, code: int) -> None:
-        """Report a command error of a leg that causes no reaction of its drives.
+    def warn(self, leg: int, code: int) -> None:
+        """Report a command error of a leg to which its drives do not react.
 
         Args:
             leg: index of the leg, 0 is left.
             code: emergency error code.
         """
         for drive in range(leg * _LEG, (leg + 1) * _LEG):
-            self.errors.notice(drive, code)
+            self.errors.warn(drive, code)
 
-    def fail(self, drive: int, code: int, *, stands: bool = False) -> None:
+    def fail(self, drive: int, code: int, *, persists: bool = False) -> None:
         """Report an error of a drive and start its local reaction.
 
         Args:
             drive: index of the drive.
             code: emergency error code.
-            stands: whether the cause persists until `recover`, so that the error cannot be acknowledged before.
+            persists: whether the cause persists until `recover`. The HAL cannot acknowledge the error before that.
         """
-        self.errors.begin(drive, code, stands=stands)
+        self.errors.begin(drive, code, persists=persists)
         state = self.state[drive]
         match reaction_to(code):
             case FaultReaction.LOWER if state not in _FAULTY:
@@ -246,7 +248,7 @@ class Drives:
         self._states_changed()
 
     def recover(self, drive: int, code: int) -> None:
-        """Mark the cause of an error as gone; the reaction stays until the HAL acknowledges it.
+        """Mark the cause of an error as gone. The reaction continues until the HAL acknowledges the error.
 
         Args:
             drive: index of the drive.
@@ -258,7 +260,7 @@ class Drives:
         self._steady = b""  # the present controlword may now acknowledge the error
 
     def leave(self, drive: int, state: DriveState) -> None:
-        """Force a state change without a command, as defective firmware would.
+        """Force a state change without a command, to emulate defective firmware.
 
         Args:
             drive: index of the drive.
@@ -268,14 +270,14 @@ class Drives:
         self._states_changed()
 
     def reset(self, drive: int) -> None:
-        """Restart a drive, as after a loss of power.
+        """Restart a drive in SWITCH_ON_DISABLED without errors, as after a loss of power.
 
         Args:
             drive: index of the drive.
         """
         self._enter(drive, DriveState.SWITCH_ON_DISABLED)
         self.latched[drive] = False
-        self.errors.forget(drive)
+        self.errors.clear(drive)
         self._states_changed()
 
     def heat(self, drive: int, temperature: float) -> None:
@@ -286,10 +288,10 @@ class Drives:
             temperature: winding temperature [degC].
         """
         self.motors.temperature[drive] = temperature
-        self._judge_heat()
+        self._check_temperature()
 
     def supply(self, drive: int, voltage: float) -> None:
-        """Set the supply voltage of a drive, and start or end its voltage errors.
+        """Set the supply voltage of a drive, and begin or end its voltage errors.
 
         Args:
             drive: index of the drive.
@@ -301,7 +303,7 @@ class Drives:
             (emergency.NO_VOLTAGE, self.parameters.off_below),
         ):
             if voltage < least:
-                self.fail(drive, code, stands=True)
+                self.fail(drive, code, persists=True)
             elif self.errors.has(drive, code):
                 self.recover(drive, code)
 
@@ -311,21 +313,21 @@ class Drives:
         changed = False
         for drive, word in enumerate(controlword.tolist()):
             if fresh[drive // _LEG]:
-                changed |= self._obey(drive, int(word))
+                changed |= self._apply_controlword(drive, int(word))
         if changed:
             self._states_changed()
         elif fresh[0] and fresh[1]:
             self._steady = words
 
-    def _obey(self, drive: int, word: int) -> bool:
-        """Apply one controlword to one drive and return whether its state or its latch changed."""
+    def _apply_controlword(self, drive: int, word: int) -> bool:
+        """Apply a controlword to a drive. Return whether the state or the latch of the drive changed."""
         state, latched = self.state[drive], self.latched[drive]
         after = next_state(state, word, latched=latched)
-        if self.errors.stand(drive) and (state is DriveState.FAULT or after is DriveState.OPERATION_ENABLED):
-            return False  # an error cannot be acknowledged before its cause is gone
+        if self.errors.any_persists(drive) and (state is DriveState.FAULT or after is DriveState.OPERATION_ENABLED):
+            return False  # the cause of an error persists, so the HAL cannot acknowledge the error
         acknowledged = after is not state and state is DriveState.FAULT
         if latched and (after is not DriveState.QUICK_STOP_ACTIVE or word == Controlword.QUICK_STOP):
-            acknowledged = not self.errors.stand(drive) or after is not DriveState.QUICK_STOP_ACTIVE
+            acknowledged = not self.errors.any_persists(drive) or after is not DriveState.QUICK_STOP_ACTIVE
             self.latched[drive] = not acknowledged
         if acknowledged:
             self.errors.acknowledge(drive)
@@ -349,27 +351,27 @@ class Drives:
 
     # -- slow quantities ---------------------------------------------------------------------------------------------
 
-    def _slow_turn(self) -> None:
+    def _update_slow(self) -> None:
         self._slow_phase = 0
         if DriveState.FAULT_REACTION_ACTIVE in self.state:
-            self._judge_rest()
+            self._check_rest()
         self.motors.warm(SLOW_CYCLES * PERIOD)
-        self._judge_heat()
-        self.errors.turn()
+        self._check_temperature()
+        self.errors.advance()
 
-    def _judge_heat(self) -> None:
+    def _check_temperature(self) -> None:
         """Reduce the torque limit of hot drives and switch off drives above the trip temperature."""
         temperature, parameters = self.motors.temperature, self.parameters
-        # Rounded as in the state frame, so that the HAL computes the same limit.
+        # The HAL computes the same limit from the rounded temperature of the state frame.
         self._own_limit[:] = self._robot.torque_limit(np.rint(temperature))
         for drive, degrees in enumerate(temperature.tolist()):
             if degrees >= parameters.trip_temperature:
-                self.fail(drive, emergency.OVER_TEMPERATURE, stands=True)
+                self.fail(drive, emergency.OVER_TEMPERATURE, persists=True)
             elif degrees <= parameters.cool_enough and self.errors.has(drive, emergency.OVER_TEMPERATURE):
                 self.recover(drive, emergency.OVER_TEMPERATURE)
 
-    def _judge_rest(self) -> None:
-        """Move drives from FAULT REACTION ACTIVE to FAULT when their lowered joints are at rest."""
+    def _check_rest(self) -> None:
+        """Enter FAULT in each drive in FAULT REACTION ACTIVE with a joint at rest."""
         speed = np.abs(self.encoders.speed)
         for drive in np.flatnonzero(speed < self.parameters.rest_speed).tolist():
             if self.state[drive] is DriveState.FAULT_REACTION_ACTIVE:

@@ -1,7 +1,7 @@
-"""Emergency messages of the nodes: error codes of CiA 301 and CiA 402, and the reaction of a drive to each.
+"""Emergency messages of the nodes: error codes of CiA 301 and CiA 402, and the reaction of a drive to each code.
 
-A node sends one emergency when an error begins, and one with code 0 when no error is left. An error that stands (its cause
-persists) cannot be acknowledged.
+A node sends an emergency when an error begins, and an emergency with code 0 when its last error ends. The HAL cannot
+acknowledge an error while its cause persists.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ OVER_TEMPERATURE: Final = 0x4310  # drive too hot
 ENCODER: Final = 0x7305  # incremental sensor 1
 COMMAND_LOST: Final = 0x8110  # CAN overrun: objects lost
 LIFE_GUARD: Final = 0x8130  # SYNC timed out
-TWO_SENDERS: Final = 0x8150  # identifier collision: two sources of one command
-COMMAND_REFUSED: Final = 0x8200  # protocol error: command damaged, or meant for another node
+TWO_SENDERS: Final = 0x8150  # identifier collision: two nodes send the same command
+COMMAND_REJECTED: Final = 0x8200  # protocol error: command with wrong CRC, length or value range
 COMMAND_TIMEOUT: Final = 0x8250  # command timed out
 
-#: Bits of the CiA 301 error register by first hex digit of the code: the generic bit and the bit of that class.
+#: First hex digit of an error code -> value of the CiA 301 error register (generic bit plus the bit of the error class).
 _REGISTER: Final = {0x2: 0x03, 0x3: 0x05, 0x4: 0x09, 0x7: 0x21, 0x8: 0x11}
 _GENERIC: Final = 0x01
 
-#: Calls of `Errors.turn` after which a notice is over, and after which the same notice may be sent again.
-_OVER, _FORGOTTEN = 2, 3
+#: Age at which a warning ends, and age from which it may be sent again [calls of `Errors.advance` since its last occurrence].
+_ENDED, _REPEATABLE = 2, 3
 
 
 class FaultReaction(Enum):
@@ -35,18 +35,19 @@ class FaultReaction(Enum):
 
     NONE = "continues"
     HOLD = "latches a local hold of its position"
-    LOWER = "switches its power stage off, and the brake lets the joint sink"
+    LOWER = "switches its power stage off, and its brake lets the joint sink slowly"
 
 
 def reaction_to(code: int) -> FaultReaction:
     """Return the reaction of a drive to an error.
 
-    A drive holds its joint if it can. It cannot with a current, temperature or encoder error, or without voltage.
+    A drive cannot hold its joint with a current, temperature or encoder error, or without supply voltage. It then lowers the
+    joint.
 
     Args:
         code: emergency error code.
     """
-    if code in (COMMAND_LOST, COMMAND_REFUSED):
+    if code in (COMMAND_LOST, COMMAND_REJECTED):
         return FaultReaction.NONE
     if code == NO_VOLTAGE or code >> 12 in (0x2, 0x4, 0x7):
         return FaultReaction.LOWER
@@ -54,7 +55,7 @@ def reaction_to(code: int) -> FaultReaction:
 
 
 def register_of(codes: Sequence[int]) -> int:
-    """Return the CiA 301 error register (object 0x1001) of a set of errors.
+    """Return the value of the CiA 301 error register (object 0x1001) for a set of active errors.
 
     Args:
         codes: emergency error codes of all active errors.
@@ -74,24 +75,24 @@ class Emergency(NamedTuple):
 
 
 class Errors:
-    """Active errors of several nodes; the emergencies to send are appended to `outbox`."""
+    """Active errors of several nodes. Each change appends the emergency to send to the list `outbox`."""
 
     def __init__(self, nodes: Sequence[str], outbox: list[Emergency]) -> None:
         self._nodes, self._outbox = nodes, outbox
-        self._active: list[dict[int, bool]] = [{} for _ in nodes]  # code -> whether its cause persists
-        self._noticed: dict[tuple[int, int], int] = {}  # (node, code) -> calls of `turn` since the last notice
+        self._active: list[dict[int, bool]] = [{} for _ in nodes]  # error code -> whether its cause persists
+        self._warnings: dict[tuple[int, int], int] = {}  # (node, error code) -> age of the warning [calls of `advance`]
 
-    def begin(self, node: int, code: int, *, stands: bool = False) -> None:
-        """Begin an error and report it if it is new.
+    def begin(self, node: int, code: int, *, persists: bool = False) -> None:
+        """Begin an error, and report it unless it is already active.
 
         Args:
             node: index of the node.
             code: emergency error code.
-            stands: whether the cause persists until `end`.
+            persists: whether the cause persists until `end`.
         """
         active = self._active[node]
         new = code not in active
-        active[code] = stands
+        active[code] = persists
         if new:
             self._report(node, code)
 
@@ -106,17 +107,17 @@ class Errors:
             self._active[node][code] = False
 
     def acknowledge(self, node: int) -> None:
-        """Remove the errors whose cause is gone, and report code 0 if none is left.
+        """Remove all errors without a persisting cause. Report code 0 if no error is left.
 
         Args:
             node: index of the node.
         """
         active = self._active[node]
-        self._active[node] = {code: True for code, stands in active.items() if stands}
+        self._active[node] = {code: True for code, persists in active.items() if persists}
         if active and not self._active[node]:
             self._report(node, ERROR_RESET)
 
-    def stand(self, node: int) -> bool:
+    def any_persists(self, node: int) -> bool:
         """Return whether the cause of any error of a node persists.
 
         Args:
@@ -133,34 +134,34 @@ class Errors:
         """
         return self._active[node].get(code, False)
 
-    def forget(self, node: int) -> None:
-        """Remove all errors of a node that restarts, without a report.
+    def clear(self, node: int) -> None:
+        """Remove all errors of a node without a report, because the node restarts.
 
         Args:
             node: index of the node.
         """
         self._active[node] = {}
 
-    def notice(self, node: int, code: int) -> None:
-        """Report an error that causes no reaction, at most once per inhibit time.
+    def warn(self, node: int, code: int) -> None:
+        """Report a warning, which is an error without a reaction. Repeat it only after the inhibit time.
 
         Args:
             node: index of the node.
             code: emergency error code.
         """
-        turns = self._noticed.get((node, code))
-        if turns is None:
-            self._noticed[node, code] = 0
+        age = self._warnings.get((node, code))
+        if age is None:
+            self._warnings[node, code] = 0
             self._report(node, code)
-        elif turns < _OVER:
-            self._noticed[node, code] = 0
+        elif age < _ENDED:
+            self._warnings[node, code] = 0
 
-    def turn(self) -> None:
-        """Advance the age of all notices by one, and report code 0 for those that are over."""
-        if not self._noticed:
+    def advance(self) -> None:
+        """Advance the age of all warnings by one, and report code 0 when a warning ends."""
+        if not self._warnings:
             return
-        self._noticed = {which: turns + 1 for which, turns in self._noticed.items() if turns + 1 < _FORGOTTEN}
-        over = [node for (node, _), turns in self._noticed.items() if turns == _OVER and not self._active[node]]
+        self._warnings = {warning: age + 1 for warning, age in self._warnings.items() if age + 1 < _REPEATABLE}
+        over = [node for (node, _), age in self._warnings.items() if age == _ENDED and not self._active[node]]
         for node in dict.fromkeys(over):
             self._report(node, ERROR_RESET)
 

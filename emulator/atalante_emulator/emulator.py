@@ -1,11 +1,13 @@
-"""Emulated robot at the other end of the bus.
+"""Emulator of the robot: runs all nodes except the HAL, and answers each SYNC of the HAL.
 
     bus -> process image -> E2E + validity -> nodes -> body (PyBullet) -> nodes -> process image -> bus
 
-A cycle begins with SYNC: every node latches the command of the previous cycle and sends its samples, then the body moves for
-one millisecond. After that, the next answer is sampled and sealed in advance. A HAL in another process therefore waits for a
-copy only, and computes while the body moves. The same object answers an embedded HAL in lock-step (`poll` as the `step` of a
-`PairBus`) and a HAL in another process (`run`). The same seed gives the same sequence of bytes.
+A cycle begins with SYNC. Every node latches the command of the previous cycle and sends its samples. Then the body moves for
+one millisecond. Then the nodes sample the sensors for the next cycle, and the emulator adds counter and CRC to the next
+frames. The next SYNC is therefore answered without delay, and a HAL in another process computes while the body moves.
+
+`poll` answers an embedded HAL in lock-step, as the `step` of a `PairBus`. `run` answers a HAL in another process. The same
+seed gives the same sequence of bytes.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from atalante_dbc import Network
 from atalante_emulator.body import Body
 from atalante_emulator.collision import Senders
 from atalante_emulator.drive import WATCHDOG, DriveParameters, Drives, DriveSignals
-from atalante_emulator.emergency import COMMAND_LOST, COMMAND_REFUSED, LIFE_GUARD, TWO_SENDERS, Emergency
+from atalante_emulator.emergency import COMMAND_LOST, COMMAND_REJECTED, LIFE_GUARD, TWO_SENDERS, Emergency
 from atalante_emulator.faults import LINK_KINDS, NODE_KINDS, SENSOR_KINDS, Fault
 from atalante_emulator.foot import Feet, FootParameters
 from atalante_emulator.haptics import Haptics, HapticsParameters
@@ -38,19 +40,19 @@ from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.frame import FRAME_BYTES, Frames, new_frames
 from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 
-#: Capacity of the receive buffer, in frames; a cycle has seven frames, some cycles one more.
+#: Capacity of the receive buffer [frames]. The HAL sends seven or eight frames per cycle.
 _RECEIVE_BUDGET = 128
-#: Largest number of frames sent in a cycle: nineteen cyclic frames, some slow ones, emergencies and faults.
+#: Capacity of the transmit buffer [frames]. The nodes send 19 cyclic frames per cycle, slow messages and emergencies.
 _BATCH = 128
-#: Values of `Check` for a command frame that was received but must not be executed.
-_REFUSED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
-#: Longest wait [s] for the other SYNCs of a cycle once the first is there.
+#: Values of `Check` for which a received command frame is rejected.
+_REJECTED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
+#: Timeout for the other SYNCs of a cycle after its first SYNC [s].
 _SYNC_SKEW = 200e-6
 
 
 @dataclass(frozen=True)
 class EmulatorParameters:
-    """True parameters of the emulated nodes, unknown to the HAL."""
+    """True parameters of the emulated nodes. The HAL does not know them."""
 
     drive: DriveParameters = field(default_factory=DriveParameters)
     imu: ImuParameters = field(default_factory=ImuParameters)
@@ -61,8 +63,8 @@ class EmulatorParameters:
 class Emulator:
     """All nodes of the network except the HAL, connected to one body.
 
-    `before_send` is a list of callables `(cycle, values)` that may change the values the nodes are about to send. They are called
-    when the SYNC of the cycle was received; `values` is in the order of `signals`.
+    `before_send` is a list of callables `(cycle, values)`. They are called after the SYNC of a cycle and may change the values
+    before the nodes send them. `values` is in the order of `signals`.
     """
 
     def __init__(
@@ -82,12 +84,12 @@ class Emulator:
         Args:
             network: nodes and messages of the DBC.
             robot: joint properties that the nodes use.
-            body: mechanics of the robot; the emulator steps it, the caller closes it.
-            bus: bus that carries all buses of the network; several channels are combined by a `JoinedBus`.
+            body: mechanics of the robot. The emulator steps it, and the caller closes it.
+            bus: bus that carries the frames of all buses. A `JoinedBus` combines several channels.
             seed: seed of all random numbers: sensor noise, biases and random faults.
             operator: emulated operator of the pendant. None if another process runs the pendant node.
             parameters: true parameters of the nodes. None means the default ones.
-            faults: faults to inject; their cycles count from 0.
+            faults: faults to inject. Their cycles count from 0.
 
         Raises:
             FaultError: If the network has no such target or signal.
@@ -98,7 +100,7 @@ class Emulator:
         if any(fault.kind in LINK_KINDS for fault in faults):
             self.bus = self._link = FaultyBus(bus, network, faults, lambda: self.cycle, seed=seed)
         self.cycle = 0
-        self.frames_lost = 0  # frames of the nodes that did not fit into the transmit queue of the bus
+        self.frames_lost = 0  # number of frames lost because the transmit queue of the bus was full
         self.before_send: list[Callable[[int, Vector], None]] = []
         self._build_images()
         self._bind_commands()
@@ -111,11 +113,11 @@ class Emulator:
             )
             if self._node_faults.rewrites:
                 self.before_send.append(self._node_faults.rewrite)
-        self._look_ahead()
+        self._sample_next()
 
     @property
     def signals(self) -> Codec:
-        """Codec of the 1 ms messages, which defines the order of their values."""
+        """Codec of the 1 ms messages of the nodes. It defines the order of their signals."""
         return self._tx.codec
 
     # -- construction ------------------------------------------------------------------------------------------------
@@ -127,32 +129,32 @@ class Emulator:
         sent = [m for m in network.messages if m.sender in ours]
         cyclic = [m for bus in network.buses for m in sent if m.bus == bus and m.cycle_ms == 1]
         self._tx = TransmitImage(cyclic)
-        self._sealed = False  # True if the next frames have counter and CRC, and wait only for their SYNC
-        self._tag = 0  # alive counter of the sealed frames: low byte of their cycle number
+        self._sealed = False  # whether the next frames already have counter and CRC
+        self._tag = 0  # alive counter of the next frames: low byte of their cycle number
         self._haptics_tx = TransmitImage([network.message("HAPTICS_STATE")])
         self._heartbeats = Heartbeats(network, [m for m in sent if m.name.endswith("_STATUS")])
-        self._emergencies: list[Emergency] = []  # to be sent in this cycle
+        self._emergencies: list[Emergency] = []  # emergencies to send in this cycle
         self._emergency_tx = TransmitImage([m for m in sent if m.name.endswith("_EMCY")])
 
         received = [m for m in network.sent_by("HAL") if m.cycle_ms == 1]
         syncs = [m for m in received if m.name.startswith("SYNC_")]
-        # In the order of an embedded bus: the commands of the previous cycle, then SYNC.
+        # An embedded bus delivers the commands of the previous cycle, then SYNC. The process image has the same order.
         self._rx = ReceiveImage([m for m in received if m not in syncs] + syncs)
-        self._rx.values.fill(0.0)  # values before the first command: no torque, no vibration, HAL OFF
+        self._rx.values.fill(0.0)  # before the first command: zero torque, zero vibration, HAL state OFF
         self._scratch = new_frames(_RECEIVE_BUDGET)
         self._scratch_from = [self._scratch[offset:] for offset in range(_RECEIVE_BUDGET)]
-        self._waiting = 0  # frames at the start of the scratch buffer that still wait for their SYNC
+        self._waiting = 0  # number of frames in the scratch buffer that arrived before their SYNC
 
         self._sync_rows = [self._rx.codec.rows[m.name] for m in syncs]
         self._sync_ids = {m.frame_id for m in syncs}
-        self._shares: list[Frames] = []  # per SYNC, the frames that the nodes of its bus send
+        self._shares: list[Frames] = []  # answer to each SYNC: the frames of the nodes on its bus
         for sync in syncs:
             rows = [row for row, m in enumerate(cyclic) if m.bus == sync.bus]
             self._shares.append(self._tx.frames[rows[0] : rows[-1] + 1])
         self._whole = [self._tx.frames]
         #: Index of each leg's SYNC in the list of SYNCs.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        self._answered = self._shares  # frames per SYNC of the last imperfect cycle
+        self._answered = self._shares  # answer to each SYNC in the last imperfect cycle
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data
         self._batch_up_to = [batch[:count] for count in range(_BATCH + 1)]
@@ -173,7 +175,7 @@ class Emulator:
 
     def _build_nodes(self, robot: Robot, parameters: EmulatorParameters) -> None:
         codec = self._tx.codec
-        #: Values of the signals before noise; the nodes write into this array.
+        #: Signal values without noise. The nodes write into this array.
         self._truth = np.zeros(codec.size)
         truth = self._truth
 
@@ -231,13 +233,13 @@ class Emulator:
         return self._imperfect_cycle(count)
 
     def _receive_rest(self, count: int) -> int:
-        """Receive until all SYNCs of the cycle arrived or the wait timed out.
+        """Receive frames until all SYNCs of the cycle arrived, or until the timeout `_SYNC_SKEW`.
 
         Args:
             count: frames already in the scratch buffer.
 
         Returns:
-            Frames in the scratch buffer. 0 if there is no SYNC among them; they are then kept for the next call.
+            Number of frames in the scratch buffer. 0 if no SYNC is among them. The frames are then kept for the next call.
         """
         ids = self._scratch["can_id"]
         deadline = None
@@ -257,21 +259,21 @@ class Emulator:
         return count
 
     def _imperfect_cycle(self, count: int) -> bool:
-        """Run a cycle with missing or rejected frames, and return whether one was run.
+        """Handle a cycle with missing or rejected frames, and return whether the cycle was run.
 
         Args:
             count: frames in the scratch buffer.
         """
         checks = self._rx.check.tolist()
-        self._judge_commands(checks, count)
+        self._check_commands(checks, count)
         synced = [sync for sync, row in enumerate(self._sync_rows) if checks[row] <= Check.SOME_LOST]
         if not synced:
             return self._cycle_without_sync()
         number = int(max(self._sync_cycles[synced]))
-        if number == self._last_sync:  # a late SYNC of a cycle that was already run
+        if number == self._last_sync:  # late SYNC of a cycle that already ran
             for leg, sync in enumerate(self._leg_syncs):
                 if sync in synced:
-                    self.drives.find_sync(leg)
+                    self.drives.restart_sync_watchdog(leg)
             self._send([self._answered[sync] for sync in synced])
             return False
         self._last_sync = number
@@ -285,8 +287,8 @@ class Emulator:
         self._cycle(fresh, [self._answered[sync] for sync in synced])
         return True
 
-    def _judge_commands(self, checks: list[int], count: int) -> None:
-        """Report lost, rejected and duplicate command frames to the drives of each leg.
+    def _check_commands(self, checks: list[int], count: int) -> None:
+        """Report lost and rejected commands to the drives of each leg, and start their local hold if two nodes send commands.
 
         Args:
             checks: check result of each received message, by row of the process image.
@@ -296,23 +298,23 @@ class Emulator:
             check = checks[row]
             self._commanded[leg] |= check <= Check.SOME_LOST
             if check == Check.SOME_LOST:
-                self.drives.notice(leg, COMMAND_LOST)
-            elif check in _REFUSED:
-                self.drives.notice(leg, COMMAND_REFUSED)
+                self.drives.warn(leg, COMMAND_LOST)
+            elif check in _REJECTED:
+                self.drives.warn(leg, COMMAND_REJECTED)
             if self._senders[leg].are_two(self._scratch[:count], self.cycle):
                 self.drives.hold(leg, TWO_SENDERS)
 
     def _cycle_without_sync(self) -> bool:
-        """Run a cycle without an answer if a fault removed its SYNC, and return whether it did."""
+        """Run a cycle without an answer if an injected fault removed its SYNC. Return whether a cycle was run."""
         lost = self._link is not None and self._link.synced
         if lost:
             for leg in range(len(SIDES)):
                 self.drives.miss_sync(leg, self.cycle)
-            self._alone()
+            self._run_without_sync()
         return lost
 
     def _send(self, parts: Sequence[Frames]) -> None:
-        """Send all frames of a cycle in one batch, so that the HAL receives all of them or none."""
+        """Send all frames of a cycle in one call of the bus."""
         frames = parts[0] if len(parts) == 1 else self._gather(parts)
         try:
             self.bus.send(frames)
@@ -326,8 +328,8 @@ class Emulator:
 
     # -- one cycle ---------------------------------------------------------------------------------------------------
 
-    def _look_ahead(self) -> None:
-        """Sample the sensors for the next cycle, as soon as the body has moved."""
+    def _sample_next(self) -> None:
+        """Sample the sensors for the next cycle, and prepare its frames in advance if `before_send` is empty."""
         body = self.body
         position = body.position
         if self._node_faults is not None:
@@ -348,12 +350,12 @@ class Emulator:
         self._sealed = True
 
     def _complete_answer(self, number: int) -> None:
-        """Seal the answer again if the SYNC of this cycle changed its content.
+        """Add counter and CRC to the answer if they are missing, or if this SYNC requires other content.
 
         Args:
             number: cycle number received in SYNC.
         """
-        changed = self._pendant is not None and self._pendant.hear(int(self._rx.values[self._hal_state_index]))
+        changed = self._pendant is not None and self._pendant.receive(int(self._rx.values[self._hal_state_index]))
         if changed or self.before_send or not self._sealed or number & 0xFF != self._tag:
             self._tag = number & 0xFF
             self._seal()
@@ -374,10 +376,10 @@ class Emulator:
         self._send(self._with_slow(answer))
         self.body.step(drives.drive(self.body.velocity))
         self.cycle += 1
-        self._look_ahead()
+        self._sample_next()
 
     def _with_slow(self, parts: list[Frames]) -> list[Frames]:
-        """Return `parts` and the slow messages that are due in this cycle."""
+        """Return `parts` plus the slow messages and the emergencies that are due in this cycle."""
         if self.cycle % self._haptics_cycles == 0:
             self._haptics.advance(self._level, int(self._rx.age[self._level_row]), self._haptics_cycles)
             parts = [*parts, self._haptics_tx.seal()]
@@ -406,7 +408,7 @@ class Emulator:
         After `WATCHDOG` milliseconds without SYNC, the drives start their local hold. Body and heartbeats continue in real time.
 
         Args:
-            stop: returns True to end the run; called about once per millisecond.
+            stop: end condition, called about once per millisecond. It returns True to end the run.
         """
         alone_from = time.monotonic() + WATCHDOG * PERIOD
         while not stop():
@@ -420,13 +422,13 @@ class Emulator:
                 alone_from += PERIOD
 
     def idle(self) -> None:
-        """Run one millisecond without a HAL: enabled drives hold, and the nodes send only heartbeats and emergencies."""
+        """Run one millisecond without a HAL. Enabled drives start their local hold, and the nodes send only slow messages."""
         for leg in range(len(SIDES)):
             self.drives.hold(leg, LIFE_GUARD)
-        self._alone()
+        self._run_without_sync()
 
-    def _alone(self) -> None:
-        """Run one millisecond in which no node receives SYNC, and so no node answers."""
+    def _run_without_sync(self) -> None:
+        """Run one millisecond without SYNC. The nodes send only slow messages and emergencies."""
         drives = self.drives
         self._rx.new_cycle()
         drives.command((False, False), self._controlword, self._target, self._limit)
@@ -434,4 +436,4 @@ class Emulator:
             self._send(parts)
         self.body.step(drives.drive(self.body.velocity))
         self.cycle += 1
-        self._look_ahead()
+        self._sample_next()

@@ -1,4 +1,4 @@
-"""Twelve emulated motor encoders: joint positions in, counts and the position and velocity of the state frames out."""
+"""Twelve emulated motor encoders: compute counts, motor position and motor velocity from the joint positions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _sample(
     position: Vector,
     velocity: Vector,
 ) -> None:
-    """Compute the counts of all encoders and the position and velocity of the state frames. Shape (12,) each."""
+    """Compute counts, motor position [rad] and motor velocity [rad/s] of all encoders. Shape (12,) each."""
     for i in range(len(joint)):
         count = np.rint(joint[i] * counts_per_rad[i])
         before[i] = count if math.isnan(counts[i]) else counts[i]
@@ -33,10 +33,10 @@ def _sample(
 
 
 class Encoders:
-    """Encoders of all joints; `sample` rewrites the given arrays of position and velocity."""
+    """Encoders of all joints. `sample` updates the arrays of motor position and motor velocity."""
 
     def __init__(self, robot: Robot, bandwidth: float, position: Vector, velocity: Vector) -> None:
-        """Connect the encoders to the signals of the state frames.
+        """Connect the encoders to the arrays of the position and velocity signals.
 
         Args:
             robot: gear ratio and polarity of each joint.
@@ -49,11 +49,11 @@ class Encoders:
         self._counts, self._before = np.zeros((2, len(JOINTS)))
         self._position, self._velocity = position, velocity
         self._sample = compiled(_sample)
-        self.sample(np.zeros(len(JOINTS)))  # the first call compiles the kernel, which would be too slow within a cycle
+        self.sample(np.zeros(len(JOINTS)))  # compiles the kernel now, because compilation takes longer than a cycle
         self._counts.fill(math.nan)  # no sample yet
 
     def sample(self, position: Vector) -> None:
-        """Read the encoders; call once per `PERIOD`.
+        """Sample all encoders. Must be called once per `PERIOD`.
 
         Args:
             position: true joint positions, shape (12,) [rad].
@@ -70,6 +70,6 @@ class Encoders:
 
     @property
     def speed(self) -> Vector:
-        """Joint velocity as unfiltered difference of counts, shape (12,) [rad/s]; for the control loop inside the drive."""
+        """Joint velocity without low-pass, from the last two counts, shape (12,) [rad/s]. The local hold uses it."""
         speed: Vector = (self._counts - self._before) / (self._counts_per_rad * PERIOD)
         return speed

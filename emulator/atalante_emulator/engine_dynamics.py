@@ -1,6 +1,6 @@
-"""Rigid-body dynamics of a URDF as PyBullet computes them, an independent check of the Pinocchio model of the gaits.
+"""Rigid-body dynamics of a URDF, computed by PyBullet. They are a reference for the Pinocchio model of the gaits.
 
-`URDF -> mass matrix, gravity, inverse dynamics, centre of mass`. The emulator itself does not use it.
+`URDF -> mass matrix, gravity, inverse dynamics, centre of mass`. The emulator does not use this module.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ Pose = tuple[Sequence[float], Sequence[float]]  # position [m], quaternion xyzw
 
 
 class EngineDynamics(Closing):
-    """Robot in PyBullet with a fixed pelvis, as a context manager. Joints are in the order of `JOINTS`."""
+    """Dynamics of a robot with a fixed pelvis in PyBullet. Joint vectors are in the order of `JOINTS`.
+
+    Used as a context manager, the object disconnects from PyBullet after the block.
+    """
 
     def __init__(self, urdf: str) -> None:
         """Load the URDF.
@@ -33,7 +36,7 @@ class EngineDynamics(Closing):
         self._client = pybullet.connect(pybullet.DIRECT)
         try:
             self._body = load_urdf(urdf, self._client)
-            self._free = load_urdf(urdf, self._client, fixed=False)  # PyBullet reports no mass for a fixed base
+            self._free = load_urdf(urdf, self._client, fixed=False)  # PyBullet reports mass 0 for a fixed base
         except ValueError:
             self.close()
             raise
@@ -122,7 +125,7 @@ class EngineDynamics(Closing):
         states = pybullet.getLinkStates(self._free, self._links, 0, 1, physicsClientId=self._client)
         masses = np.array(list(self.masses.values()))
         centre = masses @ np.array([root[0], *(state[0] for state in states)]) / masses.sum()
-        # PyBullet gives the base pose in the frame of its principal axes of inertia, not in the link frame.
+        # PyBullet returns the pose of the base's inertial frame. The result must be in the link frame of the base.
         unturned = [0.0, 0.0, 0.0, 1.0]
         in_root = pybullet.multiplyTransforms(*pybullet.invertTransform(*root), centre.tolist(), unturned)[0]
         return np.array(pybullet.multiplyTransforms(*self._base_from_inertial, in_root, unturned)[0])

@@ -1,9 +1,9 @@
-"""Injectable faults as data: a `Fault` has a kind, a target, a start, a duration and parameters.
+"""Definition of the faults that the emulator can inject. A `Fault` has a kind, a target, a start, a duration and parameters.
 
     Fault -> link (frames on the wire) or node_faults (inside the nodes) -> emulator
 
-The constructor checks a fault against the parameters of its kind; the emulator checks it against the names of the network.
-All faults act inside the emulator, so the HAL cannot distinguish them from real ones.
+The constructor of `Fault` checks the parameters. The emulator checks the names of messages, nodes, buses and signals. All
+faults act inside the emulator, so the HAL cannot distinguish them from real faults.
 """
 
 from __future__ import annotations
@@ -22,36 +22,36 @@ Value = float | int | str
 
 
 class FaultError(ValueError):
-    """Invalid fault; the message lists the valid values."""
+    """Error for an invalid fault. Its text lists the valid values."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """Parameter of a kind of fault."""
+    """Definition of a fault parameter: its valid values and its default."""
 
     valid: str  # description of the valid values, for error messages
     holds: Callable[[Any], bool]  # returns whether a value is valid
-    default: Value | None = None  # None: the parameter is required
+    default: Value | None = None  # None: the user must give a value
 
 
 @dataclass(frozen=True)
 class Kind:
-    """Definition of a kind of fault."""
+    """Definition of a kind of fault: its effect, its valid targets and its parameters."""
 
-    does: str  # description in one line
-    targets: str  # types of valid targets: message, node, bus, or a type of node
-    parameters: Mapping[str, Parameter] = field(default_factory=dict)  # by name
-    signals: bool = False  # whether signals of the target message are further parameters
+    does: str  # description of the effect in one line
+    targets: str  # valid targets: message, node, bus, or a type of node
+    parameters: Mapping[str, Parameter] = field(default_factory=dict)  # name -> definition
+    signals: bool = False  # whether signals of the target message are parameters too
 
 
 def _number(low: float, high: float, unit: str = "", *, default: float | None = None) -> Parameter:
-    """Return a parameter that is a number in [low, high]."""
+    """Return the definition of a parameter: a number in [low, high]."""
     text = f"a number from {low:g} to {high:g}" + (f" {unit}" if unit else "")
     return Parameter(text, lambda value: _is_number(value) and low <= value <= high, default)
 
 
 def _whole(low: int, high: int, *, default: int | None = None) -> Parameter:
-    """Return a parameter that is an integer in [low, high]."""
+    """Return the definition of a parameter: an integer in [low, high]."""
     return Parameter(
         f"an integer from {low} to {high}", lambda value: type(value) is int and low <= value <= high, default
     )
@@ -72,12 +72,12 @@ def _choice(names: Sequence[str]) -> Parameter:
 
 _P = _number(0.0, 1.0, default=1.0)
 _MESSAGE = Parameter("the name of a message", lambda value: isinstance(value, str))
-#: Target of the supply faults of all drives; it is not a node.
+#: Target name for supply faults that affect all drives. No node has this name.
 BATTERY: Final = "battery"
 _SUPPLIED: Final = f"drive or {BATTERY}"
 _ANY_TARGET: Final = "message, node or bus"
 
-#: Communication faults. `p` is the probability that a frame is affected.
+#: Kinds of communication faults. The parameter `p` is the probability that the fault affects a frame.
 LINK_KINDS: Final[Mapping[str, Kind]] = {
     "drop": Kind("frames are lost", _ANY_TARGET, {"p": _P}),
     "duplicate": Kind("frames are repeated", _ANY_TARGET, {"p": _P, "copies": _whole(1, 16, default=1)}),
@@ -135,7 +135,7 @@ LINK_KINDS: Final[Mapping[str, Kind]] = {
     ),
 }
 
-#: Faults inside the nodes.
+#: Kinds of faults inside the nodes.
 NODE_KINDS: Final[Mapping[str, Kind]] = {
     "reset": LINK_KINDS["reset"],
     "emergency": Kind(
@@ -174,7 +174,7 @@ NODE_KINDS: Final[Mapping[str, Kind]] = {
     ),
 }
 
-#: Faults of the values that sensors send; they replace noise as well.
+#: Kinds of sensor faults. They replace the sent values including their noise.
 SENSOR_KINDS: Final[Mapping[str, Kind]] = {
     "imu_invalid": Kind("an IMU sends the invalid code in all measured signals", "imu"),
     "imu_saturated": Kind("gyroscope and accelerometer report the end of their range", "imu"),
@@ -191,10 +191,9 @@ KINDS: Final[Mapping[str, Kind]] = {**LINK_KINDS, **NODE_KINDS, **SENSOR_KINDS}
 
 @dataclass(frozen=True, init=False)
 class Fault:
-    """Fault of one kind, from cycle `start` of the emulator, for `cycles` cycles; None: permanent.
+    """Fault to inject: its kind, its target, its first cycle, its duration and its parameters.
 
-    Parameters of the kind, and signals of the message for kinds that take them, are keyword arguments:
-    `Fault("drop", "LEFT_SK_STATE", 1000, 5)`, `Fault("value", "LEFT_SK_STATE", 1000, 1, Position=0.3)`.
+    Examples: `Fault("drop", "LEFT_SK_STATE", 1000, 5)`, `Fault("value", "LEFT_SK_STATE", 1000, 1, Position=0.3)`.
     """
 
     kind: str
@@ -204,14 +203,14 @@ class Fault:
     parameters: tuple[tuple[str, Value], ...]  # (name, value), with defaults
 
     def __init__(self, kind: str, target: str, start: int = 0, cycles: int | None = None, **parameters: Value) -> None:
-        """Make a fault.
+        """Check and store the definition of the fault.
 
         Args:
             kind: name of the kind, a key of `KINDS`.
             target: name of a message, node or bus.
-            start: first cycle of the fault.
+            start: first cycle of the fault, counted by the emulator.
             cycles: duration in cycles. None means permanent.
-            **parameters: parameters of the kind and signals of the message.
+            **parameters: parameters of the kind. Some kinds also take signals of the message.
 
         Raises:
             FaultError: If the kind or a parameter is unknown, or a value is invalid.
@@ -219,9 +218,11 @@ class Fault:
         if kind not in KINDS:
             raise FaultError(f"the kind of fault must be one of {', '.join(KINDS)}, got {kind!r}")
         if type(start) is not int or start < 0:
-            raise FaultError(f"the start of a fault must be an integer from 0 [cycles], got {start!r}")
+            raise FaultError(f"the start of a fault must be an integer of at least 0 [cycles], got {start!r}")
         if cycles is not None and (type(cycles) is not int or cycles < 1):
-            raise FaultError(f"the duration of a fault must be an integer from 1 [cycles], or None, got {cycles!r}")
+            raise FaultError(
+                f"the duration of a fault must be an integer of at least 1 [cycles], or None, got {cycles!r}"
+            )
         for name, value in (
             ("kind", kind),
             ("target", target),
@@ -237,17 +238,17 @@ class Fault:
 
     @property
     def end(self) -> float:
-        """First cycle after the fault, infinity for a permanent one."""
+        """Number of the first cycle after the fault. Infinity for a permanent fault."""
         return math.inf if self.cycles is None else self.start + self.cycles
 
     @property
     def signals(self) -> dict[str, float]:
-        """Values of the signals the fault sets, by signal name."""
+        """Signals that the fault sets, as signal name -> value."""
         known = KINDS[self.kind].parameters
         return {name: float(value) for name, value in self.parameters if name not in known}
 
     def starting(self, cycle: int) -> Fault:
-        """Return the same fault with another first cycle.
+        """Return a copy of the fault with another first cycle.
 
         Args:
             cycle: first cycle of the new fault.
@@ -261,7 +262,7 @@ class Fault:
 
 
 def _checked(kind: str, given: Mapping[str, Value]) -> tuple[tuple[str, Value], ...]:
-    """Check the parameters of a fault and return them with the defaults filled in."""
+    """Check the parameters of a fault. Return them together with the defaults of the others."""
     rule = KINDS[kind]
     known = rule.parameters
     for name, value in given.items():
@@ -274,10 +275,10 @@ def _checked(kind: str, given: Mapping[str, Value]) -> tuple[tuple[str, Value], 
             raise FaultError(f"{kind}: signal {name} must be a finite number, got {value!r}")
     for name, parameter in known.items():
         if name not in given and parameter.default is None:
-            raise FaultError(f"{kind}: {name} is required, and must be {parameter.valid}")
+            raise FaultError(f"{kind}: {name} must be {parameter.valid}, got no value")
     defaults = {name: parameter.default for name, parameter in known.items() if parameter.default is not None}
     if kind in ("value", "raw") and not given.keys() - known.keys():
-        raise FaultError(f"{kind}: at least one signal of the message must be given, such as Position=0.3")
+        raise FaultError(f"{kind}: the fault must set a signal, for example Position=0.3, got no signal")
     return tuple({**defaults, **given}.items())
 
 
@@ -305,7 +306,7 @@ def messages_of(fault: Fault, network: Network) -> tuple[Message, ...]:
     messages = targets[fault.target]
     if "like" in dict(fault.parameters) and fault["like"] not in (known := [m.name for m in network.messages]):
         raise FaultError(
-            f"{fault.kind}: like must be a message, got {fault['like']!r}; valid messages: {', '.join(known)}"
+            f"{fault.kind}: like must be the name of a message, got {fault['like']!r}; valid: {', '.join(known)}"
         )
     for signal in fault.signals:
         if signal not in (known := [s.name for s in messages[0].signals]):
@@ -316,7 +317,7 @@ def messages_of(fault: Fault, network: Network) -> tuple[Message, ...]:
 
 
 def nodes_of(fault: Fault, network: Network) -> tuple[str, ...]:
-    """Return the nodes that a node or sensor fault affects; a fault of the battery affects all drives.
+    """Return the nodes that a node or sensor fault affects. A fault of the battery affects all drives.
 
     Args:
         fault: node or sensor fault.

@@ -1,4 +1,4 @@
-"""Two emulated feet with four three-axis force cells each: contact forces in, noisy cell forces in the foot frame out."""
+"""Emulated force cells of the two feet: compute the forces of all cells in the foot frame from the contacts of the body."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from atalante_hal.types import Vector
 
 @dataclass(frozen=True)
 class FootParameters:
-    """Noise and temperature of the emulated force cells at 1 kHz."""
+    """Noise and temperature of the emulated force cells. The sample rate is 1 kHz."""
 
-    noise: tuple[float, float, float] = (3.0, 3.0, 10.0)  # N rms along x, y, z of a cell
-    temperature: float = 28.0  # degC
+    noise: tuple[float, float, float] = (3.0, 3.0, 10.0)  # noise of a cell along x, y, z [N rms]
+    temperature: float = 28.0  # constant temperature of all cells [degC]
 
 
 class Feet:
-    """Eight force cells; `sample` rewrites their forces on the foot, shape (2, 4, 3) [N]."""
+    """Force cells of two feet, four cells per foot. `sample` updates the array of forces, shape (2, 4, 3) [N]."""
 
     def __init__(self, parameters: FootParameters, force: Vector) -> None:
         self._force = force
@@ -28,7 +28,7 @@ class Feet:
         self._loaded = True
 
     def sample(self, contact: Sequence[tuple[int, int, Vector3]], rotation: Sequence[tuple[float, ...]]) -> None:
-        """Read the cells; call once per `PERIOD`.
+        """Sample all force cells. Must be called once per `PERIOD`.
 
         Args:
             contact: per contact of the last step: index of the foot, index of the cell, force on the foot in world axes [N].
@@ -45,7 +45,7 @@ class Feet:
             self._force[foot, cell] += into_frame(rotation[foot], force)
 
     def draw_noise(self, generator: np.random.Generator, out: Vector) -> None:
-        """Draw the noise of many cycles.
+        """Draw the noise of the force cells for many cycles.
 
         Args:
             generator: source of the random numbers.
@@ -55,7 +55,7 @@ class Feet:
 
 
 def into_frame(rotation: tuple[float, ...], vector: Vector3) -> Vector3:
-    """Return a vector in the axes of a frame.
+    """Transform a vector from world axes into the axes of a frame.
 
     Args:
         rotation: attitude of the frame, quaternion xyzw from the frame to the world.
@@ -63,7 +63,7 @@ def into_frame(rotation: tuple[float, ...], vector: Vector3) -> Vector3:
     """
     x, y, z, w = rotation
     vx, vy, vz = vector
-    # Inverse rotation: v' = v - 2 w (u x v) + 2 u x (u x v).
+    # Inverse rotation by the quaternion (w, u): v' = v - 2 w (u x v) + 2 u x (u x v).
     cx, cy, cz = y * vz - z * vy, z * vx - x * vz, x * vy - y * vx
     return (
         vx - 2.0 * (w * cx - (y * cz - z * cy)),

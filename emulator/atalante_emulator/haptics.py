@@ -1,4 +1,4 @@
-"""Emulated haptics node: eight vibration motors that follow the commanded level with a first-order lag."""
+"""Emulated haptics node with eight vibration motors. Each motor follows its commanded level with a first-order lag."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from atalante_hal.types import PERIOD, Vector
 
-#: Cycles without a valid command after which the motors stop.
+#: Timeout of the vibration command [cycles]. The motors stop after it.
 WATCHDOG = 50
 
 
@@ -15,23 +15,23 @@ WATCHDOG = 50
 class HapticsParameters:
     """Time response of the emulated vibration motors."""
 
-    rise_time: float = 0.04  # s, time constant of a small eccentric-mass motor
+    rise_time: float = 0.04  # time constant of a small eccentric-mass motor [s]
 
 
 class Haptics:
-    """Eight vibration motors; `advance` rewrites `amplitude`, shape (8,), 0 to 1."""
+    """Vibration motors of the haptics node. `advance` updates `amplitude`, shape (8,), from 0 to 1."""
 
     def __init__(self, parameters: HapticsParameters, amplitude: Vector) -> None:
         self.amplitude = amplitude
         self._parameters = parameters
 
     def advance(self, level: Vector, silence: int, cycles: int) -> None:
-        """Advance the amplitudes towards a constant level: a' = (level - a) / rise_time, solved exactly.
+        """Advance the amplitudes by some cycles, with the exact solution of da/dt = (level - a) / rise_time.
 
         Args:
             level: last valid command, shape (8,), 0 to 1.
-            silence: age of that command, in cycles.
-            cycles: time to advance, in units of `PERIOD`.
+            silence: age of that command [cycles].
+            cycles: time to advance [cycles].
         """
         lag = math.exp(-cycles * PERIOD / self._parameters.rise_time)
         self.amplitude *= lag

@@ -1,4 +1,4 @@
-"""Heartbeats of the emulated nodes: a status message with BOOTUP after a start, then with OPERATIONAL in every period."""
+"""Heartbeats of the emulated nodes. The first status message of a node reports BOOTUP, all later ones report OPERATIONAL."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ class _Status:
 
     tx: TransmitImage
     at: dict[str, int]
-    booted: int = 0  # cycle in which the node started
+    booted: int = 0  # number of the cycle in which the node started
 
 
 class Heartbeats:
-    """The status messages of the emulated nodes."""
+    """Sender of the status messages of all emulated nodes."""
 
     def __init__(self, network: Network, messages: Sequence[Message]) -> None:
         self._period = max(m.cycle_ms for m in messages)
-        # The messages are spread over the period, so that no two nodes send their status in the same cycle.
+        # At most one node sends its periodic status in a cycle.
         gap = self._period // len(messages)
         self._due: dict[int, _Status] = {}
         self._of: dict[str, _Status] = {}
@@ -47,7 +47,7 @@ class Heartbeats:
             self.set(message.sender, "SupplyVoltage", _SUPPLY_VOLTAGE)
 
     def set(self, node: str, signal: str, value: float) -> None:
-        """Set a status signal of a node, from its next status message on.
+        """Set a signal in the status messages of a node.
 
         Args:
             node: name of the node.
@@ -58,7 +58,7 @@ class Heartbeats:
         status.tx.values[status.at[signal]] = value
 
     def boot(self, node: str, cycle: int) -> None:
-        """Restart a node: it sends BOOTUP in this cycle, and its uptime and alive counter restart at 0.
+        """Restart a node. It sends BOOTUP in this cycle, and its uptime and alive counter restart at 0.
 
         Args:
             node: name of the node.
@@ -72,7 +72,7 @@ class Heartbeats:
         self._booting.append(status)
 
     def due(self, cycle: int) -> Sequence[Frames]:
-        """Return the status frames of a cycle, shape (1,) each; most cycles have none.
+        """Return the status frames to send in a cycle, shape (1,) each. Most cycles have no status frame.
 
         Args:
             cycle: number of the cycle.

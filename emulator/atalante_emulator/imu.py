@@ -1,7 +1,7 @@
-"""Four emulated IMUs: attitude, angular rate and specific force of the links that carry them, with noise and bias.
+"""Four emulated IMUs: compute attitude, angular rate and specific force from the motion of their links.
 
-The acceleration is the change of the link velocity over the last millisecond plus gravity, rotated into the sensor frame. It
-is consistent with the motion and needs no model.
+The specific force is the change of the link velocity over the last millisecond plus gravity, in the sensor frame. The module
+also draws the noise and the bias of the IMUs.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from atalante_hal.types import PERIOD, Vector
 
 @dataclass(frozen=True)
 class ImuParameters:
-    """Noise, bias and temperature of the emulated IMUs, per axis at 1 kHz."""
+    """Noise, bias and temperature of the emulated IMUs, for each axis at a sample rate of 1 kHz."""
 
-    gyro_noise: float = 3.9e-3  # rad/s rms: 0.01 deg/s/sqrt(Hz) over 500 Hz
-    gyro_bias: float = 5.2e-5  # rad/s rms over devices: 0.003 deg/s
-    accel_noise: float = 0.05  # m/s2 rms
-    accel_bias: float = 0.02  # m/s2 rms over devices
-    temperature: float = 32.0  # degC
+    gyro_noise: float = 3.9e-3  # noise density 0.01 deg/s/sqrt(Hz) times the root of 500 Hz [rad/s rms]
+    gyro_bias: float = 5.2e-5  # standard deviation of the bias between devices, 0.003 deg/s [rad/s]
+    accel_noise: float = 0.05  # noise [m/s2 rms]
+    accel_bias: float = 0.02  # standard deviation of the bias between devices [m/s2]
+    temperature: float = 32.0  # constant temperature of all IMUs [degC]
 
 
 class ImuSignals(NamedTuple):
-    """Signals of the IMUs' state frames; `Imus.sample` rewrites them."""
+    """Signals in the state frames of the IMUs. `Imus.sample` updates them."""
 
-    quaternion: Vector  # (4, 4) wxyz, sensor to world, w >= 0
-    gyro: Vector  # (4, 3) rad/s
-    accel: Vector  # (4, 3) m/s2, specific force: +g upwards at rest
+    quaternion: Vector  # attitude, wxyz from sensor to world with w >= 0, shape (4, 4)
+    gyro: Vector  # angular rate in the sensor frame, shape (4, 3) [rad/s]
+    accel: Vector  # specific force in the sensor frame, upwards at rest, shape (4, 3) [m/s2]
 
 
 def _sample(links: Vector, before: Vector, quaternion: Vector, gyro: Vector, accel: Vector) -> None:
@@ -52,7 +52,7 @@ def _sample(links: Vector, before: Vector, quaternion: Vector, gyro: Vector, acc
             before[i] = vx, vy, vz
         ax, ay, az = (vx - before[i, 0]) / PERIOD, (vy - before[i, 1]) / PERIOD, (vz - before[i, 2]) / PERIOD + GRAVITY
         before[i] = vx, vy, vz
-        # Rows of the matrix that rotates world vectors into the sensor frame.
+        # The matrix r rotates vectors from world axes into the sensor frame.
         x2, y2, z2 = x + x, y + y, z + z
         xx, yy, zz, xy, xz, yz = x * x2, y * y2, z * z2, x * y2, x * z2, y * z2
         xw, yw, zw = w * x2, w * y2, w * z2
@@ -66,19 +66,19 @@ def _sample(links: Vector, before: Vector, quaternion: Vector, gyro: Vector, acc
 
 
 class Imus:
-    """IMUs of a body; row i of the signals belongs to IMU i of `robot.IMUS`."""
+    """Emulated IMUs of the robot. Row i of the signals belongs to IMU i of `robot.IMUS`."""
 
     def __init__(self, parameters: ImuParameters, signals: ImuSignals) -> None:
         self._parameters, self._signals = parameters, signals
         self._count = len(signals.quaternion)
         self._before = np.zeros((self._count, 3))
         self._sample = compiled(_sample)
-        # The first call compiles the kernel, which would be too slow within a cycle.
+        # Compiles the kernel now, because compilation takes longer than a cycle.
         self.sample(np.zeros((self._count, LINK_STATE)))
         self._before.fill(math.nan)
 
     def sample(self, links: Vector) -> None:
-        """Read the sensors; call once per `PERIOD`.
+        """Sample all IMUs. Must be called once per `PERIOD`.
 
         Args:
             links: attitude and velocities of each IMU after the last step, as in `Body.imu`, shape (4, 10).
@@ -86,7 +86,7 @@ class Imus:
         self._sample(links, self._before, *self._signals)
 
     def draw_bias(self, generator: np.random.Generator) -> tuple[Vector, Vector]:
-        """Draw the constant biases of the devices.
+        """Draw the constant biases of the IMUs.
 
         Args:
             generator: source of the random numbers.
@@ -100,7 +100,7 @@ class Imus:
     def draw_noise(
         self, generator: np.random.Generator, bias: tuple[Vector, Vector], gyro: Vector, accel: Vector
     ) -> None:
-        """Draw the noise of many cycles and add the bias.
+        """Draw the noise of the IMUs for many cycles, and add their bias.
 
         Args:
             generator: source of the random numbers.

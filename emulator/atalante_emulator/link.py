@@ -1,4 +1,4 @@
-"""Communication faults: a bus at the emulator's end that loses, changes, delays and adds frames in both directions.
+"""Injected communication faults: a bus wrapper that loses, changes, delays and adds frames in both directions.
 
     HAL <- bus <- FaultyBus.send <- nodes
     HAL -> bus -> FaultyBus.receive -> nodes
@@ -22,33 +22,33 @@ from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.wire.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, ID_EXTENDED, Frames, joined, new_frames
 
-#: Class bit of an error frame (linux/can/error.h).
+#: Bit for bus-off in the identifier of a CAN error frame (CAN_ERR_BUSOFF of linux/can/error.h).
 BUS_OFF: Final = 0x40
 _HIGHEST_STANDARD: Final = 0x7FF
 _CLASSIC_LENGTH: Final = 8
 
 
 class _Late(NamedTuple):
-    """Delayed frame and the cycle in which it is due."""
+    """Delayed frame and the cycle in which it goes on the wire."""
 
     due: int
     frame: Frames
 
 
 class _Disturbance:
-    """One communication fault in operation: it changes, loses, delays and adds frames."""
+    """Execution of one communication fault: changes, loses, delays and adds frames."""
 
     def __init__(self, fault: Fault, network: Network, seed: str) -> None:
         self.fault = fault
-        # The injected frames are copies of a received one, so the fault must receive frames one cycle earlier.
+        # `inject` sends copies of a received frame, so it must receive frames one cycle before its start.
         self.from_cycle = fault.start - (fault.kind == "inject")
         self.messages = {message.frame_id: message for message in messages_of(fault, network)}
         self.random = random.Random(seed)
         self.late: list[_Late] = []
         self._network = network
-        self._counters: dict[int, int] = {}  # frozen counter, by identifier
-        self._held: dict[int, Frames] = {}  # frame that waits for the next frame of its message, by identifier
-        self._last: Frames | None = None  # last frame of the message to inject
+        self._counters: dict[int, int] = {}  # identifier -> frozen counter
+        self._held: dict[int, Frames] = {}  # identifier -> frame kept back until the next frame of its message
+        self._last: Frames | None = None  # last received frame, which `inject` copies
         self._effect = _EFFECTS[fault.kind]
         self.babble: Babble | None = None
         if fault.kind == "flood":
@@ -56,7 +56,7 @@ class _Disturbance:
         self._chance = float(dict(fault.parameters).get("p", 1.0))
 
     def frames(self, frame: Frames, cycle: int) -> Sequence[Frames]:
-        """Return the frames that replace a frame, shape (1,) each.
+        """Apply the fault to a frame, and return the frames to pass on instead, shape (1,) each.
 
         Args:
             frame: frame as sent, shape (1,).
@@ -70,7 +70,7 @@ class _Disturbance:
         return self._effect(self, frame, message, cycle)
 
     def due(self, cycle: int) -> list[Frames]:
-        """Remove the delayed frames that are due and return them, shape (1,) each.
+        """Return the delayed frames that are due, shape (1,) each, and remove them from `late`.
 
         Args:
             cycle: number of the cycle.
@@ -118,7 +118,7 @@ class _Disturbance:
         earlier = self._held.pop(message.frame_id, None)
         if earlier is not None:
             return frame, earlier
-        if cycle + 1 < self.fault.end:  # the fault lasts until a later frame can pass this one
+        if cycle + 1 < self.fault.end:  # a later frame can still overtake this frame
             self._held[message.frame_id] = frame
             return ()
         return (frame,)
@@ -203,10 +203,10 @@ _EFFECTS: Final[dict[str, Callable[[_Disturbance, Frames, Message, int], Sequenc
 
 
 class FaultyBus(WrappedBus):
-    """Emulator's end of a bus, with communication faults.
+    """Bus of the emulated nodes with injected communication faults.
 
-    Delayed and added frames are on the wire at the SYNC of their cycle: for the nodes before the frames of the HAL, and for the
-    HAL before the answers of the nodes. Added frames reach both ends.
+    Delayed and added frames go on the wire when the SYNC of their cycle arrives. The nodes receive them before the frames of
+    the HAL. The HAL receives them before the answers of the nodes. Added frames reach both ends.
     """
 
     def __init__(
@@ -217,15 +217,15 @@ class FaultyBus(WrappedBus):
         Args:
             bus: bus to the HAL.
             network: nodes and messages of the DBC.
-            faults: faults to inject; those outside `LINK_KINDS` are ignored.
-            clock: returns the emulator's cycle.
+            faults: faults to inject. Faults of other kinds than `LINK_KINDS` are ignored.
+            clock: function that returns the cycle number of the emulator.
             seed: seed of the random faults.
 
         Raises:
             FaultError: If the network has no such target or signal.
         """
         super().__init__(bus)
-        #: Whether the HAL sent a SYNC in the last `receive`, even if a fault removed it.
+        #: Whether the last `receive` got a SYNC of the HAL, also if a fault removed that SYNC.
         self.synced = False
         self._clock, self._cycle, self._begun = clock, -1, -1
         self._all = [
@@ -236,8 +236,8 @@ class FaultyBus(WrappedBus):
         self._active: list[_Disturbance] = []
         self._syncs = {m.frame_id for m in network.messages if m.name.startswith("SYNC_")}
         self._from_hal = {m.frame_id for m in network.sent_by("HAL")}
-        self._for_nodes: list[Frames] = []  # frames that the nodes did not receive yet
-        #: Wire time of the frames on each bus, used during a flood.
+        self._for_nodes: list[Frames] = []  # frames to the nodes that are not received yet
+        #: Arbitration of the frames on each bus, computed only during a flood.
         self.wire = Wire(network)
 
     def send(self, frames: Frames) -> None:
@@ -271,7 +271,7 @@ class FaultyBus(WrappedBus):
         self.synced = not self._syncs.isdisjoint(frames["can_id"][:count].tolist())
         if self.synced:
             self._begin_cycle()
-        # Commands may arrive before their SYNC and belong to this cycle, too.
+        # Commands of this cycle may arrive before its SYNC.
         if self._now() or not self.wire.idle:
             self._for_nodes += self._passed(frames[:count], from_hal=True)
         elif self._for_nodes:
@@ -293,14 +293,14 @@ class FaultyBus(WrappedBus):
         return self._active
 
     def _passed(self, frames: Frames, *, from_hal: bool) -> list[Frames]:
-        """Pass each frame through all active faults and return those that fit on the wire, shape (1,) each."""
+        """Apply all active faults to each frame. Return the frames that get on the wire in this cycle, shape (1,) each."""
         passing = [frames[row : row + 1].copy() for row in range(len(frames))]
         for disturbance in self._active:
             passing = [after for frame in passing for after in disturbance.frames(frame, self._cycle)]
         return passing if self.wire.idle else self.wire.carry(passing, from_hal=from_hal)
 
     def _begin_cycle(self) -> None:
-        """Put the delayed and the added frames on the wire, once per cycle."""
+        """Send the delayed frames that are due and the added frames. Only the first call in a cycle has an effect."""
         self._now()
         if self._begun == self._cycle:
             return
@@ -309,7 +309,7 @@ class FaultyBus(WrappedBus):
         added = [frame for d in self._active for frame in d.added(self._cycle)]
         added += self.wire.begin([d.babble for d in self._active if d.babble is not None])
         self._for_nodes += [frame for frame in due if _id(frame) in self._from_hal]
-        self._for_nodes += [frame for frame in added if not _id(frame) & ID_ERROR]  # error frames are local to the HAL
+        self._for_nodes += [frame for frame in added if not _id(frame) & ID_ERROR]  # only the HAL gets error frames
         if for_hal := [frame for frame in due if _id(frame) not in self._from_hal] + added:
             self.bus.send(joined(for_hal))
 
@@ -324,7 +324,7 @@ def _cut(frame: Frames, length: int) -> None:
 
 
 def _sealed(frame: Frames, message: Message, *, counter: int | None = None) -> Frames:
-    """Write the CRC for the frame's length and a message's Data ID, and return the frame; skip frames without room for it."""
+    """Write the counter and the CRC with the Data ID of a message into a frame, and return it. Leave short frames unchanged."""
     payload = frame["data"][0]
     length = int(frame["len"][0])
     if length > COUNTER_BYTE:

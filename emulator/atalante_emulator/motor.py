@@ -1,4 +1,4 @@
-"""Twelve emulated motors with current loop, friction, brake and winding heat: wanted torque in, joint torque out."""
+"""Twelve emulated motors with current loop, friction, brake and winding temperature: compute the torques on the joints."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from atalante_hal.types import PERIOD, Vector
 
 @dataclass(frozen=True)
 class MotorParameters:
-    """True parameters of the emulated motors; a tuple has one value per leg joint: FH, TH, SH, SK, SA, HA."""
+    """True parameters of the emulated motors. A tuple has one value per leg joint: FH, TH, SH, SK, SA, HA."""
 
-    coulomb: tuple[float, ...] = (4.1, 3.1, 5.15, 4.9, 2.06, 0.97)  # Nm, dry friction at the joint
-    viscous: tuple[float, ...] = (6.2, 3.9, 5.9, 4.1, 1.03, 0.49)  # Nm s/rad
-    friction_speed: float = 0.05  # rad/s over which dry friction changes sign
-    # A relay shorts the windings while the power stage is off, so that a joint without power sinks slowly.
-    brake: tuple[float, ...] = (150.0, 40.0, 125.0, 80.0, 20.0, 8.0)  # Nm s/rad
-    current_loop: float = 0.5e-3  # s, time constant of the torque
-    ambient: float = 25.0  # degC
-    heating: float = 70.0  # K, final temperature rise at half the joint's torque limit
-    thermal_time: float = 300.0  # s
+    coulomb: tuple[float, ...] = (4.1, 3.1, 5.15, 4.9, 2.06, 0.97)  # dry friction at the joint [Nm]
+    viscous: tuple[float, ...] = (6.2, 3.9, 5.9, 4.1, 1.03, 0.49)  # viscous friction at the joint [Nm s/rad]
+    friction_speed: float = 0.05  # joint speed at which dry friction reaches 76 % of its full value [rad/s]
+    # While the power stage is off, a relay shorts the windings, and the motor brakes the joint.
+    brake: tuple[float, ...] = (150.0, 40.0, 125.0, 80.0, 20.0, 8.0)  # damping of the brake [Nm s/rad]
+    current_loop: float = 0.5e-3  # time constant of the torque [s]
+    ambient: float = 25.0  # ambient temperature [degC]
+    heating: float = 70.0  # final temperature rise at half the torque limit [K]
+    thermal_time: float = 300.0  # time constant of the winding temperature [s]
 
 
-#: Rows of the motor array: wanted torque, strength, dry friction, damping, external torque, resulting joint torque.
+#: Rows of the motor array: torque setpoint, strength, dry friction, damping, external torque, resulting joint torque.
 _WANTED, _STRENGTH, _DRY, _DAMPING, _PUSH, _JOINT = range(6)
 
 
-def _turn(velocity: Vector, motors: Vector, tracking: float, friction_speed: float, torque: Vector) -> None:
+def _advance(velocity: Vector, motors: Vector, tracking: float, friction_speed: float, torque: Vector) -> None:
     """Advance all motors by one `PERIOD`.
 
     Args:
         velocity: true joint velocities, shape (12,) [rad/s].
-        motors: motor array, shape (6, 12); its joint torques are updated.
+        motors: motor array, shape (6, 12). Its joint torques are updated.
         tracking: share of the torque error that the current loop removes per `PERIOD`.
-        friction_speed: speed over which dry friction changes sign [rad/s].
-        torque: motor torques, shape (12,) [Nm]; updated.
+        friction_speed: joint speed at which dry friction reaches 76 % of its full value [rad/s].
+        torque: motor torques, shape (12,) [Nm]. Updated here.
     """
     for i in range(len(torque)):
         torque[i] += tracking * (motors[_WANTED, i] - torque[i])
@@ -49,7 +49,7 @@ def _turn(velocity: Vector, motors: Vector, tracking: float, friction_speed: flo
 
 
 class Motors:
-    """Motors of all joints; they rewrite the given arrays of measured torque [Nm at the joint] and temperature [degC]."""
+    """Motors of all joints. They update the arrays of measured torque [Nm at the joint] and winding temperature [degC]."""
 
     def __init__(self, robot: Robot, parameters: MotorParameters, torque: Vector, temperature: Vector) -> None:
         both = len(SIDES)
@@ -64,11 +64,11 @@ class Motors:
         self._motors[_DAMPING] = self._braked
         self._heat = parameters.heating / (0.5 * robot.torque_max) ** 2
         temperature.fill(parameters.ambient)
-        self._turn = compiled(_turn)
-        self.turn(np.zeros(len(JOINTS)))  # the first call compiles the kernel, which would be too slow within a cycle
+        self._advance = compiled(_advance)
+        self.advance(np.zeros(len(JOINTS)))  # compiles the kernel now, because compilation takes longer than a cycle
 
     def power(self, powered: npt.NDArray[np.bool_]) -> None:
-        """Set the power stages; motors without power brake.
+        """Switch the power stage of each motor on or off. A motor without power brakes its joint.
 
         Args:
             powered: whether each power stage is on, shape (12,).
@@ -76,16 +76,16 @@ class Motors:
         self._motors[_DAMPING] = np.where(powered, self._viscous, self._braked)
 
     def weaken(self, motor: int, strength: float) -> None:
-        """Reduce the true torque of a motor to a share of the torque it measures.
+        """Set the ratio of true torque to measured torque of a motor.
 
         Args:
             motor: index of the motor.
-            strength: share of the torque, 1 is a motor without fault.
+            strength: ratio, 0 to 1. A motor without fault has 1.
         """
         self._motors[_STRENGTH, motor] = strength
 
     def push(self, joint: int, torque: float) -> None:
-        """Set the external torque on a joint, which adds to the motor torque.
+        """Set an external torque on a joint. It is added to the motor torque.
 
         Args:
             joint: index of the joint.
@@ -93,23 +93,24 @@ class Motors:
         """
         self._motors[_PUSH, joint] = torque
 
-    def turn(self, velocity: Vector) -> list[float]:
+    def advance(self, velocity: Vector) -> list[float]:
         """Advance the motors by one `PERIOD` and return the torques on the joints.
 
-        A joint torque is the motor torque, which follows `wanted`, minus friction and brake, plus the external torque.
+        The motor torque follows the setpoint `wanted`. The joint torque is the motor torque minus friction and brake torque,
+        plus the external torque.
 
         Args:
-            velocity: true joint velocities, which friction depends on, shape (12,) [rad/s].
+            velocity: true joint velocities, on which friction depends, shape (12,) [rad/s].
 
         Returns:
             Joint torques, shape (12,) [Nm].
         """
-        self._turn(velocity, self._motors, self._tracking, self._parameters.friction_speed, self._torque)
+        self._advance(velocity, self._motors, self._tracking, self._parameters.friction_speed, self._torque)
         torque: list[float] = self._joint.tolist()
         return torque
 
     def warm(self, seconds: float) -> None:
-        """Advance the winding temperatures, a first-order lag heated by the squared torque.
+        """Advance the winding temperatures. The heat is proportional to the squared torque, with a first-order lag.
 
         Args:
             seconds: time to advance at the present torque [s].

@@ -1,4 +1,4 @@
-"""Faults inside the nodes: changes before the sensors of a cycle are read, and changes of the values they send.
+"""Injected faults inside the nodes: faults of drives, supply, encoders, status messages and sensor values.
 
 body -> NodeFaults.begin -> encoders, drives -> truth + noise -> NodeFaults.rewrite -> frames
 """
@@ -23,12 +23,12 @@ from atalante_hal.wire.codec import Codec
 
 Nodes = Sequence[str]
 
-#: IMU signals that an IMU fault changes.
+#: Names of the measured IMU signals, without the letter of the axis.
 _MEASURED: Final = ("Quaternion", "Gyro", "Accel")
 
 
 class NodeFaults:
-    """Active faults of `NODE_KINDS` and `SENSOR_KINDS` in one emulator."""
+    """Execution of the faults of `NODE_KINDS` and `SENSOR_KINDS` in one emulator."""
 
     def __init__(
         self,
@@ -43,9 +43,9 @@ class NodeFaults:
         """Connect the faults to the nodes.
 
         Args:
-            faults: faults to inject; those of other kinds are ignored.
+            faults: faults to inject. Faults of other kinds are ignored.
             network: nodes and messages of the DBC.
-            robot: joint properties, for the energy that the drives draw.
+            robot: joint properties, from which the energy consumption of the drives is computed.
             codec: codec of the 1 ms messages.
             drives: emulated drives.
             heartbeats: status messages of all nodes.
@@ -59,13 +59,13 @@ class NodeFaults:
         self._faults = [(fault, nodes_of(fault, network)) for fault in faults if fault.kind in NODE_KINDS]
         self._sensors = [(fault, nodes_of(fault, network)[0]) for fault in faults if fault.kind in SENSOR_KINDS]
         self.rewrites = bool(self._sensors)
-        self._position: Vector = np.zeros(len(NODES))  # rad, joint positions at the encoders
+        self._position: Vector = np.zeros(len(NODES))  # joint positions at the encoders [rad]
         self._stuck_at: dict[Fault, float] = {}
         self._frozen: dict[Fault, Vector] = {}
         self._hold_up: dict[Fault, HoldUp] = {}
 
     def begin(self, cycle: int, position: Vector) -> Vector:
-        """Apply the node faults of this cycle, and end those that are over.
+        """Apply the node faults that are active in this cycle, and end those whose duration is over.
 
         Args:
             cycle: number of the cycle.
@@ -81,11 +81,11 @@ class NodeFaults:
         return self._position
 
     def rewrite(self, cycle: int, values: Vector) -> None:
-        """Apply the sensor faults of this cycle to the values about to be sent.
+        """Apply the sensor faults that are active in this cycle to the values before they are sent.
 
         Args:
             cycle: number of the cycle.
-            values: values of the 1 ms messages in DBC units, shape (codec.size,); updated.
+            values: values of the 1 ms messages in DBC units, shape (codec.size,). Updated here.
         """
         for fault, node in self._sensors:
             if fault.start <= cycle < fault.end:
@@ -98,7 +98,7 @@ class NodeFaults:
         begins, ends = cycle == fault.start, cycle == fault.end
         if node in NODES:
             if begins:
-                self._drives.fail(NODES.index(node), code, stands=True)
+                self._drives.fail(NODES.index(node), code, persists=True)
             elif ends:
                 self._drives.recover(NODES.index(node), code)
         elif begins:
@@ -114,7 +114,7 @@ class NodeFaults:
             self._drives.leave(drive, AUTOMATIC[self._drives.state[drive]])
 
     def _reset(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
-        """Keep the node in reset, and boot it at the end; the fault of the same kind in `link` blocks its frames."""
+        """Keep a drive in its reset state during the fault, and boot the node at the end. `link` drops its frames meanwhile."""
         (node,) = nodes
         if cycle == fault.end:
             self._heartbeats.boot(node, cycle)

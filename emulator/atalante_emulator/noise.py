@@ -1,4 +1,4 @@
-"""Sensor noise of the emulated nodes, drawn for many cycles at a time."""
+"""Sensor noise of the emulated nodes. It is drawn for many cycles at once to save time."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from atalante_emulator.imu import Imus
 from atalante_hal.types import Vector
 from atalante_hal.wire.codec import Codec
 
-#: Number of cycles that one `draw` covers.
+#: Number of cycles for which one call of `draw` draws the noise.
 NOISE_CYCLES: Final = 128
 
 
 class SensorNoise:
-    """Noise of `NOISE_CYCLES` cycles, in the order of the codec's values."""
+    """Noise of all signals for `NOISE_CYCLES` cycles, in the signal order of the codec."""
 
     def __init__(self, seed: int, codec: Codec, drives: Drives, imus: Imus, feet: Feet) -> None:
         self._noise = noise = np.zeros((NOISE_CYCLES, codec.size))
@@ -25,7 +25,7 @@ class SensorNoise:
         self._torque, self._gyro, self._accel, self._force = (
             noise[:, codec.slice(quantity)] for quantity in ("Torque", "Gyro", "Accel", "Force")
         )
-        # Each sensor family has its own generator, so that another IMU model does not change the noise of the feet.
+        # Drives, IMUs and feet have separate generators: a change of the IMU model leaves the noise of the feet unchanged.
         self._of_drives, self._of_imus, self._of_feet = (
             np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3)
         )

@@ -1,6 +1,6 @@
-"""Emulated pendant node and its operator, with dead-man switch, buttons and assistance dial.
+"""Emulated pendant node, and the emulated operator of its dead-man switch, buttons and assistance dial.
 
-The node sends the same frame as a real pendant and receives the HAL state from SYNC, as a real pendant does.
+Like a real pendant, the node sends `PENDANT_STATE` and reads the HAL state from SYNC.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from typing import NamedTuple
 from atalante_hal.types import Vector
 from atalante_hal.wire.codec import Codec
 
-#: Value of the signal `HalState` in which the operator presses START.
+#: Value READY of the signal `HalState`. In this state the operator presses START.
 HAL_READY = 1
 
 
 class Request(IntEnum):
-    """Request of the operator; values of the signal `PENDANT_STATE.Request`."""
+    """Last pressed button: values of the signal `PENDANT_STATE.Request`."""
 
     NONE = 0
     START = 1
@@ -25,7 +25,7 @@ class Request(IntEnum):
 
 
 class PendantSignals(NamedTuple):
-    """Signals of `PENDANT_STATE`; an `assistance_factor` of None leaves the factor unchanged."""
+    """Signals of the message `PENDANT_STATE`. If `assistance_factor` is None, the HAL keeps its own factor."""
 
     dead_man: bool = True
     request: Request = Request.NONE
@@ -34,27 +34,27 @@ class PendantSignals(NamedTuple):
 
 
 class Operator:
-    """Emulated operator who keeps the dead-man switch pressed and presses START while the HAL is READY.
+    """Emulated operator: keeps the dead-man switch pressed, and presses START while the HAL is in READY.
 
-    A robot in HOLD stays there until `start()` is called, because recovery must be a decision of the operator.
+    A robot in HOLD stays in HOLD until `start()` is called, because only the operator may end HOLD.
     """
 
-    #: Cycles in READY before START, and between two presses while the HAL stays READY.
+    #: Time in READY before the operator presses START, and before every further press [cycles].
     REACTION = 200
 
     def __init__(self, assistance_factor: float | None = None, *, starts: bool = True) -> None:
         """Press the dead-man switch and set the dial.
 
         Args:
-            assistance_factor: assistance factor Xi on the dial, 0 to 1. None leaves it to the HAL.
-            starts: whether the operator presses START when the HAL is READY.
+            assistance_factor: assistance factor Xi on the dial, 0 to 1. None: the HAL keeps its own factor.
+            starts: whether the operator presses START when the HAL is in READY.
 
         Raises:
             ValueError: If the factor is outside [0, 1].
         """
         self._starts = starts
         self._ready_for = 0
-        #: Signals that the node sends; replaced by a new object at every change.
+        #: Signals that the node sends. Every change creates a new object.
         self.signals = PendantSignals()
         self.assist(assistance_factor)
 
@@ -62,7 +62,7 @@ class Operator:
         """Turn the assistance dial.
 
         Args:
-            factor: assistance factor Xi, 0 to 1. None leaves it to the HAL.
+            factor: assistance factor Xi, 0 to 1. None: the HAL keeps its own factor.
 
         Raises:
             ValueError: If the factor is outside [0, 1].
@@ -72,16 +72,16 @@ class Operator:
         self.signals = self.signals._replace(assistance_factor=factor)
 
     def start(self) -> None:
-        """Press START."""
+        """Press the START button."""
         self._press(Request.START)
 
     def stop(self) -> None:
-        """Press STOP; the operator presses START again only on `start()`."""
+        """Press the STOP button. From now on, the operator presses START only in `start()`."""
         self._starts = False
         self._press(Request.STOP)
 
     def hold(self) -> None:
-        """Press HOLD; the operator presses START again only on `start()`."""
+        """Press the HOLD button. From now on, the operator presses START only in `start()`."""
         self._starts = False
         self._press(Request.HOLD)
 
@@ -90,11 +90,11 @@ class Operator:
         self.signals = self.signals._replace(dead_man=False)
 
     def squeeze(self) -> None:
-        """Press the dead-man switch again."""
+        """Press the dead-man switch after a release."""
         self.signals = self.signals._replace(dead_man=True)
 
-    def hear(self, hal_state: int) -> None:
-        """Receive the HAL state of one cycle, and press START if it is time.
+    def receive(self, hal_state: int) -> None:
+        """Read the HAL state of one cycle, and press START after `REACTION` cycles in READY.
 
         Args:
             hal_state: value of the signal `HalState` in SYNC.
@@ -112,7 +112,7 @@ class Operator:
 
 
 class PendantNode:
-    """Pendant node of an operator: receives the HAL state from SYNC and sends `PENDANT_STATE`."""
+    """Emulated pendant node: passes the HAL state to the operator, and fills the signals of `PENDANT_STATE`."""
 
     def __init__(self, operator: Operator, codec: Codec, values: Vector) -> None:
         """Connect the node to its signals.
@@ -128,8 +128,8 @@ class PendantNode:
         names = ("DeadMan", "Request", "RequestCounter", "AssistanceSet", "AssistanceFactor")
         self._indices = [codec.index("PENDANT_STATE", name) for name in names]
 
-    def hear(self, hal_state: int) -> bool:
-        """Receive the HAL state of one cycle and update the signals.
+    def receive(self, hal_state: int) -> bool:
+        """Read the HAL state of one cycle and update the signals.
 
         Args:
             hal_state: value of the signal `HalState` in SYNC.
@@ -137,7 +137,7 @@ class PendantNode:
         Returns:
             Whether a signal changed.
         """
-        self._operator.hear(hal_state)
+        self._operator.receive(hal_state)
         signals = self._operator.signals
         if signals is self._sent:
             return False

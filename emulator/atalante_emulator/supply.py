@@ -1,4 +1,4 @@
-"""Supply of the drives without battery: the capacitors of the DC link feed them until they are empty."""
+"""Supply of the drives without a battery: the capacitors of the DC link discharge into the drives."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ import numpy as np
 from atalante_hal.robot import Robot
 from atalante_hal.types import PERIOD, Vector
 
-IDLE = 40.0  # W, power of the electronics of all twelve drives
-#: Copper loss of a motor at its torque limit [W].
+#: Power of the electronics of all twelve drives [W].
+IDLE = 40.0
+#: Copper loss of one motor at its torque limit [W].
 COPPER = 250.0
 
 
 class HoldUp:
-    """Energy of the DC link without a battery: E = C V^2 / 2, minus the energy that the drives draw."""
+    """DC link without a battery. Its energy E = C V^2 / 2 decreases by the energy that the drives draw."""
 
     def __init__(self, robot: Robot, capacity: float, voltage: float) -> None:
-        """Charge the DC link.
+        """Charge the DC link to a voltage.
 
         Args:
-            robot: torque limits, which scale the copper losses.
+            robot: torque limits of the joints, to scale the copper losses.
             capacity: capacitance of the DC link [F].
             voltage: voltage at the start [V].
         """
@@ -30,7 +31,7 @@ class HoldUp:
         self._energy = 0.5 * capacity * voltage**2
 
     def draw(self, torque: Vector, speed: Vector) -> float:
-        """Draw the energy of one `PERIOD` and return the voltage after it [V]; braking motors feed nothing back.
+        """Draw the energy of one `PERIOD` and return the remaining voltage [V]. Braking motors return no energy.
 
         Args:
             torque: motor torques, shape (12,) [Nm at the joint].

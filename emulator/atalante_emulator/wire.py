@@ -1,7 +1,7 @@
-"""Wire time of the buses: frames are sent in the order of arbitration, and the others wait for the next cycle.
+"""CAN arbitration of the emulated buses during a flood: decides which frames get on the wire in each cycle.
 
-It is computed only during a flood, because each bus has enough time for its cyclic messages otherwise (`Network.bus_load`). A
-sender keeps one waiting frame per identifier; a newer frame replaces it.
+All other frames wait for the next cycle. A sender keeps only the newest waiting frame of each identifier. Without a flood
+there is no need for arbitration, because each bus has enough time for its cyclic messages (`Network.bus_load`).
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, Frames, new_frames
 
 @dataclass
 class Babble:
-    """Defective sender that floods a bus with frames of one identifier."""
+    """Defective node that floods a bus with frames of one identifier."""
 
     bus: str
     can_id: int
-    length: int  # bytes
-    load: float  # share of the bus time that the sender requests, 0 to 1
-    taken: float = 0.0  # s, wire time that the sender gets in this cycle
-    owed: float = 0.0  # s, wire time that the sender got but that is too short for a whole frame
+    length: int  # payload length [bytes]
+    load: float  # share of the bus time that the node tries to use, 0 to 1
+    taken: float = 0.0  # wire time that the node gets in this cycle [s]
+    rest: float = 0.0  # wire time left over from earlier cycles, shorter than one frame [s]
 
     def frames(self, network: Network) -> int:
-        """Return how many frames of the sender fit into a cycle. Only smaller identifiers have priority over the sender.
+        """Return how many flood frames fit into a cycle. Messages with smaller identifiers have priority over them.
 
         Args:
             network: messages and bit rates of the buses.
@@ -39,30 +39,30 @@ class Babble:
         )
         one = _time_of(network, self.length)
         self.taken = min(self.load, max(0.0, 1.0 - before)) * PERIOD
-        self.owed += self.taken
-        count = int(self.owed / one + 1e-9)
-        self.owed -= count * one
+        self.rest += self.taken
+        count = int(self.rest / one + 1e-9)
+        self.rest -= count * one
         return count
 
 
 class Wire:
-    """Arbitration of all buses, cycle by cycle."""
+    """Arbitration of the frames on all buses."""
 
     def __init__(self, network: Network) -> None:
         self._network = network
         self._bus_of = {m.frame_id: m.bus for m in network.messages}
-        self._used: dict[str, float] = {}  # s, wire time that regular frames used in this cycle, by bus
+        self._used: dict[str, float] = {}  # bus -> wire time of the regular frames in this cycle [s]
         self._babbles: Sequence[Babble] = ()
-        self._from_hal: dict[int, Frames] = {}  # waiting frames of the HAL, by identifier
-        self._from_nodes: dict[int, Frames] = {}  # waiting frames of the nodes, by identifier
+        self._from_hal: dict[int, Frames] = {}  # identifier -> waiting frame of the HAL
+        self._from_nodes: dict[int, Frames] = {}  # identifier -> waiting frame of a node
 
     @property
     def idle(self) -> bool:
-        """Whether there is no flood and no waiting frame."""
+        """Whether no flood is active and no frame waits."""
         return not (self._babbles or self._from_hal or self._from_nodes)
 
     def load(self, bus: str) -> float:
-        """Return the share of the cycle in which a bus is busy so far.
+        """Return the load of a bus in the present cycle, as a share of the cycle time.
 
         Args:
             bus: name of the bus.
@@ -70,7 +70,7 @@ class Wire:
         return (self._used.get(bus, 0.0) + sum(one.taken for one in self._babbles if one.bus == bus)) / PERIOD
 
     def begin(self, babbles: Sequence[Babble]) -> list[Frames]:
-        """Begin a cycle and return the flood frames that get on the wire, shape (1,) each.
+        """Begin a cycle. Return the flood frames that get on the wire in this cycle, shape (1,) each.
 
         Args:
             babbles: floods that are active in this cycle.
@@ -80,7 +80,7 @@ class Wire:
         return [_babbled(one) for one in babbles for _ in range(one.frames(self._network))]
 
     def carry(self, frames: Sequence[Frames], *, from_hal: bool) -> list[Frames]:
-        """Return the frames that get on the wire in this cycle, in the order of arbitration; the others wait.
+        """Return the frames that get on the wire in this cycle, in the order of arbitration. All other frames wait.
 
         Args:
             frames: frames to send now, shape (1,) each.

@@ -467,7 +467,7 @@ class TestErrors:
         assert [e.code for e in bench.drives.emergencies] == [0x2310, 0x4310, 0]
 
     def test_the_end_of_an_error_is_not_its_acknowledgement(self, bench: DriveBench) -> None:
-        bench.drives.fail(7, 0x2310, stands=True)
+        bench.drives.fail(7, 0x2310, persists=True)
         for _ in range(SLOW_CYCLES):
             bench.cycle()
         bench.drives.recover(7, 0x2310)
@@ -504,7 +504,7 @@ class TestErrors:
 
     def test_an_error_that_stands_cannot_be_acknowledged(self, bench: DriveBench) -> None:
         bench.enable()
-        bench.drives.fail(7, 0x3220, stands=True)
+        bench.drives.fail(7, 0x3220, persists=True)
         bench.word[:] = Controlword.QUICK_STOP
         for _ in range(3):
             bench.cycle()
@@ -517,7 +517,7 @@ class TestErrors:
 
     def test_a_drive_with_an_error_that_stands_can_be_lowered_and_not_enabled(self, bench: DriveBench) -> None:
         bench.enable()
-        bench.drives.fail(7, 0x3220, stands=True)
+        bench.drives.fail(7, 0x3220, persists=True)
         bench.word[7] = Controlword.DISABLE_VOLTAGE
         bench.cycle()
         assert bench.drives.state[7] is DriveState.SWITCH_ON_DISABLED
@@ -539,10 +539,10 @@ class TestErrors:
 
     def test_a_reset_drive_has_forgotten_everything(self, bench: DriveBench) -> None:
         bench.enable()
-        bench.drives.fail(7, 0x3220, stands=True)
+        bench.drives.fail(7, 0x3220, persists=True)
         bench.drives.reset(7)
         assert (bench.drives.state[7], bench.drives.latched[7]) == (DriveState.SWITCH_ON_DISABLED, False)
-        assert not bench.drives.errors.stand(7)
+        assert not bench.drives.errors.any_persists(7)
         assert [e.code for e in bench.drives.emergencies] == [0x3220]
 
     def test_leaving_unasked_is_told_by_the_state_alone(self, bench: DriveBench) -> None:
@@ -553,7 +553,7 @@ class TestErrors:
 
     def test_notices_go_on_and_are_told_by_the_whole_leg(self, bench: DriveBench) -> None:
         bench.enable()
-        bench.drives.notice(1, emergency.COMMAND_LOST)
+        bench.drives.warn(1, emergency.COMMAND_LOST)
         assert states(bench) == {DriveState.OPERATION_ENABLED}
         assert bench.drives.emergencies == [Emergency(node, 0x11, 0x8110) for node in NODES[6:]]
         for _ in range(2 * SLOW_CYCLES):
@@ -590,7 +590,7 @@ class TestSync:
         bench.enable()
         for cycle in range(20):
             bench.drives.miss_sync(0, cycle)
-            bench.drives.find_sync(0)
+            bench.drives.restart_sync_watchdog(0)
         assert states(bench) == {DriveState.OPERATION_ENABLED}
         for cycle in range(20, 20 + WATCHDOG - 1):
             bench.drives.miss_sync(0, cycle)

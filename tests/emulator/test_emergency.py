@@ -53,21 +53,21 @@ class TestErrors:
         assert told == [Emergency("LEFT", 0x11, 0x8250), Emergency("LEFT", 0, 0)]
 
     def test_an_error_of_one_node_is_not_the_others(self, errors: Errors, told: list[Emergency]) -> None:
-        errors.begin(1, 0x8250, stands=True)
-        assert [errors.stand(node) for node in (0, 1)] == [False, True]
+        errors.begin(1, 0x8250, persists=True)
+        assert [errors.any_persists(node) for node in (0, 1)] == [False, True]
         assert [errors.has(node, 0x8250) for node in (0, 1)] == [False, True]
         errors.acknowledge(0)
         assert [e.node for e in told] == ["RIGHT"]
 
     def test_what_stands_stays(self, errors: Errors, told: list[Emergency]) -> None:
-        errors.begin(0, 0x4310, stands=True)
+        errors.begin(0, 0x4310, persists=True)
         errors.begin(0, 0x8250)
         assert told[-1] == Emergency("LEFT", 0x19, 0x8250)
         errors.acknowledge(0)
-        assert errors.stand(0)
+        assert errors.any_persists(0)
         assert len(told) == 2
         errors.end(0, 0x4310)
-        assert errors.stand(0) is False
+        assert errors.any_persists(0) is False
         assert errors.has(0, 0x4310) is False
         assert len(told) == 2
         errors.acknowledge(0)
@@ -79,52 +79,52 @@ class TestErrors:
         assert told == []
 
     def test_forgotten_without_a_word(self, errors: Errors, told: list[Emergency]) -> None:
-        errors.begin(0, 0x4310, stands=True)
-        errors.forget(0)
+        errors.begin(0, 0x4310, persists=True)
+        errors.clear(0)
         errors.acknowledge(0)
-        assert not errors.stand(0)
+        assert not errors.any_persists(0)
         assert len(told) == 1
 
 
 class TestNotices:
     def test_over_after_an_inhibit_time(self, errors: Errors, told: list[Emergency]) -> None:
-        errors.notice(0, 0x8110)
+        errors.warn(0, 0x8110)
         assert told == [Emergency("LEFT", 0x11, 0x8110)]
-        errors.turn()
+        errors.advance()
         assert len(told) == 1
-        errors.turn()
+        errors.advance()
         assert told[1:] == [Emergency("LEFT", 0, 0)]
         for _ in range(5):
-            errors.turn()
+            errors.advance()
         assert len(told) == 2
 
     def test_goes_on_as_long_as_it_happens(self, errors: Errors, told: list[Emergency]) -> None:
         for _ in range(20):
-            errors.notice(0, 0x8110)
-            errors.turn()
+            errors.warn(0, 0x8110)
+            errors.advance()
         assert len(told) == 1
 
     def test_no_sooner_again_than_the_inhibit_time(self, errors: Errors, told: list[Emergency]) -> None:
-        errors.notice(0, 0x8110)
-        errors.turn()
-        errors.turn()
-        errors.notice(0, 0x8110)
+        errors.warn(0, 0x8110)
+        errors.advance()
+        errors.advance()
+        errors.warn(0, 0x8110)
         assert len(told) == 2
-        errors.turn()
-        errors.notice(0, 0x8110)
+        errors.advance()
+        errors.warn(0, 0x8110)
         assert [e.code for e in told] == [0x8110, 0, 0x8110]
 
     def test_two_kinds_are_told_and_end_with_one_word(self, errors: Errors, told: list[Emergency]) -> None:
-        errors.notice(0, 0x8110)
-        errors.notice(0, 0x8200)
-        errors.turn()
-        errors.turn()
+        errors.warn(0, 0x8110)
+        errors.warn(0, 0x8200)
+        errors.advance()
+        errors.advance()
         assert [e.code for e in told] == [0x8110, 0x8200, 0]
 
     def test_an_error_outlives_a_notice(self, errors: Errors, told: list[Emergency]) -> None:
-        errors.notice(0, 0x8110)
+        errors.warn(0, 0x8110)
         errors.begin(0, 0x8250)
-        errors.turn()
-        errors.turn()
+        errors.advance()
+        errors.advance()
         assert [e.code for e in told] == [0x8110, 0x8250]
-        assert not errors.stand(0)
+        assert not errors.any_persists(0)

@@ -315,7 +315,7 @@ def test_says_whether_the_hal_sent_sync(line: Make) -> None:
         ),
         (
             Fault("masquerade", KNEE, like="KNEE"),
-            "masquerade: like must be a message, got 'KNEE'; valid messages: SYNC_LEFT_LEG",
+            "masquerade: like must be the name of a message, got 'KNEE'; valid: SYNC_LEFT_LEG",
         ),
     ],
     ids=str,

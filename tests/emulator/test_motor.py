@@ -21,7 +21,7 @@ def motors(robot: Robot) -> Motors:
 
 def settle(motors: Motors, velocity: np.ndarray = STILL) -> np.ndarray:
     for _ in range(30):
-        torque = motors.turn(velocity)
+        torque = motors.advance(velocity)
     return np.array(torque)
 
 
@@ -32,7 +32,7 @@ def test_torque_follows_as_a_first_order_lag(robot: Robot) -> None:
     motors.wanted[:] = 20.0
     for n in range(1, 6):
         expected = 20.0 * (1.0 - math.exp(-n * PERIOD / SMOOTH.current_loop))
-        np.testing.assert_allclose(motors.turn(STILL), expected, rtol=1e-12)
+        np.testing.assert_allclose(motors.advance(STILL), expected, rtol=1e-12)
         np.testing.assert_allclose(measured, expected, rtol=1e-12)
 
 
@@ -41,17 +41,17 @@ def test_torque_follows_as_a_first_order_lag(robot: Robot) -> None:
 def test_friction_and_brake_take_power_and_never_give_it(robot: Robot, powered: np.ndarray, speed: float) -> None:
     motors = Motors(robot, MotorParameters(), *np.zeros((2, 12)))
     motors.power(powered)
-    power = np.array(motors.turn(np.full(12, speed))) * speed
+    power = np.array(motors.advance(np.full(12, speed))) * speed
     assert (power < 0.0).all() if speed else not power.any()
 
 
 def test_only_a_motor_without_power_brakes(motors: Motors) -> None:
     motors.power(np.arange(12) != 3)
-    torque = np.array(motors.turn(np.full(12, 0.5)))
+    torque = np.array(motors.advance(np.full(12, 0.5)))
     assert torque[3] == pytest.approx(-0.5 * SMOOTH.brake[3])
     assert not np.delete(torque, 3).any()
     motors.power(ALL)
-    assert not np.array(motors.turn(np.full(12, 0.5))).any()
+    assert not np.array(motors.advance(np.full(12, 0.5))).any()
 
 
 def test_a_weak_motor_measures_what_it_should_make(robot: Robot) -> None:
@@ -71,11 +71,11 @@ def test_a_push_is_on_the_joint_and_not_measured(robot: Robot) -> None:
     motors = Motors(robot, SMOOTH, measured, np.zeros(12))
     motors.push(5, 30.0)
     motors.push(6, -10.0)
-    np.testing.assert_allclose(motors.turn(STILL), [0.0] * 5 + [30.0, -10.0] + [0.0] * 5)
+    np.testing.assert_allclose(motors.advance(STILL), [0.0] * 5 + [30.0, -10.0] + [0.0] * 5)
     motors.push(5, 0.0)
-    np.testing.assert_allclose(motors.turn(STILL), [0.0] * 6 + [-10.0] + [0.0] * 5)
+    np.testing.assert_allclose(motors.advance(STILL), [0.0] * 6 + [-10.0] + [0.0] * 5)
     motors.push(6, 0.0)
-    assert not any(motors.turn(STILL))
+    assert not any(motors.advance(STILL))
     assert not measured.any()
 
 

@@ -459,7 +459,7 @@ def test_a_fault_that_fits_no_node(world: Make, fault: Fault, says: str) -> None
             "leave_operation: state must be one of NOT_READY_TO_SWITCH_ON, .*, got 'LIMP'",
         ),
         ("cell_stuck", {"cell": "FLL"}, "cell_stuck: cell must be one of FL, FR, RL, RR, got 'FLL'"),
-        ("torque_weak", {}, "torque_weak: share is required, and must be a number from 0 to 1"),
+        ("torque_weak", {}, "torque_weak: share must be a number from 0 to 1, got no value"),
         ("emergency", {"code": 0}, "emergency: code must be an integer from 1 to 65535, got 0"),
         ("under_voltage", {"volts": -1.0}, re.escape("under_voltage: volts must be a number from 0 to 60 V, got -1.0")),
     ],

@@ -15,19 +15,19 @@ def test_operator_starts_a_robot_that_is_ready_and_only_then() -> None:
     for state in SupervisorState:
         if state is not SupervisorState.READY:
             for _ in range(3 * Operator.REACTION):
-                operator.hear(state)
+                operator.receive(state)
     assert operator.signals.request is Request.NONE
     for _ in range(Operator.REACTION - 1):
-        operator.hear(HAL_READY)
+        operator.receive(HAL_READY)
     assert operator.signals.request_counter == 0
-    operator.hear(HAL_READY)
+    operator.receive(HAL_READY)
     assert (operator.signals.request, operator.signals.request_counter) == (Request.START, 1)
 
 
 def test_operator_presses_again_while_nothing_happens() -> None:
     operator = Operator()
     for _ in range(3 * Operator.REACTION):
-        operator.hear(HAL_READY)
+        operator.receive(HAL_READY)
     assert operator.signals.request_counter == 3
 
 
@@ -35,8 +35,8 @@ def test_readiness_must_last() -> None:
     operator = Operator()
     for _ in range(10):
         for _ in range(Operator.REACTION - 1):
-            operator.hear(HAL_READY)
-        operator.hear(SupervisorState.OFF)
+            operator.receive(HAL_READY)
+        operator.receive(SupervisorState.OFF)
     assert operator.signals.request_counter == 0
 
 
@@ -45,7 +45,7 @@ def test_after_stop_the_operator_waits_to_be_told(press: str, request_: Request)
     operator = Operator()
     getattr(operator, press)()
     for _ in range(3 * Operator.REACTION):
-        operator.hear(HAL_READY)
+        operator.receive(HAL_READY)
     assert (operator.signals.request, operator.signals.request_counter) == (request_, 1)
     operator.start()
     assert (operator.signals.request, operator.signals.request_counter) == (Request.START, 2)
@@ -54,7 +54,7 @@ def test_after_stop_the_operator_waits_to_be_told(press: str, request_: Request)
 def test_an_operator_told_not_to_start_does_not() -> None:
     operator = Operator(starts=False)
     for _ in range(3 * Operator.REACTION):
-        operator.hear(HAL_READY)
+        operator.receive(HAL_READY)
     assert operator.signals.request is Request.NONE
 
 
@@ -87,7 +87,7 @@ def test_dial() -> None:
 def test_signals_are_another_object_when_they_change_and_the_same_when_not() -> None:
     operator = Operator(0.5)
     before = operator.signals
-    operator.hear(0)
+    operator.receive(0)
     assert operator.signals is before
     operator.assist(0.6)
     assert operator.signals is not before
