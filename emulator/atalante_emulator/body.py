@@ -64,7 +64,7 @@ class Body(Protocol):
         """
 
     def step(self, torque: Sequence[float]) -> None:
-        """Apply joint torques for one `PERIOD` and update all arrays.
+        """Apply joint torques for one `PERIOD` and update the motion, the link states and the contacts.
 
         Args:
             torque: joint torques, shape (12,) [Nm].
@@ -170,7 +170,7 @@ class PyBulletBody:
         self.contact = ()  # no step since the reset, so no contacts
 
     def step(self, torque: Sequence[float]) -> None:
-        """Apply joint torques for one `PERIOD` and update all arrays.
+        """Apply joint torques for one `PERIOD` and update the motion, the link states and the contacts.
 
         Args:
             torque: joint torques, shape (12,) [Nm]. A list is fastest.

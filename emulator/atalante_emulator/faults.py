@@ -30,7 +30,7 @@ class Parameter:
     """Definition of a fault parameter: its valid values and its default."""
 
     valid: str  # description of the valid values, for error messages
-    holds: Callable[[Any], bool]  # returns whether a value is valid
+    holds: Callable[[Any], bool]  # function that returns whether a value is valid
     default: Value | None = None  # None: the user must give a value
 
 

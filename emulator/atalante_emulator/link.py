@@ -36,7 +36,7 @@ class _Late(NamedTuple):
 
 
 class _Disturbance:
-    """Execution of one communication fault: changes, loses, delays and adds frames."""
+    """Runtime state of one communication fault, and its effect on the frames."""
 
     def __init__(self, fault: Fault, network: Network, seed: str) -> None:
         self.fault = fault

@@ -28,7 +28,7 @@ class MotorParameters:
     thermal_time: float = 300.0  # time constant of the winding temperature [s]
 
 
-#: Rows of the motor array: torque setpoint, strength, dry friction, damping, external torque, resulting joint torque.
+#: Rows of the motor array: torque setpoint, torque ratio, dry friction, damping, external torque, joint torque.
 _WANTED, _STRENGTH, _DRY, _DAMPING, _PUSH, _JOINT = range(6)
 
 

@@ -28,7 +28,7 @@ _MEASURED: Final = ("Quaternion", "Gyro", "Accel")
 
 
 class NodeFaults:
-    """Execution of the faults of `NODE_KINDS` and `SENSOR_KINDS` in one emulator."""
+    """Node faults and sensor faults of one emulator. `begin` and `rewrite` apply them in each cycle."""
 
     def __init__(
         self,

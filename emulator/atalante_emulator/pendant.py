@@ -16,7 +16,7 @@ HAL_READY = 1
 
 
 class Request(IntEnum):
-    """Last pressed button: values of the signal `PENDANT_STATE.Request`."""
+    """Button that the operator pressed last: values of the signal `PENDANT_STATE.Request`."""
 
     NONE = 0
     START = 1

@@ -72,7 +72,7 @@ def test_the_list_of_commands_is_complete_and_in_order() -> None:
     assert result.exit_code == 0
     listed = [line.split()[0] for line in result.stdout.split("Commands:\n")[1].splitlines() if line[2:3] != " "]
     assert listed == list(COMMANDS)
-    assert "0 ok, 1 failed, 2 usage, 3 no device, 4 fault latched, 130" in result.stdout
+    assert "0 ok, 1 failed, 2 usage error, 3 no device, 4 fault latched, 130" in result.stdout
 
 
 def test_help_and_version_load_nothing_slow() -> None:
@@ -179,8 +179,11 @@ def test_a_list_of_problems_is_shortened_to_the_first_and_a_count(failing: Any) 
 @pytest.mark.parametrize(
     ("error", "sentence"),
     [
-        (PermissionError(13, "Permission denied", "/root/run"), "/root/run cannot be used: Permission denied"),
-        (OSError(28, "No space left on device"), "the output file cannot be used: No space left on device"),
+        (
+            PermissionError(13, "Permission denied", "/root/run"),
+            "/root/run cannot be read or written: Permission denied",
+        ),
+        (OSError(28, "No space left on device"), "the output file cannot be read or written: No space left on device"),
     ],
 )
 def test_an_operating_system_error_of_a_file_is_one_sentence(failing: Any, error: OSError, sentence: str) -> None:
@@ -227,7 +230,7 @@ def test_every_known_error_exists() -> None:
             2,
             "must assign a bus to each channel",
         ),
-        (["jog", "left_SK", "--to", "5", "-i", "socketcan"], 2, "socketcan needs a channel: -c vcan0"),
+        (["jog", "left_SK", "--to", "5", "-i", "socketcan"], 2, "socketcan requires a channel: -c vcan0"),
         (["status", "-i", "socketcan", "-c", "nocan7"], 3, "atalante doctor"),
         (["emulator", "-i", "socketcan", "-c", "nocan7"], 3, "atalante doctor"),
         (["pendant", "stop", "-i", "socketcan", "-c", "nocan7"], 3, "atalante doctor"),

@@ -34,7 +34,7 @@ def test_a_second_pendant_takes_over_and_holds(vcan: str, network: Network, robo
         listening, block = socket(), new_frames(256)
         listener = Observer(network, robot, time.monotonic())
         first.dead_man = True
-        first.speak()
+        first.start_sending()
         for work in (lambda: emulator.poll(0.05), lambda: first.poll(0.05), lambda: second.poll(0.05)):
             stack.enter_context(repeated(work))
 
@@ -42,9 +42,9 @@ def test_a_second_pendant_takes_over_and_holds(vcan: str, network: Network, robo
         assert cycles(400, SupervisorState.READY) is SupervisorState.READY, hal.missing()
         first.press(Request.START)
         assert cycles(60, SupervisorState.ACTIVE) is SupervisorState.ACTIVE, hal.reason
-        second.speak()
+        second.start_sending()
         assert cycles(70) is SupervisorState.ACTIVE, hal.reason
-        assert (first.displaced, second.displaced, second.refused) == (True, False, False)
+        assert (first.displaced, second.displaced, second.takeover_failed) == (True, False, False)
         second.press(Request.HOLD)
         assert cycles(10) is SupervisorState.HOLD
         assert hal.crc_errors == 0

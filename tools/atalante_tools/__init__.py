@@ -1,1 +1,1 @@
-"""The `atalante` command line: commands, console output, and the assembly of a run."""
+"""The `atalante` command line: its commands, their console output, and the setup of a run."""

@@ -1,4 +1,4 @@
-"""The `atalante` command: a group that imports a subcommand when it is called, and reports an error as one sentence.
+"""The command group `atalante`: imports only the called subcommand, and reports an error as one sentence.
 
 entry.main -> cli -> commands.<name>.command -> exit code (see console/outcome.py)
 """
@@ -13,16 +13,16 @@ import click
 from atalante_tools.console.outcome import INTERRUPTED, InvalidUsage, failure_of
 from atalante_tools.entry import main as main
 
-#: Name of a command -> its module below `atalante_tools` (attribute `command`), and its line in `atalante --help`.
+#: Command name -> module in `atalante_tools` that defines the command, and its line in `atalante --help`.
 COMMANDS = {
-    "demo": ("commands.demo", "Run the whole stack: an emulated robot walks in virtual guides."),
+    "demo": ("commands.demo", "Run all parts in one command: an emulated robot walks in virtual guides."),
     "airwalk": ("commands.airwalk", "Walk in the air inside one virtual guide, on any bus."),
     "emulator": ("commands.emulator", "Emulate the robot on a bus, for a HAL in another process."),
     "jog": ("commands.jog", "Move one joint to an angle."),
     "vibrate": ("commands.vibrate", "Run one vibration motor."),
     "pendant": ("commands.pendant", "Act as the pendant: start, stop, hold, assistance factor."),
     "status": ("commands.status", "Listen to a bus and print the state of every node."),
-    "doctor": ("commands.doctor", "Check that this machine is ready, and print what to type if not."),
+    "doctor": ("commands.doctor", "Check whether this computer is ready, and print the commands that fix problems."),
     "validate": ("canlog.validate", "Check CAN logs or a live bus against the DBC."),
     "decode": ("canlog.decode", "Write the signals of CAN logs as Parquet or MCAP."),
     "conform": ("conform", "Test one node for acceptance, with this computer as the HAL."),
@@ -35,14 +35,14 @@ COMMANDS = {
 
 
 class Commands(click.Group):
-    """Group of all commands, each imported only when it is called."""
+    """Click group of all commands. It imports a command only when the command is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the names of all commands, in the order in which a new user needs them."""
+        """Return the names of all commands in the order of `COMMANDS`."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import a command and return it, or None for an unknown name."""
+        """Import a command and return it. Return None for an unknown name."""
         if cmd_name not in COMMANDS:
             return None
         command = importlib.import_module(f"atalante_tools.{COMMANDS[cmd_name][0]}").command
@@ -55,17 +55,17 @@ class Commands(click.Group):
             formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command.
+        """Run the command, and replace known errors by `Failed`.
 
         Raises:
-            Failed: If the command line is invalid or a known error was raised; its message is one sentence for the user.
+            Failed: If the command line is invalid, or the command raised a known error. Its message is one sentence.
         """
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
             ctx.exit(INTERRUPTED)
         except click.exceptions.NoArgsIsHelpError:
-            raise  # a group without a subcommand: click prints the help of the group
+            raise  # no subcommand was given: click prints the help of the group
         except click.UsageError as error:
             command_path = error.ctx.command_path if error.ctx else ctx.command_path
             raise InvalidUsage(f"{error.format_message().rstrip('.')}; see `{command_path} --help`") from error
@@ -93,5 +93,5 @@ def cli() -> None:
 
     All angles are in degrees. Start with `atalante demo`.
 
-    Exit codes: 0 ok, 1 failed, 2 usage, 3 no device, 4 fault latched, 130 Ctrl-C, 143 SIGTERM.
+    Exit codes: 0 ok, 1 failed, 2 usage error, 3 no device, 4 fault latched, 130 Ctrl-C, 143 SIGTERM.
     """

@@ -1,6 +1,6 @@
 """Console entry point `atalante`: installs the signal handlers, runs the command line and returns the exit code.
 
-The signal handlers are installed before any other module is imported, so that Ctrl-C during the imports ends cleanly.
+The signal handlers are installed first, because Ctrl-C during the slow imports must not print a traceback.
 """
 
 from __future__ import annotations
@@ -9,24 +9,24 @@ import sys
 
 from atalante_tools.console.stop_request import Stopped, interruptible
 
-TYPE_CHECKING = False  # same as `typing.TYPE_CHECKING`; importing `typing` would delay the signal handlers
+TYPE_CHECKING = False  # replaces `typing.TYPE_CHECKING`, because the import of `typing` is slow
 if TYPE_CHECKING:
     from typing import NoReturn
 
 
 def main() -> NoReturn:
-    """Run the command line.
+    """Run the command line and end the process with its exit code.
 
     Raises:
-        SystemExit: Always, with the exit code of the signal that stopped the command, or of the command itself.
+        SystemExit: Always. Its code is the exit code of the stop signal, or of the command without a stop signal.
     """
     code: object = 0
     with interruptible() as stop:
         try:
             from atalante_tools.cli import cli
-            from atalante_tools.console.terminal import Patience
+            from atalante_tools.console.terminal import CompilationNotice
 
-            Patience.begin()
+            CompilationNotice.begin()
             cli(prog_name="atalante")
         except SystemExit as end:
             code = end.code
@@ -39,7 +39,7 @@ def main() -> NoReturn:
 
 
 def _made_from_stop(error: BaseException) -> bool:
-    """Return whether `Stopped` is the cause of this exception, which a library raised in its place."""
+    """Return whether a library raised this exception because of `Stopped`."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, Stopped):

@@ -1,6 +1,6 @@
-"""Generator of SUPERVISOR.md: the state machine as tables, computed with `next_state`.
+"""Generator of SUPERVISOR.md, which shows the supervisor's state machine as tables.
 
-`make supervisor-table` writes the page. A test fails when the page is out of date.
+The tables are computed with `next_state`. `make supervisor-table` writes the file. A test fails if the file is out of date.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from atalante_hal.safety.diagnostics import Dtc, Reaction
 from atalante_hal.safety.state_machine import Conditions, next_state
 from atalante_hal.types import SupervisorState
 
-#: Conditions of a robot without faults, while the operator holds the dead-man switch and presses no button.
+#: Conditions without a fault, with a pressed dead-man switch and without a request of the operator.
 WELL: Final = Conditions(nodes_well=True, drives_enabled=True, dead_man=True)
-#: Rows of the first table: description, and conditions without a diagnostic.
+#: Rows of the first table: description and conditions. No row has a diagnostic.
 FACTS: Final = (
     ("nothing", WELL),
     ("a node is missing or not trusted", replace(WELL, nodes_well=False)),
@@ -42,7 +42,7 @@ keeps moving.
 
 
 def page() -> str:
-    """Return the text of SUPERVISOR.md."""
+    """Return the Markdown text of SUPERVISOR.md."""
     started = replace(WELL, start_wanted=True)
     diagnostics = [(f"`{d}`", d.reaction.name, d.severity.value, d.meaning) for d in Dtc]
     return "\n".join(
@@ -61,9 +61,9 @@ def page() -> str:
 
 
 def a_diagnostic(reaction: Reaction) -> Dtc:
-    """Return the first diagnostic that has this reaction.
+    """Return the first diagnostic with a given reaction.
 
-    One is enough for the table, because all diagnostics of one reaction lead to the same states.
+    All diagnostics with the same reaction lead to the same states, so the table needs only one of them.
 
     Args:
         reaction: Reaction to look up.

@@ -126,11 +126,11 @@ def test_the_status_line_counts_cycles_frames_and_drives(
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["-i", "pcan", "-c", "x", "--no-operator", "--xi", "0.5"], "--xi needs the emulated operator"),
+        (["-i", "pcan", "-c", "x", "--no-operator", "--xi", "0.5"], "--xi requires the emulated operator"),
         (["-i", "pcan", "-c", "x", "--xi", "2"], "2.0 is not in the range"),
-        (["-i", "pcan", "-c", "x", "--mass", "75"], "a patient needs --mass and --height"),
-        (["-i", "embedded"], "this command needs a CAN bus, got -i embedded"),
-        ([], "socketcan needs a channel: -c vcan0"),
+        (["-i", "pcan", "-c", "x", "--mass", "75"], "a patient requires both --mass and --height"),
+        (["-i", "embedded"], "this command requires a CAN bus, got -i embedded"),
+        ([], "socketcan requires a channel: -c vcan0"),
     ],
 )
 def test_an_invalid_command_line_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:

@@ -44,10 +44,10 @@ def test_the_line_counts_frames_and_drops_its_pendant_after_another_sends() -> N
     assert received(far) == [0x181, 0x194, 0x701]
     far.send(frames_with([0x10, 0x100]))
     assert line.receive(new_frames(8)) == 2
-    assert not line.pendant_given_away
+    assert not line.pendant_displaced
     far.send(frames_with([0x10, 0x194]))
     line.receive(new_frames(8))
-    assert line.pendant_given_away
+    assert line.pendant_displaced
     for _ in range(3):
         line.send(batch)
         line.send(alone)
@@ -62,7 +62,7 @@ def test_buffer_rows_after_the_received_frames_are_ignored() -> None:
     block = frames_with([0x194] * 8)
     far.send(frames_with([0x10]))
     assert line.receive(block) == 1
-    assert not line.pendant_given_away
+    assert not line.pendant_displaced
     assert line.stamps.dtype == np.int64
     assert (line.dropped, line.name, block.dtype) == (0, near.name, FRAME)
 

@@ -26,7 +26,7 @@ from atalante_tools.commands.emulator_line import Line
 from atalante_tools.console.options import Target
 from atalante_tools.console.stop_request import StopRequest
 from atalante_tools.session import pendant_session
-from atalante_tools.session.pendant_node import GRACE, PendantNode, Request
+from atalante_tools.session.pendant_node import TAKEOVER_CYCLES, PendantNode, Request
 from atalante_tools.session.pendant_session import Keyboard, Session
 
 OFF, READY, ACTIVE, HOLD = (SupervisorState[name] for name in ("OFF", "READY", "ACTIVE", "HOLD"))
@@ -120,14 +120,14 @@ class World:
         self.nodes.append(PendantNode(self.network, self.wire.end()))
         return self.nodes[-1]
 
-    def speaking(self) -> PendantNode:
+    def sending(self) -> PendantNode:
         node = self.node()
         node.dead_man = True
-        node.speak()
+        node.start_sending()
         return node
 
     def active(self) -> PendantNode:
-        node = self.speaking()
+        node = self.sending()
         assert self.run(200) is READY
         node.press(Request.START)
         assert self.run(50) is ACTIVE
@@ -160,7 +160,7 @@ def world(make_world: Callable[..., World]) -> World:
 
 
 def test_it_answers_every_sync_with_a_protected_frame(world: World) -> None:
-    world.speaking()
+    world.sending()
     ids = {m.name: m.frame_id for m in world.network.messages}
     tap = world.wire.end()
     world.run(300)
@@ -173,7 +173,7 @@ def test_it_answers_every_sync_with_a_protected_frame(world: World) -> None:
 
 
 def test_start_needs_a_press_and_the_dead_man(world: World) -> None:
-    node = world.speaking()
+    node = world.sending()
     assert world.run(200) is READY
     node.dead_man = False
     node.press(Request.START)
@@ -208,7 +208,7 @@ def test_the_assistance_factor_changes_only_when_the_pendant_sets_it(world: Worl
 
 def test_a_damaged_sync_is_not_answered(world: World, network: Network) -> None:
     node = PendantNode(network, world.wire.end())
-    node.speak()
+    node.start_sending()
     world.run(2)
     frames = np.frombuffer(node._bus.queue, FRAME)  # type: ignore[attr-defined]
     damaged = frames[frames["can_id"] == network.message("SYNC_RIGHT_SENSE").frame_id][:1].copy()
@@ -228,15 +228,15 @@ def test_a_takeover_by_a_new_pendant_does_not_disturb_the_hal(world: World) -> N
     events = world.hal.events.count
     new = world.node()
     world.run(50)
-    assert new.heard_another
+    assert new.found_another
     assert new.dead_man
-    new.speak()
+    new.start_sending()
     assert world.run(400) is ACTIVE
     assert old.displaced
-    assert not new.refused
+    assert not new.takeover_failed
     assert not new.displaced
-    assert new.spoken == 400
-    assert old.spoken + new.spoken - world.hal.state.cycle in (0, 1)
+    assert new.answered == 400
+    assert old.answered + new.answered - world.hal.state.cycle in (0, 1)
     assert world.hal.state.assistance_factor == pytest.approx(0.4, abs=1e-4)
     assert {event.code for event in world.hal.events.since(events)} <= {"E2E_REPEATED"}
     assert world.hal.crc_errors == 0
@@ -247,7 +247,7 @@ def test_a_press_of_the_new_pendant_counts_once(world: World) -> None:
     new = world.node()
     world.run(50)
     new.press(Request.STOP)
-    new.speak()
+    new.start_sending()
     assert world.run(20) is HOLD
     new.press(Request.START)
     assert world.run(30) is ACTIVE
@@ -258,10 +258,10 @@ def test_a_pendant_that_keeps_sending_prevents_the_takeover(world: World) -> Non
     hardware._other_received = lambda check: None  # type: ignore[method-assign]
     new = world.node()
     world.run(50)
-    new.speak()
+    new.start_sending()
     assert world.run(200) is ACTIVE
-    assert new.refused
-    assert new.spoken == GRACE
+    assert new.takeover_failed
+    assert new.answered == TAKEOVER_CYCLES
     assert not hardware.displaced
 
 
@@ -273,10 +273,10 @@ def test_the_emulated_pendant_yields_to_a_pendant_process(make_world: Callable[.
     new = world.node()
     world.run(50)
     new.press(Request.HOLD)
-    new.speak()
+    new.start_sending()
     world.run(100)
-    assert world.emulator.bus.pendant_given_away  # type: ignore[attr-defined]
-    assert not new.refused
+    assert world.emulator.bus.pendant_displaced  # type: ignore[attr-defined]
+    assert not new.takeover_failed
     assert world.hal.state.supervisor is HOLD
     new.press(Request.START)
     assert world.run(50) is ACTIVE
@@ -287,9 +287,9 @@ def test_the_emulated_pendant_yields_to_a_pendant_process(make_world: Callable[.
 
 def test_start_is_pressed_when_the_hal_is_ready_and_printed(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     operator = world.session()
-    operator.take()
+    operator.take_over()
     operator.start_wanted = True
-    operator.stay(0.6)
+    operator.run(0.6)
     said = capsys.readouterr().err
     assert said.splitlines() == [
         "the pendant is active",
@@ -307,9 +307,9 @@ HEAD_STARTS = (1, 5, 10, 15, 16, 17, 50, 100)
 def started_once(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     """Check that `pendant start` leads to ACTIVE with one press, within 250 cycles after pendant and HAL are running."""
     operator = world.session()
-    operator.take()
+    operator.take_over()
     operator.start_wanted = True
-    operator.stay(0.35)
+    operator.run(0.35)
     assert ACTIVE in world.states[-250:]
     assert world.hal.state.supervisor is HOLD
     said = capsys.readouterr().err.splitlines()
@@ -364,7 +364,7 @@ def test_a_late_pendant_may_press_from_its_second_frame_on(world: World, state: 
         world.nodes.clear()
         assert world.run(10) is HOLD
         frames += 1  # the first one after a loss is refused
-    node = world.speaking()
+    node = world.sending()
     assert world.run(frames) is state
     node.press(Request.START)
     assert world.run(40) is ACTIVE
@@ -374,24 +374,24 @@ def test_a_late_pendant_may_press_from_its_second_frame_on(world: World, state: 
 
 def test_one_start_in_fault_leads_to_hold_with_a_message(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     operator = world.session()
-    operator.take()
+    operator.take_over()
     operator.start_wanted = True
-    operator.stay(0.5)
+    operator.run(0.5)
     operator.node.dead_man = True
     world.emulator.drives.state[7] = DriveState.FAULT
     world.emulator.drives._states_changed()
-    operator.speak_for(10)
+    operator.answer_syncs(10)
     assert world.hal.state.supervisor is SupervisorState.FAULT
 
     class TypesStart(Keyboard):
         def lines(self) -> list[str]:
-            return ["start"] if operator.node.spoken in presses else []
+            return ["start"] if operator.node.answered in presses else []
 
     capsys.readouterr()
-    begun = operator.node.spoken
+    begun = operator.node.answered
     presses = {begun + 10, begun + 400}
     operator._keyboard = TypesStart(None)
-    operator.stay(begun * 1e-3 + 0.6)
+    operator.run(begun * 1e-3 + 0.6)
     assert capsys.readouterr().err.splitlines() == [
         "the HAL is FAULT",
         "START pressed",
@@ -410,9 +410,9 @@ def test_a_refused_start_is_printed_and_its_reason_logged(world: World, capsys: 
     temperature = world.emulator.signals.slice("Temperature").start
     world.emulator.before_send.append(lambda cycle, values: values.__setitem__(temperature, 115.0))
     operator = world.session()
-    operator.take()
+    operator.take_over()
     operator.start_wanted = True
-    operator.stay(0.6)
+    operator.run(0.6)
     said = capsys.readouterr().err
     assert "the HAL did not become ACTIVE, see its event log; type start to press START again" in said
     assert [event.text for event in world.hal.events if event.code == "START_REFUSED"] == [world.hal.reason]
@@ -421,19 +421,19 @@ def test_a_refused_start_is_printed_and_its_reason_logged(world: World, capsys: 
 
 def test_typed_commands_are_executed(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     operator = world.session()
-    operator.take()
+    operator.take_over()
     operator.start_wanted = True
-    operator.stay(0.5)
+    operator.run(0.5)
     capsys.readouterr()
     operator.node.dead_man = True
     for line, state in (("start", ACTIVE), (" XI 0.25 ", ACTIVE), ("hold", HOLD), ("start", ACTIVE), ("stop", HOLD)):
-        operator.typed(line)
-        operator.speak_for(60)
+        operator.execute(line)
+        operator.answer_syncs(60)
         assert operator.node.hal is state, line
     assert world.hal.state.assistance_factor == pytest.approx(0.25, abs=1e-4)
     for line in ("xi 1.5", "xi", "run", "start now", "", "xi nan"):
-        operator.typed(line)
-    operator.speak_for(20)
+        operator.execute(line)
+    operator.answer_syncs(20)
     assert operator.node.hal is HOLD
     assert world.hal.state.assistance_factor == pytest.approx(0.25, abs=1e-4)
     assert capsys.readouterr().err.count("a command must be start, stop, hold or xi X") == 5
@@ -442,16 +442,16 @@ def test_typed_commands_are_executed(world: World, capsys: pytest.CaptureFixture
 def test_ctrl_c_is_a_stop_with_the_dead_man_released_last(world: World) -> None:
     stop = StopRequest()
     operator = world.session(stop)
-    operator.take()
+    operator.take_over()
     operator.start_wanted = True
-    operator.stay(0.5)
+    operator.run(0.5)
     before = world.hal.state.cycle
     operator.node.dead_man = True
-    operator.typed("start")
-    operator.speak_for(50)
+    operator.execute("start")
+    operator.answer_syncs(50)
     assert world.hal.state.supervisor is ACTIVE
     stop.ask(2)
-    operator.stay(None)
+    operator.run(None)
     assert world.hal.state.supervisor is HOLD
     codes = [event.code for event in world.hal.events if event.cycle > before]
     assert "OPERATOR_STOP" in codes
@@ -462,18 +462,18 @@ def test_ctrl_c_is_a_stop_with_the_dead_man_released_last(world: World) -> None:
 
 def test_the_older_session_ends_with_a_sentence(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     older = world.session()
-    older.take()
+    older.take_over()
     older.start_wanted = True
     newer = world.node()
 
     class TakesOver(Keyboard):
         def lines(self) -> list[str]:
-            if older.node.spoken > 2 * GRACE:
-                newer.speak()
+            if older.node.answered > 2 * TAKEOVER_CYCLES:
+                newer.start_sending()
             return []
 
     older._keyboard = TakesOver(None)
-    older.stay(None)
+    older.run(None)
     assert capsys.readouterr().err.endswith("the HAL is ACTIVE\nanother pendant has taken over\n")
     assert world.hal.state.supervisor is ACTIVE
 
@@ -481,8 +481,8 @@ def test_the_older_session_ends_with_a_sentence(world: World, capsys: pytest.Cap
 def test_a_missing_hal_is_reported_once_and_waited_for(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     world.running = False
     operator = world.session()
-    operator.take()
-    operator.stay(3.0)
+    operator.take_over()
+    operator.run(3.0)
     assert capsys.readouterr().err.splitlines() == [
         "the pendant is active",
         "no SYNC received on pcan test: waiting for a HAL",
@@ -491,13 +491,13 @@ def test_a_missing_hal_is_reported_once_and_waited_for(world: World, capsys: pyt
 
 def test_a_start_without_effect_is_reported(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     operator = world.session()
-    operator.take()
-    operator.speak_for(200)
+    operator.take_over()
+    operator.answer_syncs(200)
     world.emulator.before_send.append(
         lambda cycle, values: values.__setitem__(world.emulator.signals.slice("DriveState"), 0x40)
     )
     operator.start_wanted = True
-    operator.stay(1.0)
+    operator.run(1.0)
     assert (
         "the HAL did not become ACTIVE, see its event log; type start to press START again" in capsys.readouterr().err
     )
@@ -539,7 +539,7 @@ def test_stop_without_a_hal_fails_with_a_sentence(world: World, monkeypatch: pyt
     world.running = False
     result = invoke(world, monkeypatch, "stop")
     assert result.exit_code == 1
-    assert "no SYNC received on pcan test: start a HAL first, STOP has no effect without one" in result.stderr
+    assert "no SYNC received on pcan test: start a HAL first, because STOP has no effect without a HAL" in result.stderr
 
 
 def test_start_runs_for_a_time_and_ends_in_hold(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -561,10 +561,10 @@ def test_xi_takes_over_and_sets_the_factor(world: World, monkeypatch: pytest.Mon
     ("arguments", "sentence"),
     [
         (["xi", "1.2", "-i", "pcan", "-c", "x"], "1.2 is not in the range 0.0<=x<=1.0"),
-        (["start"], "socketcan needs a channel: -c vcan0"),
+        (["start"], "socketcan requires a channel: -c vcan0"),
         (
             ["stop", "-i", "embedded"],
-            "this command needs a CAN bus, got -i embedded: use for example -i socketcan -c vcan0",
+            "this command requires a CAN bus, got -i embedded: use for example -i socketcan -c vcan0",
         ),
         (["stop", "-c", "left_leg=a,b"], "must be BUS=CHANNEL, got 'b'"),
     ],

@@ -78,7 +78,7 @@ def observe(network: Network, robot: Robot, cycles: list[Frames], start: float =
     block = new_frames(64)
     for number, frames in enumerate(cycles, 1):
         block[: len(frames)] = frames
-        observer.take(block, len(frames), start + number * 1e-3)
+        observer.accept(block, len(frames), start + number * 1e-3)
     return observer, start + len(cycles) * 1e-3
 
 
@@ -124,7 +124,7 @@ def test_joint_values_are_in_degrees_on_the_output_side(network: Network, robot:
     image.values[codec.slice("Torque")] = 12.5
     for robot_, sign in ((robot, 1.0), (turned, -1.0)):
         observer = Observer(network, robot_, 0.0)
-        observer.take(image.seal(), 12, 0.001)
+        observer.accept(image.seal(), 12, 0.001)
         for joint in observer.report(0.002).joints:
             assert joint.position_deg == pytest.approx(sign * 30.0, abs=1e-3)
             assert joint.velocity_deg_s == pytest.approx(sign * -5.0, abs=0.02)
@@ -195,10 +195,10 @@ def test_foreign_frames_are_counted(network: Network, robot: Robot) -> None:
     observer = Observer(network, robot, 0.0)
     frames = new_frames(3)
     frames["can_id"] = 0x7FE
-    observer.take(frames, 3, 0.001)
+    observer.accept(frames, 3, 0.001)
     report = observer.report(0.01)
     assert (report.frames, report.foreign) == (3, 3)
-    assert "3 with an identifier unknown to this network" in render(report, TARGET)
+    assert "3 with an identifier that is not in the DBC" in render(report, TARGET)
 
 
 def test_an_emergency_is_reported(network: Network, robot: Robot) -> None:
@@ -208,7 +208,7 @@ def test_an_emergency_is_reported(network: Network, robot: Robot) -> None:
     image.values[image.codec.index("LEFT_SK_EMCY", "ErrorRegister")] = 0x09
     image.values[image.codec.index("LEFT_SK_EMCY", "ErrorCode")] = 0x4310
     observer = Observer(network, robot, 0.0)
-    observer.take(image.seal(), 1, 0.001)
+    observer.accept(image.seal(), 1, 0.001)
     assert node(observer.report(0.002), "LEFT_SK").emergency == "0x4310 (register 0x09)"
 
 

@@ -44,10 +44,22 @@ PATIENT = ("--mass", "75", "--height", "175")
         (["model", "--show", "model.xyz"], "must end in .png or .svg or .pdf, got model.xyz"),
         (["gait", "solve", *PATIENT, "--plot", "gait.xyz"], "must end in .png or .svg or .pdf, got gait.xyz"),
         (["gait", "solve", *PATIENT, "--animate", "gait.png"], "must end in .gif, got gait.png"),
-        (["gait", "solve", *PATIENT, "--out", "no/gait.json"], "the folder no of gait.json does not exist"),
-        (["gait", "fit", "--library", ".", "--out", "no/network.npz"], "the folder no of network.npz does not exist"),
-        (["model", "--urdf", "no/model.urdf"], "the folder no of model.urdf does not exist"),
-        (["validate", "some.log", "--html", "no/some.html"], "the folder no of some.html does not exist"),
+        (
+            ["gait", "solve", *PATIENT, "--out", "no/gait.json"],
+            "must be in an existing folder, got no/gait.json: create the folder no",
+        ),
+        (
+            ["gait", "fit", "--library", ".", "--out", "no/network.npz"],
+            "must be in an existing folder, got no/network.npz: create the folder no",
+        ),
+        (
+            ["model", "--urdf", "no/model.urdf"],
+            "must be in an existing folder, got no/model.urdf: create the folder no",
+        ),
+        (
+            ["validate", "some.log", "--html", "no/some.html"],
+            "must be in an existing folder, got no/some.html: create the folder no",
+        ),
     ],
 )
 def test_an_invalid_option_value_is_rejected_before_any_work(arguments: list[str], sentence: str) -> None:
@@ -61,4 +73,4 @@ def test_a_campaign_rejects_an_invalid_report_folder_before_it_runs(tmp_path: Pa
     (tmp_path / "file").touch()
     result = CliRunner().invoke(cli, ["faults", "campaign", "F56", "--out", str(tmp_path / "file" / "report")])
     assert result.exit_code == 1
-    assert result.stderr == f"atalante: {tmp_path}/file/report cannot be used: Not a directory\n"
+    assert result.stderr == f"atalante: {tmp_path}/file/report cannot be read or written: Not a directory\n"

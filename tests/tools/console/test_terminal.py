@@ -10,7 +10,7 @@ import math
 import pytest
 
 from atalante_hal import compiled
-from atalante_tools.console.terminal import LIVE, LOGGED, Patience, Progress, say, show_json, table
+from atalante_tools.console.terminal import LIVE, LOGGED, CompilationNotice, Progress, say, show_json, table
 
 
 class Terminal(io.StringIO):
@@ -71,7 +71,7 @@ def test_compiling_is_announced_once(capsys: pytest.CaptureFixture[str]) -> None
     logger = logging.getLogger(compiled.__name__)
     before = list(logger.handlers), logger.level
     try:
-        Patience.begin()
+        CompilationNotice.begin()
         for name in ("accept", "limit"):
             logger.info("%s is compiled", name)
     finally:

@@ -66,8 +66,8 @@ def test_show_without_file_writes_model_png(tmp_path: Path, monkeypatch: pytest.
         (["--mass", "30", "--height", "175"], "mass of the patient must be 45 to 110 kg, got 30 kg"),
         (["--mass", "75", "--height", "1.2"], "height of the patient must be 1.5 to 2 m, got 1.2 m"),
         (["--mass", "75", "--height", "175", "--thigh", "80"], "thigh length of the patient must be 0.3 to 0.55 m"),
-        (["--mass", "75"], "a patient needs --mass and --height"),
-        (["--thigh", "40"], "a patient needs --mass and --height"),
+        (["--mass", "75"], "a patient requires both --mass and --height"),
+        (["--thigh", "40"], "a patient requires both --mass and --height"),
     ],
 )
 def test_patient_out_of_range_is_rejected_with_the_range(arguments: list[str], sentence: str) -> None:

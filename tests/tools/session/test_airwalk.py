@@ -380,8 +380,8 @@ def test_a_patient_s_gait_of_the_network_is_walked_inside_a_certified_guide(tmp_
             1,
             "step length for the gait network must be 0.1 to 0.2 m",
         ),
-        (["--mass", "75"], 2, "a patient needs --mass and --height"),
-        (["--step-length", "0.15"], 2, "need a patient"),
+        (["--mass", "75"], 2, "a patient requires both --mass and --height"),
+        (["--step-length", "0.15"], 2, "require a patient"),
         (["--mass", "75", "--height", "175", "--step-duration", "0.85123"], 2, "a whole number of milliseconds"),
     ],
 )

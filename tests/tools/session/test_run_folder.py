@@ -10,7 +10,7 @@ import pytest
 
 from atalante_hal.telemetry.process import Recording
 from atalante_tools.console.outcome import Failed
-from atalante_tools.session.run_folder import Result, leave, run_folder
+from atalante_tools.session.run_folder import Result, run_folder, write_summary
 
 WALKED = Result("pinched", True, 1.97, 1.18, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0)
 
@@ -19,7 +19,7 @@ def test_a_second_run_in_the_same_folder_is_rejected(tmp_path: Path) -> None:
     out = tmp_path / "runs" / "demo"
     with run_folder(out):
         (out / "recording.mcap").touch()
-        with pytest.raises(Failed, match=r"another run is writing into .*/demo: .* --out"), run_folder(out):
+        with pytest.raises(Failed, match=r"another run writes into .*/demo: .* --out"), run_folder(out):
             raise AssertionError("two runs are in one folder")
         assert (out / "recording.mcap").exists()
     with run_folder(out):
@@ -48,7 +48,7 @@ def test_an_incomplete_recording_gives_a_summary_but_no_figure(
     recording: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "recording.mcap").write_bytes(recording)
-    leave(tmp_path, {"steps": 2}, [WALKED], Recording(("recording.mcap", "recording-1.mcap"), False, 7))
+    write_summary(tmp_path, {"steps": 2}, [WALKED], Recording(("recording.mcap", "recording-1.mcap"), False, 7))
     said = capsys.readouterr().err.splitlines()
     assert said[0].startswith("no figure: recording.mcap is incomplete")
     assert said[1] == f"in {tmp_path}: recording.mcap, recording-1.mcap, summary.json"

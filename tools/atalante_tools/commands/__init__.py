@@ -1,1 +1,1 @@
-"""Subcommands of `atalante` that run, emulate or observe the robot, one module per command."""
+"""Subcommands of `atalante` that run, emulate or observe the robot. Each command has its own module."""

@@ -1,4 +1,4 @@
-"""`atalante airwalk`: the walking controller with one guide shape, on any bus."""
+"""Command `atalante airwalk`: walks in the air inside one virtual guide, on any bus."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def command(shape: str, target: Target, options: Options, as_json: bool) -> None
     """Walk in the air inside one virtual guide, with a real or an emulated robot.
 
     The robot starts when the operator presses START (`atalante pendant start`). The operator may change the assistance
-    factor at any time. The robot ends in HOLD: after the steps, on Ctrl-C, or on an error.
+    factor at any time. The robot ends in HOLD after the last step, on Ctrl-C, or on an error.
 
     \b
     Example: atalante emulator -i socketcan -c vcan0     (in another terminal)

@@ -1,4 +1,4 @@
-"""`atalante demo`: an emulated robot walks in the air inside each guide shape, with HAL, controller, telemetry and recording."""
+"""Command `atalante demo`: walks in the air inside each guide shape, with an emulated robot, telemetry and a recording."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from atalante_tools.session.airwalk import SHAPE_NAMES, Options, run_trial, tria
     "--shape",
     metavar="NAME",
     multiple=True,
-    help=f"Shape of the guide: {SHAPE_NAMES}. May be repeated.  [default: all]",
+    help=f"Shape of the guide: {SHAPE_NAMES}. Repeat the option for several shapes.  [default: all]",
 )
 @trial_options(steps=30, out="runs/demo")
 def command(shape: tuple[str, ...], options: Options, as_json: bool) -> None:
-    """Walk in the air inside every guide shape, on an emulated robot, faster than real time.
+    """Walk in the air inside each guide shape with an emulated robot, faster than real time.
 
-    The demo runs HAL, emulator, virtual guide, telemetry (Zenoh, loopback only) and recording. Before the run it prints
-    the certificate of each guide, after it the largest tracking error. An error of 1.00 is the edge of the guide.
+    The demo runs HAL, emulator, controller, telemetry (Zenoh, loopback only) and recording. Before the run it prints the
+    certificate of each guide. After the run it prints the largest tracking error: 1.00 is the edge of the guide.
 
     \b
     Example: atalante demo

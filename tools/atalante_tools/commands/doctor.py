@@ -1,4 +1,4 @@
-"""`atalante doctor`: checks whether this machine is ready for a bus, and prints the commands that make it ready.
+"""Command `atalante doctor`: checks whether this computer is ready for a bus, and prints the commands that fix problems.
 
 Machine (commands/machine.py) -> examine -> CheckResult -> one line each, exit code
 """
@@ -19,15 +19,15 @@ from atalante_tools.session.body import engine_hint
 if TYPE_CHECKING:
     from atalante_tools.commands.machine import Interface, Machine
 
-#: Recommended length of a transmit queue, in frames. One cycle of all four buses sends 22 frames.
+#: Recommended length of a transmit queue [frames]. One cycle of all four buses sends 22 frames.
 QUEUE: Final = 1000
-#: MTU of a CAN FD interface, in bytes.
+#: MTU of a CAN FD interface [bytes].
 FD_MTU: Final = 72
-#: SCHED_FIFO priority of the 1 kHz loop.
+#: SCHED_FIFO priority that the 1 kHz loop requests.
 PRIORITY: Final = 50
-#: File with the real-time limits of a user.
+#: Linux file with the real-time limits of each user.
 LIMITS: Final = "/etc/security/limits.conf"
-#: Python package -> its purpose, and the extra of `atalante-hal` that installs it.
+#: Python package -> what it is needed for, and the extra of `atalante-hal` that installs it.
 PACKAGES: Final = {
     "pinocchio": ("the model of the controller", ""),
     "pybullet": ("the emulated robot", "[emulator]"),
@@ -35,7 +35,7 @@ PACKAGES: Final = {
     "mcap": ("recordings", "[telemetry]"),
     "matplotlib": ("figures", "[plot]"),
 }
-#: Program -> its purpose, and the Debian package that contains it.
+#: Program -> what it is needed for, and the Debian package that contains it.
 PROGRAMS: Final = {
     "candump": ("an independent log of a bus", "can-utils"),
     "gcc": ("the C baseline of `atalante bench`", "gcc"),
@@ -48,9 +48,9 @@ class CheckResult:
 
     name: str
     ok: bool
-    needed: bool  # whether the chosen interface requires it
-    text: str  # finding
-    fix: str = ""  # shell command that repairs it
+    needed: bool  # whether the chosen interface requires this check to pass
+    text: str  # result of the check for the user
+    fix: str = ""  # shell command that fixes the problem
 
 
 @click.command()
@@ -63,13 +63,17 @@ class CheckResult:
     help="Interface to check: embedded, socketcan, or any other interface of python-can.",
 )
 @click.option(
-    "-c", "--channel", default="", metavar="CHANNEL", help="Channel to check, or a channel map of the four buses."
+    "-c",
+    "--channel",
+    default="",
+    metavar="CHANNEL",
+    help="CAN channel to check (vcan0), or a channel map (left_leg=can0,right_leg=can1,left_sense=can2,right_sense=can3).",
 )
 @json_option
 def command(interface: str, channel: str, as_json: bool) -> None:
-    """Check whether this machine is ready, and print what to type if it is not.
+    """Check whether this computer is ready, and print the commands that fix problems.
 
-    The exit code is 1 when something is missing that the chosen interface requires. The command changes nothing.
+    The exit code is 1 if the chosen interface requires something that is missing. The command changes nothing.
 
     \b
     Example: atalante doctor
@@ -88,14 +92,14 @@ def command(interface: str, channel: str, as_json: bool) -> None:
 
 
 def channels_of(interface: str, channel: str) -> list[str]:
-    """Return the channels of a channel map, without repetitions.
+    """Return the channels of a channel map, each channel once.
 
     Args:
         interface: Interface of the channels.
-        channel: One channel or a channel map; may be empty.
+        channel: One channel or a channel map. May be empty.
 
     Raises:
-        click.UsageError: If the interface is the embedded robot, which has no channel.
+        click.UsageError: If a channel is given for the embedded robot.
         ChannelMapError: If the channel map is invalid.
     """
     if not channel:
@@ -109,7 +113,7 @@ def channels_of(interface: str, channel: str) -> list[str]:
 
 
 def line(check: CheckResult) -> str:
-    """Return the text of a check for the terminal, with the fix on a second line.
+    """Return the result of a check as text for the terminal. A second line contains the command that fixes the problem.
 
     Args:
         check: Result to print.
@@ -120,10 +124,10 @@ def line(check: CheckResult) -> str:
 
 
 def examine(machine: Machine, interface: str, channels: Sequence[str]) -> Iterator[CheckResult]:
-    """Yield the results of all checks.
+    """Check the computer and yield the result of each check.
 
     Args:
-        machine: Machine to examine.
+        machine: Computer to check.
         interface: Interface that the user chose.
         channels: Channels that must be ready.
     """
@@ -176,7 +180,7 @@ def _interface(name: str, interface: Interface | None, needed: bool) -> CheckRes
     if not interface.up:
         return CheckResult(name, False, needed, "the interface is down", f"ip link set {name} up")
     if interface.queue < QUEUE:
-        # A short queue overflows only when the receiver is slow for some cycles, so this is no error.
+        # A short queue overflows only if the receiver is slow for several cycles. No interface requires a long queue.
         text = f"CAN FD, up, but its transmit queue holds only {interface.queue} frames"
         return CheckResult(name, False, False, text, f"ip link set {name} txqueuelen {QUEUE}")
     return CheckResult(name, True, needed, f"CAN FD, up, txqueuelen {interface.queue}")
@@ -207,6 +211,6 @@ def _realtime(machine: Machine) -> Iterator[CheckResult]:
         "locked memory",
         memory is None,
         False,
-        "unlimited" if memory is None else f"at most {memory // 1024} KiB: a page fault may delay a cycle",
+        "unlimited" if memory is None else f"at most {memory // 1024} KiB: page faults may delay cycles",
         f"echo '@realtime - memlock unlimited' >> {LIMITS}; usermod -aG realtime $USER; log in again",
     )

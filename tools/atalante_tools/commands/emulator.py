@@ -1,4 +1,4 @@
-"""`atalante emulator`: emulates the robot on a bus until Ctrl-C.
+"""Command `atalante emulator`: emulates the robot on a bus until Ctrl-C.
 
 HAL in another process <- bus -> Line -> Emulator -> PyBullet body
 """
@@ -20,26 +20,26 @@ if TYPE_CHECKING:
     from atalante_emulator.emulator import Emulator
     from atalante_tools.commands.emulator_line import Line
 
-#: Time between two status lines [s].
+#: Period of the status line [s].
 STATUS_PERIOD: Final = 1.0
-#: Longest wait for a SYNC in lock-step before the stop request is checked [s].
-LOOK_UP: Final = 0.1
+#: Longest wait for a SYNC in lock-step [s]. After it, the stop request is checked.
+POLL_TIMEOUT: Final = 0.1
 
 
 @click.command()
 @target_options(embedded=False)
-@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the sensor noise.")
+@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the emulated sensor noise.")
 @click.option(
     "--operator/--no-operator",
     default=True,
     show_default=True,
-    help="Emulate the pendant too, and press START when the HAL is READY. With --no-operator, use `atalante pendant`.",
+    help="Emulate a pendant and its operator, who presses START in READY. With --no-operator, use `atalante pendant`.",
 )
 @click.option(
     "--xi",
     type=Between(0.0, 1.0),
     metavar="X",
-    help="Assistance factor set by the emulated operator, 0 to 1.  [default: the factor of the HAL]",
+    help="Assistance factor that the emulated operator sets, 0 to 1.  [default: the HAL keeps its own factor]",
 )
 @patient_options(legs=False)
 def command(target: Target, seed: int, operator: bool, xi: float | None, patient: Patient | None) -> None:
@@ -48,7 +48,7 @@ def command(target: Target, seed: int, operator: bool, xi: float | None, patient
     With --wall the emulator runs in real time. With --lockstep it advances by one cycle at each SYNC of the HAL. If the
     interface goes down, the emulator waits until it is up again.
 
-    --mass and --height adjust the leg lengths to a patient; give `atalante airwalk` the same values. The emulated
+    --mass and --height adjust the leg lengths to a patient. `atalante airwalk` requires the same values. The emulated
     exoskeleton is empty and suspended in the air.
 
     \b
@@ -56,7 +56,9 @@ def command(target: Target, seed: int, operator: bool, xi: float | None, patient
              atalante emulator -i socketcan -c vcan0 --mass 75 --height 175
     """
     if xi is not None and not operator:
-        raise click.UsageError("--xi needs the emulated operator: remove --no-operator, or use `atalante pendant xi`")
+        raise click.UsageError(
+            "--xi requires the emulated operator: remove --no-operator, or use `atalante pendant xi`"
+        )
     import atalante_dbc
     from atalante_control.model import ExoskeletonParameters
     from atalante_hal.robot import load_robot
@@ -80,29 +82,29 @@ def command(target: Target, seed: int, operator: bool, xi: float | None, patient
             say(f"the emulated robot is on {target}; now type in another terminal: {other_side}")
             if not operator:
                 say(f"to operate it, type: atalante pendant start {target.arguments}")
-            answer(emulator, target, over(stop, emulator, bus))
+            run(emulator, target, end_condition(stop, emulator, bus))
         finally:
             bus.close()
     raise SystemExit(stop.exit_code)
 
 
-def answer(emulator: Emulator, target: Target, is_over: Callable[[], bool]) -> None:
-    """Emulate the robot until `is_over()` returns True.
+def run(emulator: Emulator, target: Target, is_over: Callable[[], bool]) -> None:
+    """Run the emulator until the end condition `is_over()` returns True.
 
     Args:
         emulator: Emulator on its bus.
         target: Bus and clock.
-        is_over: Called once per cycle, or at the latest every `LOOK_UP` seconds.
+        is_over: End condition. It is called in every cycle, and at least every `POLL_TIMEOUT` seconds.
     """
     if target.lockstep:
         while not is_over():
-            emulator.poll(LOOK_UP)
+            emulator.poll(POLL_TIMEOUT)
     else:
         emulator.run(is_over)
 
 
-def over(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[[], bool]:
-    """Return the end condition of the emulator: a function that prints the status line and returns whether to stop.
+def end_condition(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[[], bool]:
+    """Return the end condition of the emulator. Each call prints the status line if it is due.
 
     Args:
         stop: Stop request of the process.
@@ -114,10 +116,10 @@ def over(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[[], bool]
 
     def is_over() -> bool:
         nonlocal has_pendant
-        if has_pendant and bus.pendant_given_away:
+        if has_pendant and bus.pendant_displaced:
             has_pendant = False
             progress.clear()
-            say("another pendant sends: the emulated pendant has stopped")
+            say("another pendant sends: the emulated pendant stopped")
         if stop.wanted:
             progress.clear()
         elif progress.due():
@@ -128,10 +130,10 @@ def over(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[[], bool]
 
 
 def status_line(emulator: Emulator, bus: Line) -> str:
-    """Return the status line: cycles, frames, drive states, and the error of an interface that is down.
+    """Return the status line with cycles, frames and drive states. If the interface is down, the line contains its error.
 
     Args:
-        emulator: Emulator to report.
+        emulator: Emulator whose status is printed.
         bus: Bus of the emulator.
     """
     states = Counter(state.name for state in emulator.drives.state)

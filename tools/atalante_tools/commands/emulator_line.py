@@ -1,4 +1,7 @@
-"""Bus of `atalante emulator`: HAL <-> bus <-> Line <-> emulated nodes."""
+"""Bus wrapper of `atalante emulator`, between the bus and the emulated nodes.
+
+HAL <-> bus <-> Line <-> emulated nodes
+"""
 
 from __future__ import annotations
 
@@ -10,18 +13,15 @@ from atalante_hal.wire.frame import Frames
 
 
 class Line(WrappedBus):
-    """Bus of the emulated robot: counts frames, and yields to another pendant.
-
-    After a frame of another pendant the frames of the emulated pendant are dropped, as a pendant process stops sending when a
-    newer one starts.
+    """Bus of the emulated robot. It counts frames, and drops the emulated pendant's frames if another pendant sends.
 
     While the interface is down, sent frames are dropped and no frames are received, as with a disconnected cable.
 
     Attributes:
-        sent: Number of frames sent so far.
-        received: Number of frames received so far.
-        down: Error message of the interface while it is down; empty while it is up.
-        pendant_given_away: Whether another pendant has sent a frame.
+        sent: Number of sent frames.
+        received: Number of received frames.
+        down: Error message of the interface while it is down. Empty while it is up.
+        pendant_displaced: Whether another pendant sent a frame.
     """
 
     def __init__(self, bus: Bus, pendant_id: int) -> None:
@@ -30,15 +30,15 @@ class Line(WrappedBus):
         self.sent = 0
         self.received = 0
         self.down = ""
-        self.pendant_given_away = False
+        self.pendant_displaced = False
 
     def send(self, frames: Frames) -> None:
-        """Send frames as `Bus.send`, but drop them while the interface is down.
+        """Send frames like `Bus.send`. While the interface is down, drop them.
 
         Args:
             frames: Frames to send.
         """
-        if self.pendant_given_away:
+        if self.pendant_displaced:
             frames = self._without_pendant(frames)
         try:
             super().send(frames)
@@ -49,10 +49,10 @@ class Line(WrappedBus):
             self.sent += len(frames)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Receive frames as `Bus.receive`, but return 0 after the timeout while the interface is down.
+        """Receive frames like `Bus.receive`. While the interface is down, wait for the timeout and return 0.
 
         Args:
-            frames: Buffer that takes the received frames.
+            frames: Buffer for the received frames.
             timeout: Longest wait for the first frame [s].
         """
         try:
@@ -62,11 +62,11 @@ class Line(WrappedBus):
             time.sleep(timeout)
             return 0
         self.received += count
-        if not self.pendant_given_away and (frames["can_id"][:count] == self._pendant_id).any():
-            self.pendant_given_away = True
+        if not self.pendant_displaced and (frames["can_id"][:count] == self._pendant_id).any():
+            self.pendant_displaced = True
         return count
 
     def _without_pendant(self, frames: Frames) -> Frames:
-        """Return the frames without those of the pendant; the same array if there are none."""
+        """Return all frames except the frames of the pendant."""
         kept = frames["can_id"] != self._pendant_id
         return frames if kept.all() else frames[kept]

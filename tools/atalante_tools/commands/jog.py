@@ -1,4 +1,4 @@
-"""`atalante jog`: moves one joint to an angle and holds all others."""
+"""Command `atalante jog`: moves one joint to an angle. All other joints hold their position."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ if TYPE_CHECKING:
     from atalante_hal.robot import Robot
     from atalante_hal.types import State
 
-#: Longest time after the move for the joint to come to rest [s].
+#: Longest wait after the move until the joint is at rest [s].
 SETTLE: Final = 1.0
-#: Largest error [rad] and speed [rad/s] of a joint at rest.
+#: Position error [rad] and speed [rad/s] below which the joint counts as at rest.
 RESTED: Final = (math.radians(0.05), math.radians(0.5))
-#: Largest error at the end of the move; with a larger one the command fails [rad].
+#: Largest position error at the end of the move [rad]. The command fails if the error is larger.
 TOLERANCE: Final = math.radians(1.0)
 
 
 @click.command()
 @click.argument("joint")
-@click.option("--to", "degrees", type=float, required=True, metavar="DEG", help="Target angle of the joint [degrees].")
+@click.option("--to", "degrees", type=float, required=True, metavar="DEG", help="Target angle of the joint [deg].")
 @click.option(
     "--speed", type=float, default=20.0, show_default=True, metavar="DEG_S", help="Peak speed of the move [deg/s]."
 )
-@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the sensor noise.")
+@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the emulated sensor noise.")
 @target_options(embedded=True)
 @json_option
 def command(joint: str, degrees: float, speed: float, seed: int, target: Target, as_json: bool) -> None:
-    """Move one joint to an angle in degrees. All other joints hold their pose.
+    """Move one joint to an angle in degrees. All other joints hold their position.
 
-    JOINT is left_ or right_ and FH, TH, SH (hip: frontal, transverse, sagittal), SK (knee), SA or HA (ankle: sagittal, henke).
-    For an angle out of range, the error message shows the range of the joint.
+    JOINT is left_ or right_ plus the name of a leg joint. Hip: FH (frontal), TH (transverse), SH (sagittal). Knee: SK.
+    Ankle: SA (sagittal), HA (Henke axis). Example: left_SK. For an angle out of range, the error shows the range of the joint.
 
-    The robot moves when the operator presses START (`atalante pendant start`). The embedded robot has an
-    emulated operator that presses START. The robot ends in HOLD.
+    The robot moves when the operator presses START (`atalante pendant start`). With -i embedded, an emulated operator
+    presses START. The robot ends in HOLD.
 
     \b
     Example: atalante jog left_SK --to 30
@@ -66,7 +66,7 @@ def command(joint: str, degrees: float, speed: float, seed: int, target: Target,
         return left >= SETTLE or (left >= 0.0 and bool(rested))
 
     def describe(state: State) -> str:
-        return f"{name} {math.degrees(state.position[index]):7.2f} deg, going to {degrees:.2f} deg"
+        return f"{name} {math.degrees(state.position[index]):7.2f} deg, target {degrees:.2f} deg"
 
     fields = controller.telemetry_fields
     with open_hal(target, robot=robot, seed=seed, controller_fields=fields) as rig, stop_requested() as stop:
@@ -87,10 +87,12 @@ def command(joint: str, degrees: float, speed: float, seed: int, target: Target,
     else:
         click.echo(
             f"{name}: {result['from_deg']:.2f} -> {result['reached_deg']:.2f} deg in {result['seconds']:.2f} s, "
-            f"{result['error_deg']:+.2f} deg off {degrees:g} deg"
+            f"error {result['error_deg']:+.2f} deg"
         )
     if abs(reached - move.target) > TOLERANCE:
-        raise Failed(f"{name} did not reach {degrees:g} degrees: check that the joint can move freely")
+        raise Failed(
+            f"{name} must reach {degrees:g} degrees, got {math.degrees(reached):.1f}: check that the joint can move freely"
+        )
     say("the robot is in HOLD")
 
 

@@ -1,4 +1,4 @@
-"""Facts about this machine for `atalante doctor`: CAN interfaces, limits, packages, programs."""
+"""Properties of this computer that `atalante doctor` checks: CAN interfaces, user limits, packages and programs."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
 
-#: Type of a CAN interface: ARPHRD_CAN of linux/if_arp.h.
+#: Interface type of CAN: ARPHRD_CAN of linux/if_arp.h.
 _CAN: Final = 280
-#: Flag of an interface that is up: IFF_UP of linux/if.h.
+#: Flag bit of an interface that is up: IFF_UP of linux/if.h.
 _UP: Final = 1
-#: Bit numbers of capabilities in linux/capability.h.
+#: Bit numbers of Linux capabilities (linux/capability.h).
 _CAP_IPC_LOCK: Final = 14
 _CAP_SYS_NICE: Final = 23
 
@@ -26,15 +26,15 @@ class Interface:
     name: str
     virtual: bool
     up: bool
-    mtu: int  # bytes; 72 for CAN FD, 16 for classic CAN
-    queue: int  # length of the transmit queue (txqueuelen), in frames
+    mtu: int  # MTU [bytes]: 72 for CAN FD, 16 for classic CAN
+    queue: int  # length of the transmit queue, txqueuelen [frames]
 
 
 class Machine(Protocol):
-    """Interface of a machine that `atalante doctor` examines; the tests replace it."""
+    """Interface of the computer that `atalante doctor` checks. The tests replace it."""
 
     def can_socket(self) -> str | None:
-        """Return the error of opening an AF_CAN socket, or None on success."""
+        """Open an AF_CAN socket. Return the error message, or None on success."""
 
     def vcan(self) -> bool:
         """Return whether the kernel module for virtual CAN interfaces is loaded."""
@@ -43,10 +43,10 @@ class Machine(Protocol):
         """Return all CAN interfaces of the kernel."""
 
     def realtime_priority(self) -> int:
-        """Return the highest SCHED_FIFO priority that this user may request, 0 for none."""
+        """Return the highest SCHED_FIFO priority that this user may request. 0 means that no priority is allowed."""
 
     def locked_memory(self) -> int | None:
-        """Return how much memory this user may lock, in bytes, or None without a limit."""
+        """Return how much memory this user may lock [bytes]. None means unlimited memory."""
 
     def package(self, name: str) -> bool:
         """Return whether a Python package is installed.
@@ -64,13 +64,13 @@ class Machine(Protocol):
 
 
 class ThisMachine:
-    """This Linux machine, read from /sys, /proc, getrlimit(2) and the import system."""
+    """This Linux computer. Its properties are read from /sys, /proc, getrlimit(2) and the import system."""
 
     def __init__(self, sys: Path = Path("/sys")) -> None:
         self._sys = sys
 
     def can_socket(self) -> str | None:
-        """Return the error of opening an AF_CAN socket, or None on success."""
+        """Open an AF_CAN socket. Return the error message, or None on success."""
         try:
             socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
         except OSError as error:
@@ -93,11 +93,11 @@ class ThisMachine:
         return found
 
     def realtime_priority(self) -> int:
-        """Return 99 with CAP_SYS_NICE, otherwise the limit RLIMIT_RTPRIO."""
+        """Return the limit RLIMIT_RTPRIO, or 99 if the process has CAP_SYS_NICE."""
         return 99 if _capable(_CAP_SYS_NICE) else resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
 
     def locked_memory(self) -> int | None:
-        """Return the limit RLIMIT_MEMLOCK in bytes, or None if it is unlimited or CAP_IPC_LOCK is set."""
+        """Return the limit RLIMIT_MEMLOCK [bytes], or None if it is unlimited or the process has CAP_IPC_LOCK."""
         limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
         return None if _capable(_CAP_IPC_LOCK) or limit == resource.RLIM_INFINITY else limit
 

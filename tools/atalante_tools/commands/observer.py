@@ -1,4 +1,7 @@
-"""Passive observer of a bus: `frames -> process image of all messages -> Report`."""
+"""Passive observer of a bus: reads the frames of all nodes and reports their state.
+
+frames -> process image of all messages -> Report
+"""
 
 from __future__ import annotations
 
@@ -12,33 +15,33 @@ from atalante_hal.safety.diagnostics import by_number
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Signals that hold the state of a node. The first one that a node sends is shown.
+#: Names of the signals that contain a node state. The report shows the first signal of the list that the node sends.
 _STATES: Final = ("HalState", "DriveState", "ImuState", "FootState", "NodeState")
 #: Milliseconds per second.
 MS: Final = 1000.0
-#: Age from which a node counts as lost, also when cycles are slower than real time [ms].
-GONE: Final = 500
+#: Age of the last frame above which HAL and pendant count as lost [ms].
+LOST_AGE: Final = 500
 
 
 @dataclass(frozen=True)
 class NodeReport:
-    """State of one node, read from its frames. A field is None while the node has not sent it."""
+    """State of one node, read from its frames. A field is None until the node sends it."""
 
     node: str
     kind: str
-    age_ms: int | None  # since the last frame of its fastest message; None: no frame received
-    late: bool  # whether the age exceeds the timeout of the DBC
+    age_ms: int | None  # age of the newest frame of the node's fastest messages. None: no frame received.
+    late: bool  # whether the age is above the timeout of the DBC
     state: str | None
     dbc_ok: bool | None
     supply_v: float | None
     temperature_degc: float | None
     error_flags: int | None
-    emergency: str | None  # code and register of the last emergency
+    emergency: str | None  # error code and error register of the last emergency
 
 
 @dataclass(frozen=True)
 class JointReport:
-    """State of one joint on the output side of its gear. A field is None while no frame was received."""
+    """State of one joint, on the output side of its gear. A field is None until a frame is received."""
 
     joint: str
     position_deg: float | None
@@ -56,26 +59,26 @@ class Report:
     cycle: int | None
     assistance_factor: float | None
     overruns: int | None
-    diagnostic: str | None  # most severe active diagnostic; None: no diagnostic
+    diagnostic: str | None  # most severe active diagnostic. None: no active diagnostic.
     dead_man: bool | None
     nodes: tuple[NodeReport, ...]
     joints: tuple[JointReport, ...]
-    load: dict[str, tuple[float, float]]  # bus -> measured load and worst case of the DBC, as shares of time (0 to 1)
+    load: dict[str, tuple[float, float]]  # bus -> measured bus load and worst case from the DBC, 0 to 1
     frames: int
-    foreign: int  # frames with an identifier that the network does not have
+    foreign: int  # number of frames with an identifier that is not in the DBC
     crc_errors: int
     dropped: int
 
 
 class Observer:
-    """Collector of the frames of all nodes, from which it makes reports."""
+    """Observer of a bus: collects the frames of all nodes and makes reports from them."""
 
     def __init__(self, network: Network, robot: Robot, now: float) -> None:
-        """Start to observe.
+        """Start the observation.
 
         Args:
-            network: Network of the bus.
-            robot: Robot whose gears and polarities convert motor values to joint values.
+            network: Nodes and messages of the DBC.
+            robot: Gear ratios and polarities, which convert motor values to joint values.
             now: Current time [s].
         """
         self._network, self._robot = network, robot
@@ -93,11 +96,11 @@ class Observer:
         self._busy = dict.fromkeys(self._network.buses, 0.0)
         self._frames = self._foreign = 0
 
-    def take(self, frames: Frames, count: int, now: float) -> None:
-        """Accept received frames.
+    def accept(self, frames: Frames, count: int, now: float) -> None:
+        """Update the process image with received frames.
 
         Args:
-            frames: Buffer whose first `count` elements are new frames.
+            frames: Buffer with the new frames in its first `count` elements.
             count: Number of new frames.
             now: Current time [s].
         """
@@ -115,7 +118,7 @@ class Observer:
                 self._busy[known[0]] += known[1]
 
     def report(self, now: float, dropped: int = 0) -> Report:
-        """Return the current report, and restart the measurement of load and frame counts.
+        """Return the current report, and restart the measurement of bus load and frame counts.
 
         Args:
             now: Current time [s].
@@ -135,7 +138,7 @@ class Observer:
             assistance_factor=self._value("HAL_STATUS", "AssistanceFactor"),
             overruns=None if overruns is None else int(overruns),
             diagnostic=by_number(int(diagnostic or 0)),
-            dead_man=None if dead_man is None or self._age(pendant) > GONE else bool(dead_man),
+            dead_man=None if dead_man is None or self._age(pendant) > LOST_AGE else bool(dead_man),
             nodes=tuple(self._node(node) for node in self._network.nodes),
             joints=tuple(self._joint(index) for index in range(len(JOINTS))),
             load={bus: (self._busy[bus] / seconds, self._worst[bus]) for bus in self._network.buses},
@@ -150,7 +153,7 @@ class Observer:
     def _fast(self, node: Node) -> list[Message]:
         cyclic = [m for m in self._network.sent_by(node.name) if m.cycle_ms]
         fastest = min(m.cycle_ms for m in cyclic)
-        if node.kind == "master":  # only SYNC shows that the HAL runs; commands may be missing for other reasons
+        if node.kind == "master":  # the HAL always sends SYNC, but it does not always send commands
             return [m for m in cyclic if m.name.startswith("SYNC_")]
         return [m for m in cyclic if m.cycle_ms == fastest]
 
@@ -198,7 +201,7 @@ class Observer:
         )
 
     def _value(self, message: str, signal: str) -> float | None:
-        """Return the last valid value, or None without a received message or without such a signal in the network."""
+        """Return the last valid value of a signal. Return None for an unknown signal or a message that was never received."""
         row = self._image.codec.rows.get(message)
         if row is None or self._image.age[row] >= NEVER:
             return None
@@ -215,7 +218,7 @@ class Observer:
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """Return the report as a JSON object.
+    """Convert a report to a JSON object.
 
     Args:
         report: Report to convert.

@@ -1,4 +1,4 @@
-"""`atalante pendant`: acts as the operator's pendant, from any process on the bus.
+"""Command `atalante pendant`: acts as the operator's pendant, from any process on the bus.
 
 keyboard -> Session -> PendantNode -> bus -> HAL
 """
@@ -27,16 +27,16 @@ for_option = click.option(
     "seconds",
     type=Between(0.01, 86400.0),
     metavar="SECONDS",
-    help="Time until STOP is pressed and the command ends [s].  [default: until Ctrl-C]",
+    help="Duration of the command [s]. At its end, STOP is pressed.  [default: until Ctrl-C]",
 )
 
 
 @click.group()
 def command() -> None:
-    """Act as the operator's pendant of the robot on a bus.
+    """Act as the operator's pendant on a bus.
 
-    Only one pendant sends at a time: a new pendant takes over from the previous one. While `start` and `xi` run, they hold
-    the dead-man switch and read commands from the keyboard: start, stop, hold, xi 0.3.
+    Only one pendant sends at a time: a new pendant takes over from the previous pendant. The commands `start` and `xi` keep
+    the dead-man switch pressed while they run. They read further commands from the keyboard: start, stop, hold, xi 0.3.
 
     \b
     Example: atalante pendant start -i socketcan -c vcan0
@@ -45,41 +45,42 @@ def command() -> None:
     """
 
 
-@command.command(short_help="Hold the dead-man switch and press START.")
+@command.command(short_help="Press the dead-man switch and START.")
 @target_options(embedded=False, clock=False)
 @for_option
 def start(target: Target, seconds: float | None) -> None:
-    """Hold the dead-man switch, and press START when the HAL is in READY or HOLD.
+    """Keep the dead-man switch pressed, and press START when the HAL is in READY or HOLD.
 
-    The command runs until Ctrl-C, which presses STOP.
+    The command runs until Ctrl-C. At the end it presses STOP and releases the dead-man switch.
 
     \b
     Example: atalante pendant start -i socketcan -c vcan0
     """
     with session(target) as operator:
-        operator.take()
+        operator.take_over()
         operator.start_wanted = True
-        operator.stay(seconds)
+        operator.run(seconds)
     raise SystemExit(operator.stop.exit_code)
 
 
-@command.command(short_help="Set the assistance factor and hold the dead-man switch.")
+@command.command(short_help="Press the dead-man switch and set the assistance factor.")
 @click.argument("factor", metavar="X", type=Between(0.0, 1.0))
 @target_options(embedded=False, clock=False)
 @for_option
 def xi(factor: float, target: Target, seconds: float | None) -> None:
     """Set the assistance factor to X, from 0 (patient alone) to 1 (robot alone).
 
-    The command holds the dead-man switch and runs until Ctrl-C, which presses STOP.
+    The command keeps the dead-man switch pressed and runs until Ctrl-C. At the end it presses STOP and releases the
+    dead-man switch.
 
     \b
     Example: atalante pendant xi 0.3 -i socketcan -c vcan0
     """
     with session(target) as operator:
-        operator.take()
+        operator.take_over()
         operator.node.assist(factor)
         say(f"assistance factor {factor:g}")
-        operator.stay(seconds)
+        operator.run(seconds)
     raise SystemExit(operator.stop.exit_code)
 
 
@@ -118,21 +119,23 @@ def press_once(target: Target, button: str) -> None:
     """
     from atalante_hal.types import SupervisorState
     from atalante_tools.session.pendant_node import Request
-    from atalante_tools.session.pendant_session import SAY
+    from atalante_tools.session.pendant_session import PRESS_SYNCS
 
     with session(target) as operator:
         node = operator.node
         operator.listen()
         if node.hal is None:
-            raise Failed(f"no SYNC received on {target}: start a HAL first, {button} has no effect without one")
+            raise Failed(
+                f"no SYNC received on {target}: start a HAL first, because {button} has no effect without a HAL"
+            )
         before = node.hal
         node.press(Request[button])
-        node.speak()
-        operator.speak_for(SAY)
+        node.start_sending()
+        operator.answer_syncs(PRESS_SYNCS)
         if operator.stop.wanted:
             raise SystemExit(operator.stop.exit_code)
-        if node.refused:
-            raise Failed("another pendant keeps sending: use that pendant, or end it first")
+        if node.takeover_failed:
+            raise Failed("another pendant must stop sending, but it still sends: use that pendant, or end it first")
         after = node.hal
     if after in (SupervisorState.ACTIVE, SupervisorState.FULL_ASSIST):
         raise Failed(f"the HAL must be in HOLD after {button}, got {after.name}")
@@ -141,7 +144,7 @@ def press_once(target: Target, button: str) -> None:
 
 @contextmanager
 def session(target: Target) -> Iterator[Session]:
-    """Open a pendant session on a bus. It reads the keyboard and ends at a signal.
+    """Open a pendant session on a bus, and close the bus after the block.
 
     Args:
         target: Bus of the robot.
@@ -162,7 +165,7 @@ def session(target: Target) -> Iterator[Session]:
 
 
 def open_pendant_bus(target: Target) -> tuple[Network, Bus]:
-    """Return the network, and the open bus that carries the messages of the pendant.
+    """Load the DBC and open the bus of the pendant. Return both.
 
     Args:
         target: Interface and channel, or channel map.
@@ -183,5 +186,5 @@ def open_pendant_bus(target: Target) -> tuple[Network, Bus]:
 def _standard_input() -> int | None:
     try:
         return sys.stdin.fileno()
-    except (AttributeError, ValueError, OSError):  # closed, or not a file
+    except (AttributeError, ValueError, OSError):  # stdin is closed or not a file
         return None

@@ -1,4 +1,4 @@
-"""`atalante status`: receives the frames of a bus and prints the state of every node. It sends nothing.
+"""Command `atalante status`: listens to a bus and prints the state of every node. It sends no frames.
 
 bus -> Observer -> Report -> tables, or one JSON object
 """
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from atalante_hal.bus import Bus
     from atalante_tools.commands.observer import Observer, Report
 
-#: Longest wait for a frame before clock and stop request are checked [s].
-LOOK_UP: Final = 0.02
+#: Longest wait for a frame [s]. After it, clock and stop request are checked.
+POLL_TIMEOUT: Final = 0.02
 _BLANK: Final = "-"
 
 
@@ -40,7 +40,7 @@ _BLANK: Final = "-"
 def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
     """Listen to a bus and print its nodes, joints (degrees, Nm), supervisor state and bus load.
 
-    The command sends nothing. The exit code is 1 when no frame was received, and 4 when a fault is latched.
+    The command sends no frames. The exit code is 1 if no frame was received, and 4 if a fault is latched.
 
     \b
     Example: atalante status -i socketcan -c vcan0
@@ -70,34 +70,34 @@ def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
                     break
         finally:
             bus.close()
-    judge(report, target)
+    require_no_fault(report, target)
 
 
 def listen(bus: Bus, listener: Observer, seconds: float, stop: StopRequest) -> Report:
-    """Return the report of the frames received during a time.
+    """Receive frames for some seconds and return the report.
 
     Args:
         bus: Bus to listen to.
-        listener: Observer that takes the frames.
+        listener: Observer that collects the frames.
         seconds: Listening time [s].
-        stop: Stop request that ends the listening early.
+        stop: Stop request, which ends the listening early.
     """
     from atalante_hal.wire.frame import new_frames
 
     frames = new_frames(256)
     end = time.monotonic() + seconds
     while (now := time.monotonic()) < end and not stop.wanted:
-        count = bus.receive(frames, min(LOOK_UP, end - now))
-        listener.take(frames, count, time.monotonic())
+        count = bus.receive(frames, min(POLL_TIMEOUT, end - now))
+        listener.accept(frames, count, time.monotonic())
     return listener.report(time.monotonic(), bus.dropped)
 
 
-def judge(report: Report, target: Target) -> None:
-    """End the command with an error if the report shows no traffic or a fault.
+def require_no_fault(report: Report, target: Target) -> None:
+    """End the command with an error if no frame was received or a fault is latched.
 
     Args:
         report: Report to check.
-        target: Bus named in the message.
+        target: Bus, for the error message.
 
     Raises:
         Failed: If no frame was received.
@@ -118,7 +118,7 @@ def render(report: Report, target: Target) -> str:
 
     Args:
         report: Report to print.
-        target: Bus named in the first line.
+        target: Bus, for the first line.
     """
     nodes = [("node", "received", "state", "DBC", "supply V", "degC", "errors", "emergency")]
     for n in report.nodes:
@@ -147,17 +147,17 @@ def render(report: Report, target: Target) -> str:
     loads += [(bus, f"{100 * used:.1f}", f"{100 * worst:.1f}") for bus, (used, worst) in report.load.items()]
     counts = f"{report.frames} frames in {report.seconds:.1f} s, {report.crc_errors} CRC errors, {report.dropped} lost"
     if report.foreign:
-        counts += f", {report.foreign} with an identifier unknown to this network"
+        counts += f", {report.foreign} with an identifier that is not in the DBC"
     return "\n\n".join([_headline(report, target), table(nodes), table(joints), table(loads), counts])
 
 
 def _headline(report: Report, target: Target) -> str:
-    from atalante_tools.commands.observer import GONE
+    from atalante_tools.commands.observer import LOST_AGE
 
     if report.supervisor is None:
         return f"{target}: no HAL (no SYNC received)"
     hal = next(n for n in report.nodes if n.kind == "master")
-    if hal.age_ms is not None and hal.age_ms > GONE:
+    if hal.age_ms is not None and hal.age_ms > LOST_AGE:
         return f"{target}: no SYNC of the HAL for {hal.age_ms} ms; it was {report.supervisor} in cycle {report.cycle}"
     parts = [f"{target}: HAL {report.supervisor}, cycle {report.cycle}"]
     if report.assistance_factor is not None:

@@ -1,4 +1,4 @@
-"""`atalante vibrate`: runs one vibration motor while the robot holds its pose."""
+"""Command `atalante vibrate`: runs one vibration motor while the robot holds its pose."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 @target_options(embedded=True)
 @json_option
 def command(motor: str, level: float, seconds: float, target: Target, as_json: bool) -> None:
-    """Run one vibration motor at a LEVEL from 0 (off) to 1 (strongest). All joints hold their pose.
+    """Run one vibration motor at a LEVEL from 0 (off) to 1 (strongest). All joints hold their position.
 
-    MOTOR is left_ or right_, thigh_ or shank_, and front or back: left_thigh_front.
+    MOTOR is left_ or right_, then thigh_ or shank_, then front or back. Example: left_thigh_front.
 
-    The motor runs after the operator presses START (`atalante pendant start`). The embedded robot has an emulated
-    operator that presses START. The robot ends in HOLD.
+    The motor runs after the operator presses START (`atalante pendant start`). With -i embedded, an emulated operator
+    presses START. The robot ends in HOLD.
 
     \b
     Example: atalante vibrate left_thigh_front 0.5 --for 2

@@ -1,1 +1,1 @@
-"""Shared parts of the commands: options, output, exit codes and stop requests."""
+"""Parts that all commands share: options, output, exit codes and stop requests."""

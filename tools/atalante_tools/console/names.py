@@ -1,4 +1,4 @@
-"""Lookup of names that a user types: case-insensitive, with suggestions for an unknown name."""
+"""Case-insensitive lookup of names that the user typed. An error suggests similar names."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import click
 
 
 def find(typed: str, names: Sequence[str], kind: str) -> int:
-    """Return the index of a name in `names`, ignoring case.
+    """Return the index of a typed name in `names`. Upper and lower case are equal.
 
     Args:
         typed: Name as the user typed it.
         names: All valid names.
-        kind: Kind of the named thing for the error message, e.g. "joint".
+        kind: Noun for the error message, for example "joint".
 
     Raises:
-        click.UsageError: If the name is unknown; the message lists similar names and all valid names.
+        click.UsageError: If the name is unknown. The message lists all valid names and similar names.
     """
     lower = [name.lower() for name in names]
     try:

@@ -1,4 +1,4 @@
-"""Shared options of the commands: bus, clock, output, patient. `-i` and `-c` have the meaning they have in python-can."""
+"""Command-line options that several commands share: bus, clock, output format and patient."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ if TYPE_CHECKING:
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 EMBEDDED: Final = "embedded"
-#: Interfaces of python-can that cannot replace a CAN bus between processes, each with the reason.
+#: Interface of python-can that cannot connect HAL and robot -> reason.
 NO_WIRE: Final = {
     "virtual": "works inside one process only",
     "udp_multicast": "returns every sent frame to its sender, which a HAL mistakes for a second HAL",
 }
 
-#: Option `--json`: one object per line on stdout, all other text on stderr.
+#: Option `--json`. JSON objects go to stdout, all other text goes to stderr.
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON objects on stdout, one per line.")
 
-#: Option type: seed of random numbers.
+#: Option type for a seed of random numbers.
 SEED: Final = click.IntRange(min=0)
 
 
 class Between(click.FloatRange):
-    """Option type: a number in a range. NaN is rejected."""
+    """Option type for a number in a range. NaN is rejected."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the number.
+        """Convert the option value to a number and return it.
 
         Raises:
             click.BadParameter: If the value is not a number, is NaN or is out of range.
@@ -48,7 +48,7 @@ class Between(click.FloatRange):
 
 
 class OutputFile(click.Path):
-    """Option type: an output file with one of the allowed suffixes, in an existing folder.
+    """Option type for an output file in an existing folder. Its suffix must be one of the allowed suffixes.
 
     An invalid path is rejected before the command starts its work.
     """
@@ -58,7 +58,7 @@ class OutputFile(click.Path):
         self._suffixes = suffixes
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the path.
+        """Convert the option value to a path and return it.
 
         Raises:
             click.BadParameter: If the suffix is not allowed or the folder does not exist.
@@ -67,22 +67,22 @@ class OutputFile(click.Path):
         if self._suffixes and path.suffix.lower() not in self._suffixes:
             self.fail(f"must end in {' or '.join(self._suffixes)}, got {path}", param, ctx)
         if not path.parent.is_dir():
-            self.fail(f"the folder {path.parent} of {path.name} does not exist: create it first", param, ctx)
+            self.fail(f"must be in an existing folder, got {path}: create the folder {path.parent}", param, ctx)
         return path
 
 
-#: Numbers of at least 5 are centimetres, smaller ones metres. This is unambiguous: every length is at least 5 cm and below 5 m.
+#: Smallest length in centimetres. A smaller number is a length in metres. All valid lengths are from 5 cm to 5 m.
 _CENTIMETRES: Final = 5.0
 
-#: Default length [m] and duration [s] of a patient's step.
+#: Default step length [m] and default step duration [s] of a patient.
 DEFAULT_STEP: Final = (0.15, 0.9)
 
 
 def length(text: str) -> float:
-    """Return a length in metres (option type). 1.75 and 175 are the same height.
+    """Convert a typed length to metres (option type). For example, 1.75 and 175 are both 1.75 m.
 
     Args:
-        text: Length of a body part or a step, in metres or, from 5 on, in centimetres.
+        text: Length of a body part or a step. Numbers below 5 are metres, other numbers are centimetres.
 
     Raises:
         click.BadParameter: If the text is not a number.
@@ -97,12 +97,12 @@ def length(text: str) -> float:
 def options_as(
     name: str, meaning: Callable[..., object], options: Sequence[Callable[[Any], Any]]
 ) -> Callable[[_Command], _Command]:
-    """Return a decorator that adds options to a command and passes their combined value as one argument.
+    """Return a decorator that adds several options to a command and passes them to it as one argument.
 
     Args:
         name: Name of the argument of the command.
-        meaning: Function that combines the option values; its parameters have the names of the options.
-        options: Click options, or decorators that pass one argument themselves, in the order of the help.
+        meaning: Function that computes the argument from the option values. Its parameters have the names of the options.
+        options: Click options, or decorators of this kind, in the order of the help text.
     """
     parameters = inspect.signature(meaning).parameters
 
@@ -122,7 +122,9 @@ def options_as(
 
 
 def patient_options(*, legs: bool) -> Callable[[_Command], _Command]:
-    """Return a decorator that adds `--mass` and `--height` and passes `patient`, which is None without these options.
+    """Return a decorator that adds `--mass` and `--height` and passes the argument `patient` to the command.
+
+    `patient` is None if the user gave none of the options.
 
     Args:
         legs: Whether to add `--thigh` and `--shank` too.
@@ -137,14 +139,14 @@ def patient_options(*, legs: bool) -> Callable[[_Command], _Command]:
                 "--thigh",
                 type=length,
                 metavar="M",
-                help="Distance from hip to knee, in m or cm.  "
+                help="Distance from hip to knee, in m (0.43) or cm (43).  "
                 "[default: estimated from the height with Winter's anthropometric table]",
             ),
             click.option(
                 "--shank",
                 type=length,
                 metavar="M",
-                help="Distance from knee to ankle, in m or cm.  "
+                help="Distance from knee to ankle, in m (0.43) or cm (43).  "
                 "[default: estimated from the height with Winter's anthropometric table]",
             ),
         ]
@@ -153,7 +155,9 @@ def patient_options(*, legs: bool) -> Callable[[_Command], _Command]:
 
 
 def subject_options(command: _Command) -> _Command:
-    """Add `--mass`, `--height`, `--step-length` and `--step-duration`, and pass `subject`, which is None without them.
+    """Add `--mass`, `--height`, `--step-length` and `--step-duration` to a command, and pass it the argument `subject`.
+
+    `subject` is None if the user gave none of the options.
 
     Args:
         command: Command to decorate.
@@ -165,13 +169,13 @@ def subject_options(command: _Command) -> _Command:
             "--step-length",
             type=length,
             metavar="M",
-            help=f"Step length of the patient's gait, in m or cm.  [default: {step_length:g}]",
+            help=f"Step length of the patient's gait, in m (0.15) or cm (15).  [default: {step_length:g} m]",
         ),
         click.option(
             "--step-duration",
             type=float,
             metavar="S",
-            help=f"Step duration of the patient's gait [s].  [default: {step_duration:g}]",
+            help=f"Step duration of the patient's gait [s].  [default: {step_duration:g} s]",
         ),
     ]
     return options_as("subject", _subject, options)(command)
@@ -180,7 +184,7 @@ def subject_options(command: _Command) -> _Command:
 def _subject(patient: Patient | None, step_length: float | None, step_duration: float | None) -> Subject | None:
     if patient is None:
         if step_length is not None or step_duration is not None:
-            raise click.UsageError("--step-length and --step-duration need a patient: add --mass and --height")
+            raise click.UsageError("--step-length and --step-duration require a patient: add --mass and --height")
         return None
     from atalante_control.gait.subject import Subject
 
@@ -201,7 +205,7 @@ def _patient(
     if mass is None and height is None and thigh is None and shank is None:
         return None
     if mass is None or height is None:
-        raise click.UsageError("a patient needs --mass and --height")
+        raise click.UsageError("a patient requires both --mass and --height")
     from atalante_control.model import Patient
 
     try:
@@ -212,15 +216,15 @@ def _patient(
 
 @dataclass(frozen=True)
 class Target:
-    """Bus of the robot: a CAN interface, or `embedded` for an emulated robot that this command starts."""
+    """Bus and clock of a run. The bus is a CAN interface, or `embedded` for an emulated robot without a CAN bus."""
 
     interface: str
-    channel: str  # one channel, or a channel map of the four buses; empty for the embedded robot
-    lockstep: bool  # a cycle ends when the nodes have answered, not after 1 ms of wall-clock time
+    channel: str  # one channel, or a channel map of the four buses. Empty for the embedded robot.
+    lockstep: bool  # True: a cycle ends after the answers of all nodes. False: a cycle ends after 1 ms.
 
     @property
     def embedded(self) -> bool:
-        """Return whether the robot is the embedded one, emulated in this process or in a subprocess."""
+        """Return whether the robot is emulated by the command itself, in its process or in a subprocess."""
         return self.interface == EMBEDDED
 
     def __str__(self) -> str:
@@ -229,7 +233,7 @@ class Target:
 
     @property
     def arguments(self) -> str:
-        """Return the options with which another `atalante` command uses the same bus."""
+        """Return the options `-i` and `-c` with which another `atalante` command uses the same bus."""
         return f"-i {self.interface} -c {self.channel}"
 
 
@@ -247,16 +251,16 @@ def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command]
             default=EMBEDDED if embedded else "socketcan",
             show_default=True,
             metavar="NAME",
-            help="CAN interface, for example socketcan, pcan or kvaser"
-            + ("; embedded starts an emulated robot." if embedded else "."),
+            help="CAN interface by its name in python-can, for example socketcan, pcan or kvaser."
+            + (" With embedded, the command itself emulates the robot." if embedded else ""),
         ),
         click.option(
             "-c",
             "--channel",
             default="",
             metavar="CHANNEL",
-            help="Channel of all four buses (vcan0), or one per bus (left_leg=can0,right_leg=can1,...) for left_leg, "
-            "right_leg, left_sense and right_sense.",
+            help="CAN channel of all four buses (vcan0), or one channel per bus "
+            "(left_leg=can0,right_leg=can1,left_sense=can2,right_sense=can3).",
         ),
     ]
     if clock:
@@ -265,7 +269,8 @@ def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command]
             click.option(
                 "--lockstep/--wall",
                 default=None,
-                help=f"Wait for all nodes in every cycle (slow machines), or run at 1 kHz.  [default: {default}]",
+                help="With --lockstep, a cycle ends after the answers of all nodes (for slow computers). "
+                f"With --wall, a cycle takes 1 ms.  [default: {default}]",
             )
         )
 
@@ -276,7 +281,7 @@ def _target(interface: str, channel: str, lockstep: bool | None = None, *, embed
     if interface == EMBEDDED:
         if not embedded:
             raise click.UsageError(
-                "this command needs a CAN bus, got -i embedded: use for example -i socketcan -c vcan0"
+                "this command requires a CAN bus, got -i embedded: use for example -i socketcan -c vcan0"
             )
         if channel:
             raise click.UsageError(
@@ -287,5 +292,5 @@ def _target(interface: str, channel: str, lockstep: bool | None = None, *, embed
             f"{interface} {NO_WIRE[interface]}: use a CAN adapter, or Linux vcan (`atalante doctor -i socketcan -c vcan0`)"
         )
     elif not channel:
-        raise click.UsageError(f"{interface} needs a channel: -c vcan0, or a channel map of the four buses")
+        raise click.UsageError(f"{interface} requires a channel: -c vcan0, or a channel map of the four buses")
     return Target(interface, channel, interface == EMBEDDED if lockstep is None else lockstep)

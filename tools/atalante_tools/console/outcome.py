@@ -2,7 +2,7 @@
 
     library error -> failure_of -> Failed -> one line on stderr, exit code
 
-0 ok, 1 failed, 2 usage, 3 no device, 4 fault latched, 130 Ctrl-C, 143 SIGTERM.
+0 ok, 1 failed, 2 usage error, 3 no device, 4 fault latched, 130 Ctrl-C, 143 SIGTERM.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ INTERRUPTED: Final = 130
 
 
 class Failed(click.ClickException):
-    """Failure of a command, with exit code 1. The message is one sentence: what was expected, received, and what to do."""
+    """Failure of a command, with exit code 1. The message is one sentence for the user."""
 
     exit_code = FAILED
 
     def show(self, file: IO[Any] | None = None) -> None:
-        """Print the message on stderr, or to `file`."""
+        """Print the message to `file`. The default is stderr."""
         click.echo(f"atalante: {self.format_message()}", file=file, err=file is None)
 
 
@@ -43,13 +43,12 @@ class NoDevice(Failed):
 
 
 class FaultLatched(Failed):
-    """Latched fault, with exit code 4: the robot stays in FAULT until the operator acknowledges it."""
+    """Latched fault, with exit code 4. The robot stays in FAULT until the operator acknowledges the fault."""
 
     exit_code = FAULT_LATCHED
 
 
-#: Library errors whose message is shown to the user: module and class of the error, and the `Failed` class that replaces it.
-#: The first match counts. They are given by name, so that nothing is imported: the module of a raised error is already loaded.
+#: Known library errors: module name, class name, and the `Failed` class that replaces the error. The first match counts.
 KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_hal.bus", "BusAbsent", NoDevice),
     ("atalante_hal.bus", "BusDown", NoDevice),
@@ -69,17 +68,17 @@ KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_tools.canlog.validate.project", "ProjectError", InvalidUsage),
 )
 
-#: Largest number of lines after the first. A longer message is shortened to its first line and the number of the others.
+#: Largest number of lines after the first line of a message. Longer messages are shortened.
 MOST: Final = 2
-#: Error numbers of a disk that cannot be written: full, over quota, read-only, I/O error. They may come without a file name.
+#: Error numbers of a failed write: disk full, over quota, read-only, I/O error.
 DISK: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
 
 
 def failure_of(error: BaseException) -> Failed | None:
-    """Return the failure that a library error becomes, or None for a defect, which keeps its traceback.
+    """Convert a known library error to a failure with one sentence for the user. Return None for any other error.
 
-    The message of an operating-system error contains the file and the reason, without the error number.
-    The message of an error with a diagnostic code (FAULTS.md: CONFIG_INVALID, DBC_INVALID, ...) starts with that code.
+    An error with a diagnostic code (CONFIG_INVALID, DBC_INVALID, ...) gets a message that starts with the code. The message of
+    an operating-system error contains the file name and the reason.
 
     Args:
         error: Exception that ended the command.
@@ -93,5 +92,5 @@ def failure_of(error: BaseException) -> Failed | None:
             code = getattr(error, "code", "")
             return failure(f"{code}: {sentence}" if code else sentence)
     if isinstance(error, OSError) and (error.filename is not None or error.errno in DISK):
-        return Failed(f"{error.filename or 'the output file'} cannot be used: {error.strerror}")
+        return Failed(f"{error.filename or 'the output file'} cannot be read or written: {error.strerror}")
     return None

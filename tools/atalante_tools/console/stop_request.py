@@ -1,10 +1,10 @@
-"""Stop request of the process: SIGINT (Ctrl-C) and SIGTERM, stored until the process ends.
+"""Stop request of the process: stores that SIGINT (Ctrl-C) or SIGTERM arrived.
 
     signal -> handler -> StopRequest: the handler raises `Stopped`, or a loop reads `wanted`
 
-An exception raised by a signal handler can be lost. A callback of compiled code reports it as ignored and continues; an
-optimiser treats it as a failed evaluation. Therefore the request is stored, and `check` raises it again before the robot moves.
-This module has few imports, because it is imported before the signals are handled.
+A library may catch and discard an exception that a signal handler raises. Examples are a callback of compiled code and a failed
+evaluation in an optimiser. Therefore the request is stored, and `check` raises `Stopped` again before the robot moves. This
+module has few imports, because the signals are not handled yet while it is imported.
 """
 
 from __future__ import annotations
@@ -14,28 +14,28 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-TYPE_CHECKING = False  # same as `typing.TYPE_CHECKING`; importing `typing` would delay the signal handlers
+TYPE_CHECKING = False  # replaces `typing.TYPE_CHECKING`, because the import of `typing` is slow
 if TYPE_CHECKING:
     from types import FrameType
 
-#: Base of the exit code after a signal: the exit code is this base plus the signal number (shell convention).
+#: Exit code after a signal, minus the signal number (shell convention).
 SIGNALLED = 128
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stopped(SystemExit):
-    """Exception raised by a stop request. `except Exception` does not catch it."""
+    """Exception that ends the command after a stop signal. `except Exception` does not catch it."""
 
 
 class StopRequest:
-    """Record of the first stop signal: `wanted` after it arrived, and its `exit_code`."""
+    """Record of the first stop signal. `wanted` is True after the signal, and `exit_code` is its exit code."""
 
     def __init__(self) -> None:
         self.wanted = False
         self.exit_code = 0
 
     def ask(self, number: int) -> None:
-        """Record that a signal arrived.
+        """Record that a stop signal arrived.
 
         Args:
             number: Signal number.
@@ -45,7 +45,7 @@ class StopRequest:
             self.wanted = True
 
     def check(self) -> None:
-        """End the command if a signal arrived.
+        """Raise `Stopped` if a stop signal arrived.
 
         Raises:
             Stopped: If a signal arrived, with its exit code.
@@ -54,17 +54,17 @@ class StopRequest:
             raise Stopped(self.exit_code)
 
     def settle(self) -> None:
-        """Clear the request, for a command that a signal ends normally."""
+        """Clear the request. The command then ends with exit code 0, although a signal arrived."""
         self.wanted = False
         self.exit_code = 0
 
 
-#: Stop request of this process, while one of the context managers below handles its signals.
+#: Stop request of this process. None while no context manager of this module is active.
 _request: StopRequest | None = None
 
 
 def check_stop() -> None:
-    """End the command if a signal arrived. Call it between two parts of long work, which may have lost the exception.
+    """Raise `Stopped` if a stop signal arrived. Call it after long work that may have discarded the exception.
 
     Raises:
         Stopped: If a signal arrived, with its exit code.
@@ -75,12 +75,12 @@ def check_stop() -> None:
 
 @contextmanager
 def _handled(react: Callable[[StopRequest, int, bool], None]) -> Iterator[StopRequest]:
-    """Record the signals that arrive inside the block in the stop request of this process.
+    """Record the stop signals that arrive inside the block in the stop request of this process.
 
     Python handles signals in the main thread only. In any other thread the block gets a request that is never set.
 
     Args:
-        react: Called after each signal with the request, the signal number, and whether it repeats an earlier signal.
+        react: Function called after each signal, with the request, the signal number, and whether an earlier signal arrived.
     """
     global _request
     outer = _request
@@ -107,10 +107,10 @@ def _handled(react: Callable[[StopRequest, int, bool], None]) -> Iterator[StopRe
 
 @contextmanager
 def interruptible() -> Iterator[StopRequest]:
-    """Raise `Stopped` at each SIGINT and SIGTERM inside the block, which is the whole program.
+    """Raise `Stopped` at each SIGINT and SIGTERM inside the block. The block is the whole program.
 
-    A `Stopped` raised where Python ignores exceptions (e.g. in `__del__`) is not reported, because the request is stored.
-    After the block a signal ends the process with the default action of the system, without a Python traceback.
+    Python reports an exception that it ignores, for example in `__del__`. It does not report an ignored `Stopped`, because the
+    request is stored. After the block, a signal ends the process with the default action of the system.
     """
 
     def stop(request: StopRequest, _number: int, _repeated: bool) -> None:
@@ -134,10 +134,10 @@ def interruptible() -> Iterator[StopRequest]:
 
 @contextmanager
 def stop_requested() -> Iterator[StopRequest]:
-    """Set `wanted` at the first SIGINT or SIGTERM inside the block, and end the process at the second.
+    """Set `wanted` at the first SIGINT or SIGTERM inside the block, and end the process at the second signal.
 
-    No exception is raised inside the block, so the block must read `wanted`. If the process ends, the watchdog of each drive
-    holds the robot.
+    The signals raise no exception inside the block, so the block must read `wanted`. If the process ends, the drives hold the
+    robot after their watchdog timeout.
 
     Raises:
         Stopped: If a signal arrived before the block.
@@ -155,10 +155,10 @@ def stop_requested() -> Iterator[StopRequest]:
 
 @contextmanager
 def ended_by(end: Callable[[], None]) -> Iterator[StopRequest]:
-    """Call `end` at each SIGINT and SIGTERM inside the block. No signal interrupts the block.
+    """Call `end` at each SIGINT and SIGTERM inside the block. The signals raise no exception.
 
     Args:
-        end: Requests the end of the block. It may be called between any two instructions, so it must only set a flag.
+        end: Function that requests the end of the block. It may be called at any time, so it must only set a flag.
     """
 
     def ask(_request: StopRequest, _number: int, _repeated: bool) -> None:

@@ -1,4 +1,4 @@
-"""Output of the commands: log lines and a progress line on stderr, tables and JSON objects on stdout."""
+"""Console output of the commands: messages and a progress line on stderr, tables and JSON objects on stdout."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from typing import Any, Final, TextIO
 
 import click
 
-#: Time between two progress lines on a terminal, where each line replaces the previous one [s].
+#: Period of the progress line on a terminal [s]. Each line overwrites the previous line.
 LIVE: Final = 0.2
-#: Time between two progress lines in a log [s].
+#: Period of the progress line in a file or pipe [s].
 LOGGED: Final = 5.0
 
 
 def say(text: str) -> None:
-    """Print one line for the user on stderr."""
+    """Print a message of one line on stderr."""
     click.echo(text, err=True)
 
 
-class Patience(logging.Handler):
-    """Log handler that prints one notice when the first function is compiled, which takes seconds."""
+class CompilationNotice(logging.Handler):
+    """Log handler that prints a message when the first function is compiled, because compilation takes seconds."""
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
@@ -31,25 +31,25 @@ class Patience(logging.Handler):
 
     @classmethod
     def begin(cls) -> None:
-        """Install the handler on the logger of `atalante_hal.compiled`, without importing that module."""
+        """Install the handler on the logger of `atalante_hal.compiled`."""
         logger = logging.getLogger("atalante_hal.compiled")
         logger.addHandler(cls())
         logger.setLevel(logging.INFO)
 
     def emit(self, _record: logging.LogRecord) -> None:
-        """Print the notice at the first log record, which reports a compilation."""
+        """Print the message at the first log record. Every log record reports a compilation."""
         if not self._printed:
             self._printed = True
             say("compiling: takes some seconds, only once after an installation or an update")
 
 
 def show_json(value: Mapping[str, Any]) -> None:
-    """Print one JSON object as a line on stdout. NaN and infinity become null."""
+    """Print a JSON object as one line on stdout. NaN and infinity become null."""
     click.echo(json.dumps(_finite(value), allow_nan=False))
 
 
 def table(rows: Sequence[Sequence[str]]) -> str:
-    """Return rows as text with aligned columns. The first row is the header; columns of numbers are right-aligned."""
+    """Return rows as text with aligned columns. The first row is the header. Columns of numbers are right-aligned."""
     columns = list(zip(*rows, strict=True))
     widths = [max(map(len, column)) for column in columns]
     right = [all(_is_number(cell) for cell in column[1:]) for column in columns]
@@ -61,19 +61,19 @@ def table(rows: Sequence[Sequence[str]]) -> str:
 
 
 class Progress:
-    """Progress line of a command: overwritten on a terminal, printed every few seconds in a log.
+    """Progress line of a command. On a terminal each line overwrites the previous line.
 
-    `due()` is fast enough to be called every cycle.
+    `due()` is fast and may be called in every cycle.
     """
 
     def __init__(
         self, *, period: float | None = None, stream: TextIO | None = None, now: Callable[[], float] = time.monotonic
     ) -> None:
-        """Start the first period now.
+        """Start the first period.
 
         Args:
-            period: Time between two lines [s]; None: `LIVE` on a terminal, `LOGGED` otherwise.
-            stream: Text stream of the lines; None: stderr.
+            period: Time between two lines [s]. None: `LIVE` on a terminal, `LOGGED` otherwise.
+            stream: Text stream of the lines. None: stderr.
             now: Monotonic clock [s].
         """
         self._stream = stream or sys.stderr
@@ -84,11 +84,11 @@ class Progress:
         self._width = 0
 
     def due(self) -> bool:
-        """Return whether the next line is due."""
+        """Return whether the next progress line is due."""
         return self._now() >= self._next
 
     def show(self, text: str) -> None:
-        """Print the line and start the next period."""
+        """Print a progress line and start the next period."""
         self._next = self._now() + self._period
         if self._live:
             self._stream.write("\r" + text.ljust(self._width))

@@ -1,1 +1,1 @@
-"""Parts of a run: rig (HAL on its bus), emulated body, pendant, run folder and figures."""
+"""Parts of a run: HAL with its buses, emulated body, pendant, run folder and figures."""

@@ -1,4 +1,4 @@
-"""Trial of `atalante demo` and `atalante airwalk`: steps in the air inside a virtual guide (first experiment of the paper).
+"""Trial of `atalante demo` and `atalante airwalk`: walks in the air inside virtual guides (first experiment of the paper).
 
 guide shape -> certificate (printed) -> steps -> recording, summary.json, figure
 """
@@ -22,7 +22,7 @@ from atalante_tools.console.options import SEED, Between, Target, json_option, o
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import stop_requested
 from atalante_tools.console.terminal import say, show_json
-from atalante_tools.session.run_folder import Result, leave, results_table, run_folder
+from atalante_tools.session.run_folder import Result, results_table, run_folder, write_summary
 
 if TYPE_CHECKING:
     from atalante_control.airwalk.controller import AirwalkController
@@ -41,9 +41,9 @@ if TYPE_CHECKING:
     from atalante_tools.session.rig import Rig
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
-#: Names of `shapes.SHAPES`, repeated here because the help must not import the controller.
+#: Names of the guide shapes, copied from `shapes.SHAPES` because the help must not import the slow controller.
 SHAPE_NAMES = "constant, widening, narrowing, pinched, asymmetric, snap"
-#: Number of cycles between two checks of the telemetry process.
+#: Period of the check of the telemetry process [cycles].
 _TEND_CYCLES = 250
 
 
@@ -51,26 +51,28 @@ _TEND_CYCLES = 250
 class Options:
     """Options of a trial."""
 
-    steps: int  # right-stance steps per guide shape
+    steps: int  # number of right-stance steps per guide shape
     xi: float  # assistance factor, 0 to 1
     seed: int  # seed of the sensor noise
     out: Path  # run folder
-    record_rate: int  # Hz, recording rate
-    can_log: Path | None  # log file for all CAN frames; None: no CAN log
-    telemetry: Path | None  # TOML file with endpoint, TLS certificate and users; None: publish on the loopback only
-    subject: Subject | None = None  # the gait network computes the gait of this subject; None: default gait
+    record_rate: int  # recording rate [Hz]
+    can_log: Path | None  # log file for all CAN frames. None: no CAN log.
+    telemetry: (
+        Path | None
+    )  # TOML file with endpoint, TLS certificate and users. None: publish on the loopback interface only.
+    subject: Subject | None = None  # patient and step, for which the gait network computes a gait. None: default gait.
 
 
 @dataclass
 class Walked:
-    """Results and recording of a trial, complete after the telemetry is closed."""
+    """Results and recording of a trial. The recording is set when the telemetry is closed."""
 
-    results: list[Result] = field(default_factory=list)  # one per finished shape
-    recording: Recording | None = None  # None: telemetry not started
+    results: list[Result] = field(default_factory=list)  # one result per finished guide shape
+    recording: Recording | None = None  # None until the telemetry is closed
 
 
 def _record_rate(text: str) -> int:
-    """Return a recording rate in Hz (option type). It must be a divisor of the 1000 Hz of the loop.
+    """Convert a typed recording rate to a number [Hz] (option type). It must be a divisor of the loop rate 1000 Hz.
 
     Args:
         text: Rate as the user typed it.
@@ -84,7 +86,7 @@ def _record_rate(text: str) -> int:
 
 
 def trial_options(steps: int, out: str) -> Callable[[_Command], _Command]:
-    """Return a decorator that adds the options of a trial to a command and passes them as the argument `options`.
+    """Return a decorator that adds the options of a trial to a command and passes them to it as the argument `options`.
 
     Args:
         steps: Default of `--steps`.
@@ -94,25 +96,30 @@ def trial_options(steps: int, out: str) -> Callable[[_Command], _Command]:
         click.option("--steps", type=click.IntRange(1), default=steps, show_default=True, metavar="N",
                      help="Number of right-stance steps per guide shape."),
         click.option("--xi", type=Between(0.0, 1.0), default=0.5, show_default=True, metavar="X",
-                     help="Assistance factor from 0 (widest guide, 7.5 deg) to 1 (full assistance); the pendant may change it."),
-        click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the sensor noise."),
+                     help="Initial assistance factor Xi from 0 (guide of +-7.5 deg) to 1 (guide of +-0.5 deg). The pendant may "
+                          "change it."),
+        click.option("--seed", type=SEED, default=0, show_default=True, metavar="N",
+                     help="Seed of the emulated sensor noise."),
         click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=out, show_default=True,
-                     metavar="DIR", help="Folder for recording.mcap, summary.json and the figure. Existing files are replaced."),
+                     metavar="DIR", help="Folder for recording.mcap, summary.json and guide_shapes.png. Existing files are "
+                                         "replaced."),
         click.option("--record-rate", type=_record_rate, default="100", show_default=True, metavar="HZ",
-                     help="Recording rate [Hz], a divisor of 1000. 1000 records every cycle."),
+                     help="Recording rate [Hz]. It must be a divisor of 1000. With 1000, every cycle is recorded."),
         click.option("--can-log", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
-                     help="Log every CAN frame to FILE. Its suffix sets the format: .log, .asc, .blf, .log.gz, .asc.gz."),
+                     help="Log every CAN frame to this file. The suffix sets the format: .log, .asc, .blf, .log.gz, .asc.gz.  "
+                          "[default: no CAN log]"),
         click.option("--telemetry", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
-                     help="Read Zenoh endpoint, TLS certificate and users from this TOML file.  [default: loopback only]"),
+                     help="TOML file with Zenoh endpoint, TLS certificate and users.  "
+                          "[default: publish on the loopback interface only]"),
     ]  # fmt: skip
 
     return options_as("options", Options, [*options, json_option, subject_options])
 
 
 def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_json: bool) -> None:
-    """Walk with one shape after the other, record the run, and print the results.
+    """Walk inside one guide shape after another, record the run, and print the results.
 
-    If the run ends early, the recording and the results until then are kept.
+    If the run ends early, it keeps its recording and its results.
 
     Args:
         target: Bus and clock.
@@ -143,15 +150,15 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
                     show_json({"recording": asdict(walked.recording)})
                 else:
                     click.echo(results_table(walked.results))
-                leave(options.out, _asked(options), walked.results, walked.recording)
+                write_summary(options.out, _summary_options(options), walked.results, walked.recording)
     _require_complete(walked.recording)
 
 
 def _require_complete(recording: Recording | None) -> None:
-    """Check that the recording has no gaps.
+    """Check that the recording is one file that contains every cycle.
 
     Raises:
-        Failed: If cycles are missing or the file is truncated; the message contains the files and the number of missing cycles.
+        Failed: If cycles are missing or the file is truncated. The message contains the files and the number of missing cycles.
     """
     if recording is not None and not recording.complete:
         raise Failed(
@@ -160,11 +167,11 @@ def _require_complete(recording: Recording | None) -> None:
         )
 
 
-def _asked(options: Options) -> dict[str, Any]:
-    """Return the options as JSON types for summary.json, without the output paths."""
-    asked = {key: value for key, value in asdict(options).items() if key not in ("out", "can_log")}
+def _summary_options(options: Options) -> dict[str, Any]:
+    """Return the options for summary.json, as JSON types and without the output paths."""
+    given = {key: value for key, value in asdict(options).items() if key not in ("out", "can_log")}
     telemetry = None if options.telemetry is None else str(options.telemetry)
-    return {**asked, "telemetry": telemetry, "version": version("atalante-hal")}
+    return {**given, "telemetry": telemetry, "version": version("atalante-hal")}
 
 
 def _require_format(can_log: Path) -> None:
@@ -186,12 +193,14 @@ def _walk_all(
     *,
     as_json: bool,
 ) -> None:
-    """Walk with one shape after the other, and add results and recording to `walked`. Raise the errors of `run_trial`."""
+    """Walk inside one guide shape after another, and add results and recording to `walked`. Raise the errors of `run_trial`."""
     import atalante_dbc
     from atalante_hal.robot import load_robot
 
     with ExitStack() as stack:
-        robot_process = _start_robot(target, stack)  # its imports run while the controllers are created
+        robot_process = _start_robot(
+            target, stack
+        )  # the subprocess imports its modules while the controllers are created
         network, robot = atalante_dbc.load(), load_robot()
         exoskeleton, gait, controllers = _controllers(options.subject, robot, shapes)
         certificates: dict[str, Certificate] = {}
@@ -201,8 +210,8 @@ def _walk_all(
             with _open(target, options, network, robot, controller, gait.hash32, robot_process, exoskeleton) as rig:
                 robot_process = _start_robot(target, stack) if name != last else None
                 if telemetry is None:
-                    # Printed only after the bus is open: without a robot the certificates have no meaning.
-                    certificates = {shape: guarded.certificate(options.xi) for shape, guarded in controllers.items()}
+                    # The certificates are printed only after the bus could be opened.
+                    certificates = {shape: walking.certificate(options.xi) for shape, walking in controllers.items()}
                     _announce(certificates.values())
                     telemetry = _telemetry(target, options, outlet, rig.hal, network, gait.hash32)
                     stack.enter_context(telemetry)
@@ -220,7 +229,7 @@ def _walk_all(
 
 
 class _Walk:
-    """Run of one guide shape: loop, telemetry and progress line."""
+    """Run of the robot inside one guide shape. It writes the telemetry and prints the progress line."""
 
     def __init__(
         self,
@@ -245,7 +254,7 @@ class _Walk:
                 hal.tap = telemetry.tap(stamps=lambda: hal.bus.stamps)
 
     def run(self, stop: Any) -> Statistics:
-        """Walk until all steps are done, the stop request is set, or the robot leaves ACTIVE.
+        """Walk until all steps are done, a stop signal arrives, or the robot leaves ACTIVE.
 
         Args:
             stop: Stop request of the process.
@@ -256,7 +265,7 @@ class _Walk:
         return statistics
 
     def conclude(self) -> None:
-        """End the command with an error unless all steps were done; see `Watch.conclude`."""
+        """End the command with an error unless all steps are done. See `Watch.conclude`."""
         self._watch.conclude()
 
     def _record(self) -> None:
@@ -290,7 +299,7 @@ class _Walk:
 def _controllers(
     subject: Subject | None, robot: Robot, shapes: Mapping[str, GuideShape]
 ) -> tuple[ExoskeletonParameters, Gait, dict[str, AirwalkController]]:
-    """Return the exoskeleton adjusted to the subject, the gait, and one controller per shape."""
+    """Return the exoskeleton, the gait, and one controller per guide shape. Leg lengths and gait fit the subject."""
     from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
     from atalante_control.dynamics.gait_network import load_network
     from atalante_control.dynamics.suspended import suspended_gait
@@ -305,13 +314,13 @@ def _controllers(
         gait = suspended_gait(load_network().gait(subject, robot), exoskeleton, robot)
         config = AirwalkConfig(feedforward=True)
     controllers = {name: AirwalkController(robot, gait, shape, config, exoskeleton) for name, shape in shapes.items()}
-    if subject is not None:  # printed here, because the gait is now known to be valid
+    if subject is not None:  # the gait is valid, because the controllers accepted it
         say(f"gait of the network: {subject}; the exoskeleton is empty")
     return exoskeleton, gait, controllers
 
 
 def _announce(certificates: Collection[Certificate]) -> None:
-    """Print the certificate of each shape before the run: disturbance torques, and the effects that are not included."""
+    """Print the certificate of each guide shape: tolerated disturbance torques, and the effects that it does not include."""
     for certificate in certificates:
         name, xi, bound = certificate.shape, certificate.xi, certificate.joint_torque
         if bound is None:
@@ -330,7 +339,7 @@ def _announce(certificates: Collection[Certificate]) -> None:
 
 
 def _bounds(certificate: Certificate) -> dict[str, Any]:
-    """Return the certificate as the fields `certified`, `bound_hip_nm` and `bound_knee_nm` of `Result`."""
+    """Return the fields `certified`, `bound_hip_nm` and `bound_knee_nm` of `Result` for a certificate."""
     bound = certificate.joint_torque
     return {
         "certified": certificate.certified,
@@ -340,17 +349,17 @@ def _bounds(certificate: Certificate) -> dict[str, Any]:
 
 
 def _weakest(controller: AirwalkController, factors: Iterable[float]) -> Certificate:
-    """Return the certificate with the smallest hip bound of all assistance factors of the run."""
+    """Return the certificate for the assistance factor of the run that has the smallest hip bound."""
     certificates = [controller.certificate(xi) for xi in factors]
     return min(certificates, key=lambda c: -1.0 if c.joint_torque is None else c.joint_torque.hip)
 
 
-#: Number of processor cores for HAL, telemetry and the embedded robot in a subprocess.
+#: Smallest number of processor cores for HAL, telemetry and embedded robot in three processes.
 _CORES = 3
 
 
 def _start_robot(target: Target, stack: ExitStack) -> EmbeddedRobot | None:
-    """Start the embedded robot in a subprocess if there are enough cores; on a shared core it would slow down the HAL."""
+    """Start the embedded robot in a subprocess. Return None for a real robot or a computer with too few cores."""
     from atalante_tools.session.embedded import EmbeddedRobot
 
     robot_process = target.embedded and len(os.sched_getaffinity(0)) >= _CORES
@@ -393,7 +402,7 @@ def _telemetry(
         record_rate=options.record_rate,
         can_log=options.can_log,
         lock_step=target.lockstep,
-        slots=8192,  # 8 s of cycles: a demo runs many times faster than real time, and the recorder may pause
+        slots=8192,  # buffer for 8192 cycles, because a demo runs faster than real time and the recorder may pause
         **outlet,
     )
     return TelemetryProcess(
@@ -416,7 +425,7 @@ def _telemetry(
 
 
 class _EndpointReport:
-    """Printer of the Zenoh endpoint: prints it when created, and on a call after a restart has changed it."""
+    """Printer of the Zenoh endpoint. It prints the endpoint at the start and after each change."""
 
     def __init__(self, telemetry: TelemetryProcess) -> None:
         for notice in telemetry.notices:
@@ -426,7 +435,7 @@ class _EndpointReport:
         self()
 
     def __call__(self) -> None:
-        """Print the endpoint if it has changed since the last print."""
+        """Print the endpoint if it changed since the last call."""
         endpoint = self._telemetry.endpoint
         if endpoint != self._endpoint:
             self._endpoint = endpoint
@@ -435,25 +444,25 @@ class _EndpointReport:
 
 
 def _close(telemetry: TelemetryProcess, walked: Walked) -> None:
-    """Close the telemetry, print its notices about lost data, and add its recording to `walked`."""
+    """Close the telemetry, print its messages about lost data, and add its recording to `walked`."""
     summary = telemetry.close()
     walked.recording = summary.recording
     for notice in summary.notices:
-        if notice not in telemetry.notices:  # notices of the start are already printed
+        if notice not in telemetry.notices:  # the messages of the start are already printed
             say(notice)
     if not summary.complete and not summary.notices:
         say("the telemetry process ended unexpectedly: the recording may be truncated")
 
 
 def _result(certificate: Certificate, controller: AirwalkController, hal: Hal, statistics: Statistics) -> Result:
-    walked = controller.statistics
+    walking = controller.statistics
     return Result(
         shape=certificate.shape,
         **_bounds(certificate),
-        steps=walked.steps,
-        max_ratio=round(walked.max_ratio, 4),
-        inside=round(walked.inside_fraction, 4),
-        filter_active=round(walked.active_fraction, 4),
+        steps=walking.steps,
+        max_ratio=round(walking.max_ratio, 4),
+        inside=round(walking.inside_fraction, 4),
+        filter_active=round(walking.active_fraction, 4),
         cycles=statistics.cycles,
         real_time_factor=round(statistics.real_time_factor, 2),
         frames=int(hal.record[hal.layout["frames"]][0]),

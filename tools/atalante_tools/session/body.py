@@ -1,4 +1,4 @@
-"""Body of the emulated robot: the empty exoskeleton in PyBullet, suspended at its pelvis."""
+"""Body of the emulated robot: an exoskeleton without a patient in PyBullet, suspended at its pelvis."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from atalante_emulator.body import PyBulletBody
 
 
-#: Newest Python that the extra `emulator` installs PyBullet on; the package index has no wheel for a later one.
+#: Newest Python version for which the package index has a wheel of PyBullet.
 ENGINE_PYTHON: Final = (3, 11)
 
 
 def engine_hint() -> str:
-    """Return the command that installs PyBullet, and the Python versions that it works on."""
+    """Return the command that installs PyBullet, together with the Python version that it requires."""
     python = sys.version_info[:2]
     newest = "{}.{}".format(*ENGINE_PYTHON)
     if python <= ENGINE_PYTHON:
@@ -35,18 +35,18 @@ def require_engine() -> None:
     """Check that PyBullet is installed, without importing it.
 
     Raises:
-        Failed: If it is not installed; the message names the extra and the Python versions that have it.
+        Failed: If PyBullet is not installed. The message contains the command that installs it.
     """
     if find_spec("pybullet") is None:
         raise Failed(f"the emulated robot needs PyBullet; type: {engine_hint()}")
 
 
 def describe(robot: Robot, exoskeleton: ExoskeletonParameters | None = None) -> str:
-    """Return the URDF of the exoskeleton.
+    """Return the URDF text of the exoskeleton.
 
     Args:
-        robot: Robot with the joint limits.
-        exoskeleton: Geometry and masses; None: default leg lengths.
+        robot: Joint limits of the robot.
+        exoskeleton: Geometry and masses. None: default leg lengths.
     """
     from atalante_control.model import ExoskeletonParameters, urdf
 
@@ -57,12 +57,12 @@ def describe(robot: Robot, exoskeleton: ExoskeletonParameters | None = None) -> 
 def open_body(
     robot: Robot, pose: Sequence[float] | None = None, exoskeleton: ExoskeletonParameters | None = None
 ) -> Iterator[PyBulletBody]:
-    """Open the body of a robot, and close it after the block.
+    """Create the body of a robot in PyBullet, and close it after the block.
 
     Args:
-        robot: Robot with the joint limits.
-        pose: Initial joint angles, shape (12,) [rad]; None: all zero.
-        exoskeleton: Geometry and masses; None: default leg lengths.
+        robot: Joint limits of the robot.
+        pose: Initial joint angles, shape (12,) [rad]. None: all zero.
+        exoskeleton: Geometry and masses. None: default leg lengths.
 
     Raises:
         Failed: If PyBullet is not installed.
@@ -74,11 +74,11 @@ def open_body(
 
 @contextmanager
 def open_described(urdf: str, pose: Sequence[float] | None = None) -> Iterator[PyBulletBody]:
-    """Open the body of a URDF, and close it after the block.
+    """Create a body from a URDF in PyBullet, and close it after the block.
 
     Args:
         urdf: URDF text.
-        pose: Initial joint angles, shape (12,) [rad]; None: all zero.
+        pose: Initial joint angles, shape (12,) [rad]. None: all zero.
     """
     with no_banner():
         from atalante_emulator.body import PyBulletBody
@@ -93,7 +93,7 @@ def open_described(urdf: str, pose: Sequence[float] | None = None) -> Iterator[P
 
 @contextmanager
 def no_banner() -> Iterator[None]:
-    """Discard all output to stderr inside the block, including that of C code, e.g. the import banner of PyBullet."""
+    """Discard all output to stderr inside the block. This includes output of C code, such as the import banner of PyBullet."""
     sys.stderr.flush()
     terminal, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:

@@ -1,4 +1,7 @@
-"""Figures of a run, drawn from its recording: `recording.mcap -> guide_shapes.png`."""
+"""Figure of a run, drawn from its recording.
+
+recording.mcap -> guide_shapes.png
+"""
 
 from __future__ import annotations
 
@@ -19,23 +22,23 @@ from matplotlib import pyplot as plt
 
 _LEFT_HIP = "left_SH"
 _RIGHT_STANCE = 1
-#: Phase from which the last step of a run counts as complete.
+#: Phase that the last step of a run must reach to count as complete, 0 to 1.
 _WHOLE = 0.9
-#: Samples of one step: phase, then measured angle, desired angle, upper and lower edge of the guide [deg].
+#: Samples of one step. A sample is phase, measured angle, desired angle, upper edge and lower edge of the guide [deg].
 _Step = list[tuple[float, ...]]
 
 
 def guide_shapes(recording: Path, picture: Path) -> None:
-    """Draw the left hip angle over the phase of all right-stance steps, one panel per guide shape.
+    """Draw the left hip angle over the phase for all right-stance steps. Each guide shape has its own panel.
 
-    An incomplete last step of a run that was stopped is left out, unless it is the only step.
+    An incomplete last step is not drawn, unless it is the only step.
 
     Args:
         recording: MCAP recording of the run.
-        picture: Output file.
+        picture: File to write.
     """
     steps: dict[str, dict[int, _Step]] = defaultdict(lambda: defaultdict(list))
-    last: dict[str, tuple[int, int]] = {}  # run -> step and stance at its end
+    last: dict[str, tuple[int, int]] = {}  # run name -> last step number and last stance leg
     for run, guide, upper, lower in _guide_samples(recording):
         last[run] = guide.step, guide.stance
         if guide.stance == _RIGHT_STANCE and guide.name and guide.name[0] == _LEFT_HIP:
@@ -61,7 +64,7 @@ def guide_shapes(recording: Path, picture: Path) -> None:
 
 
 def _whole(walked: dict[int, _Step], last: tuple[int, int]) -> dict[int, _Step]:
-    """Return the complete steps, or all steps if none is complete."""
+    """Return all complete steps of a run. If no step is complete, return all steps."""
     number, stance = last
     whole = {
         step: samples
@@ -86,7 +89,7 @@ def _panel(axis: Any, run: str, walked: dict[int, _Step]) -> None:
 
 
 def _guide_samples(recording: Path) -> Iterator[tuple[str, Any, float, float]]:
-    """Yield run name, `Guide` message, upper and lower edge [rad] of every recorded cycle with a guide."""
+    """Yield run name, `Guide` message, upper edge and lower edge [rad] for every recorded cycle with a guide."""
     classes = {name: message_class(name) for name in ("SystemState", "Guide", "Controller")}
     run, edges = "", (0.0, 0.0)
     pending: Any = None

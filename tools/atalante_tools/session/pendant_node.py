@@ -1,11 +1,11 @@
 """PENDANT node of the network: answers each SYNC with `PENDANT_STATE`, and sends `PENDANT_STATUS` at its period.
 
-Only one pendant sends at a time. A new pendant listens first and copies the state of the older one: request counter, dead-man
-switch, assistance factor. The older pendant stops sending when it receives a frame with its own identifier.
+Only one pendant sends at a time. A new pendant listens first and copies the signals of the older pendant: request counter,
+dead-man switch and assistance factor. The older pendant stops sending when it receives a frame with its own identifier.
 
-During the takeover both pendants answer the same SYNC for a cycle or two. Their frames have the same counter, the low byte of
-the SYNC's Cycle. The HAL accepts the first frame. It reports the second frame as a repetition, or as a second sender if the
-contents differ. After four such cycles it holds the robot.
+During the takeover both pendants answer the same SYNC in one or two cycles. Both frames have the same counter, the low byte of
+the signal Cycle in SYNC. The HAL accepts the first frame. It reports the second frame as a repetition, or as a second sender if
+the contents differ. After four such cycles the HAL holds the robot.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 
-#: Duration of a takeover, in cycles: time for the older pendant to stop sending.
-GRACE: Final = 50
-#: Last cycles of the takeover, in which the older pendant must not send any more.
-SILENT: Final = 10
+#: Duration of a takeover [cycles]. In this time the older pendant must stop sending.
+TAKEOVER_CYCLES: Final = 50
+#: Last part of a takeover, in which the older pendant must not send any frame [cycles].
+QUIET_CYCLES: Final = 10
 #: NMT state of an operational node (CiA 301).
 OPERATIONAL: Final = 5
 #: Firmware version reported in PENDANT_STATUS.
 FIRMWARE_VERSION: Final = 0x0100
-#: Values of `Check` for a frame with a valid CRC, whether or not its counter is right. Another pendant has sent such a frame.
-_SPOKEN: Final = (Check.OK, Check.SOME_LOST, Check.REPEATED, Check.CONFLICT, Check.WRONG_SEQUENCE)
+#: Values of `Check` for a frame with a valid CRC. Such a frame with the identifier of the pendant comes from another pendant.
+_FROM_ANOTHER: Final = (Check.OK, Check.SOME_LOST, Check.REPEATED, Check.CONFLICT, Check.WRONG_SEQUENCE)
 
 
 class Request(IntEnum):
-    """Request of the operator; values of the signal `PENDANT_STATE.Request`."""
+    """Button that the operator pressed last: values of the signal `PENDANT_STATE.Request`."""
 
     NONE = 0
     START = 1
@@ -43,22 +43,22 @@ class Request(IntEnum):
 
 
 class PendantNode:
-    """Pendant node: listens until `speak()`, then answers every SYNC until another pendant takes over.
+    """Pendant node. It listens until `start_sending()`, then answers every SYNC until another pendant takes over.
 
     Attributes:
-        hal: State of the HAL in the last SYNC; None: no SYNC received.
-        cycles: Number of SYNCs received.
-        spoken: Number of SYNCs answered.
-        heard_another: Whether a frame of another pendant was received before `speak()`.
-        displaced: Whether another pendant has taken over since.
-        refused: Whether the older pendant kept sending, so that this one stopped.
+        hal: State of the HAL in the last SYNC. None: no SYNC received.
+        cycles: Number of received SYNCs.
+        answered: Number of answered SYNCs.
+        found_another: Whether a frame of another pendant was received before `start_sending()`.
+        displaced: Whether another pendant took over from this node.
+        takeover_failed: Whether this node stopped because the older pendant did not stop sending.
     """
 
     def __init__(self, network: Network, bus: Bus) -> None:
-        """Prepare the node.
+        """Set up the process images of the node.
 
         Args:
-            network: Network of the robot.
+            network: Nodes and messages of the DBC.
             bus: Bus that carries `PENDANT_STATE`.
         """
         state, status = network.message("PENDANT_STATE"), network.message("PENDANT_STATUS")
@@ -81,18 +81,18 @@ class PendantNode:
             self._status.values[self._status.codec.index(status.name, name)] = value
         self._uptime_at = self._status.codec.index(status.name, "Uptime")
         self._status_cycles = status.cycle_ms
-        self._speaking = False
-        self._other_at = -GRACE  # value of `spoken` at the last frame of another pendant
+        self._sending = False
+        self._other_at = -TAKEOVER_CYCLES  # value of `answered` when the last frame of another pendant arrived
         self.hal: SupervisorState | None = None
         self.cycles = 0
-        self.spoken = 0
-        self.heard_another = False
+        self.answered = 0
+        self.found_another = False
         self.displaced = False
-        self.refused = False
+        self.takeover_failed = False
 
-    def speak(self) -> None:
-        """Begin to send: answer the next SYNC and every later one."""
-        self._speaking = True
+    def start_sending(self) -> None:
+        """Answer every SYNC from now on."""
+        self._sending = True
 
     @property
     def dead_man(self) -> bool:
@@ -104,7 +104,7 @@ class PendantNode:
         self._tx.values[self._at["DeadMan"]] = pressed
 
     def press(self, request: Request) -> None:
-        """Press a button: send the request with an incremented counter.
+        """Press a button. The next frames contain the request with an incremented counter.
 
         Args:
             request: Request of the button.
@@ -123,7 +123,7 @@ class PendantNode:
         self._tx.values[self._at["AssistanceSet"]] = 1.0
 
     def poll(self, timeout: float = 0.0) -> bool:
-        """Receive the pending frames, and answer a SYNC.
+        """Receive the waiting frames. Answer the SYNC if one is among them.
 
         Args:
             timeout: Longest wait for the first frame [s].
@@ -138,43 +138,43 @@ class PendantNode:
         image.new_cycle()
         image.accept_each(self._scratch, count)
         state = Check(image.check[self._state_row])
-        if state in _SPOKEN:
+        if state in _FROM_ANOTHER:
             self._other_received(state)
         if not Check(image.check[self._sync_row]).fresh:
             return False
         self.hal = SupervisorState(int(image.values[self._hal_at]))
         self.cycles += 1
-        if self._speaking:
+        if self._sending:
             self._answer()
         return True
 
     def _other_received(self, check: Check) -> None:
-        if not self._speaking:
+        if not self._sending:
             if check.fresh:
-                self.heard_another = True
-                self._take_over()
+                self.found_another = True
+                self._copy_signals()
             return
-        if self.spoken > GRACE:
-            self._speaking = False
+        if self.answered > TAKEOVER_CYCLES:
+            self._sending = False
             self.displaced = True
-        self._other_at = self.spoken
+        self._other_at = self.answered
 
-    def _take_over(self) -> None:
-        """Copy the signals of the other pendant, so that the HAL gets the same state from this one."""
+    def _copy_signals(self) -> None:
+        """Copy the signals of the other pendant. The HAL then receives the same values from both pendants."""
         for name, index in self._at.items():
             self._tx.values[index] = self._received.values[self._received_index[name]]
 
     def _answer(self) -> None:
-        if self.spoken == GRACE and self._other_at > GRACE - SILENT:
-            self._speaking = False
-            self.refused = True
+        if self.answered == TAKEOVER_CYCLES and self._other_at > TAKEOVER_CYCLES - QUIET_CYCLES:
+            self._sending = False
+            self.takeover_failed = True
             return
         self._send(self._tx.seal(int(self._received.values[self._cycle_at]) & 0xFF))
-        if self.spoken % self._status_cycles == 0:
-            self._status.values[self._uptime_at] = self.spoken * PERIOD
+        if self.answered % self._status_cycles == 0:
+            self._status.values[self._uptime_at] = self.answered * PERIOD
             self._send(self._status.seal())
-        self.spoken += 1
+        self.answered += 1
 
     def _send(self, frames: Frames) -> None:
-        with suppress(BusFull):  # the HAL detects a missing frame by its timeout
+        with suppress(BusFull):  # the HAL detects missing frames by a timeout
             self._bus.send(frames)

@@ -1,4 +1,7 @@
-"""Session of a pendant at a terminal: `keyboard and HAL state -> Session -> PendantNode`, with messages to the user."""
+"""Session of a pendant at a terminal: runs a pendant node, reads the keyboard and prints messages for the user.
+
+keyboard and HAL state -> Session -> PendantNode
+"""
 
 from __future__ import annotations
 
@@ -16,26 +19,26 @@ from atalante_tools.console.stop_request import StopRequest
 from atalante_tools.console.terminal import say
 from atalante_tools.session.pendant_node import PendantNode, Request
 
-#: Shortest listening time for another pendant before sending [s].
+#: Shortest time in which a new pendant listens for another pendant before it sends [s].
 LISTEN: Final = 0.05
-#: Smallest number of SYNCs received while listening, for machines slower than real time.
+#: Smallest number of SYNCs that a new pendant must receive before it sends.
 LISTEN_CYCLES: Final = 3
-#: Time without a SYNC after which no HAL is assumed [s].
-NO_HAL: Final = 1.0
-#: Longest wait for a frame before stop request and keyboard are checked [s].
-LOOK_UP: Final = 0.02
+#: Timeout of SYNC [s]. After it, the HAL counts as absent.
+HAL_TIMEOUT: Final = 1.0
+#: Longest wait for a frame [s]. After it, stop request and keyboard are checked.
+POLL_TIMEOUT: Final = 0.02
 #: Number of SYNCs that `pendant stop` and `pendant hold` answer.
-SAY: Final = 500
+PRESS_SYNCS: Final = 500
 #: Number of SYNCs answered with STOP at the end of `pendant start` and `pendant xi`.
-SAY_STOP: Final = 20
-#: Number of SYNCs answered after the dead-man switch is released.
-SAY_RELEASED: Final = 5
-#: Number of cycles after START within which a healthy robot becomes ACTIVE.
-STARTED_BY: Final = 400
+STOP_SYNCS: Final = 20
+#: Number of SYNCs answered with a released dead-man switch at the end of `pendant start` and `pendant xi`.
+RELEASE_SYNCS: Final = 5
+#: Longest normal time from START to ACTIVE [cycles].
+START_TIMEOUT: Final = 400
 
 
 class Session:
-    """Session of one pendant node, controlled by the keyboard."""
+    """Session of one pendant node at a terminal. Commands from the keyboard control the node."""
 
     def __init__(
         self,
@@ -50,55 +53,55 @@ class Session:
         self.start_wanted = False
         self._target, self._keyboard, self._now = target, keyboard, now
         self._begun = self._synced_at = now()
-        self._hal_there = True
+        self._hal_present = True
         self._hal: object = None
         self._pressed_at: int | None = None
 
     def listen(self) -> None:
-        """Listen for a HAL and for another pendant, without sending."""
+        """Listen for SYNC of a HAL and for frames of another pendant, without sending."""
         begun = self._now()
         while not self.stop.wanted:
-            self.node.poll(LOOK_UP)
+            self.node.poll(POLL_TIMEOUT)
             listened = self._now() - begun
-            if listened >= NO_HAL or (listened >= LISTEN and self.node.cycles >= LISTEN_CYCLES):
+            if listened >= HAL_TIMEOUT or (listened >= LISTEN and self.node.cycles >= LISTEN_CYCLES):
                 return
 
-    def take(self) -> None:
-        """Take over from another pendant if there is one, press the dead-man switch and start to send."""
+    def take_over(self) -> None:
+        """Copy the signals of another pendant if one sends. Then press the dead-man switch and start sending."""
         self.listen()
         say(
             f"taking over from another pendant on {self._target}"
-            if self.node.heard_another
+            if self.node.found_another
             else "the pendant is active"
         )
         self.node.dead_man = True
-        self.node.speak()
+        self.node.start_sending()
 
-    def speak_for(self, cycles: int) -> None:
+    def answer_syncs(self, count: int) -> None:
         """Answer a number of SYNCs.
 
         It ends early if the HAL stops sending, another pendant takes over, or a signal arrives.
 
         Args:
-            cycles: Number of SYNCs to answer.
+            count: Number of SYNCs to answer.
         """
-        wanted = self.stop.wanted
-        last, received_at = self.node.spoken + cycles, self._now()
-        while self.node.spoken < last and not (self.node.displaced or self.node.refused):
-            if self.node.poll(LOOK_UP):
+        stopping = self.stop.wanted
+        last, received_at = self.node.answered + count, self._now()
+        while self.node.answered < last and not (self.node.displaced or self.node.takeover_failed):
+            if self.node.poll(POLL_TIMEOUT):
                 received_at = self._now()
-            elif self._now() - received_at > NO_HAL:
+            elif self._now() - received_at > HAL_TIMEOUT:
                 return
-            if self.stop.wanted and not wanted:
+            if self.stop.wanted and not stopping:
                 return
 
-    def stay(self, seconds: float | None) -> None:
-        """Answer SYNCs until a signal arrives, another pendant takes over, or the time is over; then press STOP.
+    def run(self, seconds: float | None) -> None:
+        """Answer each SYNC until the time is over, a signal arrives, or another pendant takes over. Then press STOP.
 
-        After a takeover STOP is not pressed.
+        STOP is not pressed after a takeover by another pendant.
 
         Args:
-            seconds: Duration [s]; None: until a signal arrives.
+            seconds: Duration [s]. None: until a signal arrives.
 
         Raises:
             Failed: If the older pendant keeps sending.
@@ -106,38 +109,38 @@ class Session:
         node = self.node
         self._begun = self._now()
         while not self.stop.wanted and (seconds is None or self._elapsed() < seconds):
-            if node.poll(LOOK_UP):
-                self._follow()
-            elif self._hal_there and self._now() - self._synced_at > NO_HAL:
-                self._hal_there = False
+            if node.poll(POLL_TIMEOUT):
+                self._react_to_sync()
+            elif self._hal_present and self._now() - self._synced_at > HAL_TIMEOUT:
+                self._hal_present = False
                 say(f"no SYNC received on {self._target}: waiting for a HAL")
             if node.displaced:
                 say("another pendant has taken over")
                 return
-            if node.refused:
-                raise Failed("another pendant keeps sending: use that pendant, or end it first")
+            if node.takeover_failed:
+                raise Failed("another pendant must stop sending, but it still sends: use that pendant, or end it first")
             for line in self._keyboard.lines():
-                self.typed(line)
-        self.put_down()
+                self.execute(line)
+        self.press_stop()
 
     def _elapsed(self) -> float:
-        """Return the time since the start [s]: robot time after the first answered SYNC, wall-clock time before."""
-        return self.node.spoken * PERIOD if self.node.spoken else self._now() - self._begun
+        """Return the time since the start [s]. It counts cycles after the first answered SYNC, and wall-clock time before."""
+        return self.node.answered * PERIOD if self.node.answered else self._now() - self._begun
 
-    def put_down(self) -> None:
-        """Press STOP, then release the dead-man switch."""
+    def press_stop(self) -> None:
+        """Press STOP for some cycles, then release the dead-man switch."""
         self.node.press(Request.STOP)
-        self.speak_for(SAY_STOP)
+        self.answer_syncs(STOP_SYNCS)
         self.node.dead_man = False
-        self.speak_for(SAY_RELEASED)
+        self.answer_syncs(RELEASE_SYNCS)
         if self.node.hal is not None:
             say(f"STOP: the HAL is {self.node.hal.name}")
 
-    def typed(self, line: str) -> None:
-        """Execute a command line of the operator.
+    def execute(self, line: str) -> None:
+        """Execute a command that the operator typed.
 
         Args:
-            line: start, stop, hold, or xi with a factor from 0 to 1.
+            line: Typed line: start, stop, hold, or xi with a factor from 0 to 1.
         """
         word, *arguments = line.lower().split() or [""]
         if word in ("start", "stop", "hold") and not arguments:
@@ -151,10 +154,10 @@ class Session:
         elif word:
             say(f"a command must be start, stop, hold or xi X with X from 0 to 1, got {line.strip()!r}")
 
-    def _follow(self) -> None:
-        """Print a new state of the HAL, and press START when it is due."""
+    def _react_to_sync(self) -> None:
+        """Print a change of the HAL state, and press START if the session wants to start and the HAL is ready for it."""
         node = self.node
-        self._synced_at, self._hal_there = self._now(), True
+        self._synced_at, self._hal_present = self._now(), True
         if node.hal is not self._hal and node.hal is not None:
             self._hal = node.hal
             say(f"the HAL is {node.hal.name}")
@@ -162,35 +165,35 @@ class Session:
                 say("each START changes the state once; type start to press START again")
             self._pressed_at = None
         startable = node.hal in (SupervisorState.READY, SupervisorState.HOLD)
-        # The HAL ignores requests until it has received `REQUALIFY` valid frames of the pendant.
-        if self.start_wanted and startable and node.spoken > REQUALIFY:
+        # The HAL ignores requests until it received `REQUALIFY` consecutive valid frames of the pendant.
+        if self.start_wanted and startable and node.answered > REQUALIFY:
             self.start_wanted = False
             self._pressed_at = node.cycles
             node.press(Request.START)
             say("START pressed")
-        elif self._pressed_at is not None and node.cycles - self._pressed_at > STARTED_BY:
+        elif self._pressed_at is not None and node.cycles - self._pressed_at > START_TIMEOUT:
             self._pressed_at = None
             say("the HAL did not become ACTIVE, see its event log; type start to press START again")
 
 
 class Keyboard:
-    """Non-blocking reader of typed lines from a file descriptor; with None it returns no lines."""
+    """Non-blocking reader of typed lines from a file descriptor. Without a file descriptor it returns no lines."""
 
     def __init__(self, file: int | None) -> None:
         self._file = file
-        self._begun = b""
+        self._partial = b""
 
     def lines(self) -> list[str]:
-        """Return the complete lines typed since the last call."""
+        """Return the complete lines that the user typed since the last call."""
         if self._file is None or not select.select([self._file], (), (), 0.0)[0]:
             return []
-        # The system suspends a background process that reads from the terminal.
+        # Linux would suspend a background process that reads from the terminal.
         if os.isatty(self._file) and os.tcgetpgrp(self._file) != os.getpgrp():
             return []
         typed = os.read(self._file, 4096)
         if not typed:
             self._file = None
-        *lines, self._begun = (self._begun + typed).split(b"\n")
+        *lines, self._partial = (self._partial + typed).split(b"\n")
         return [line.decode(errors="replace") for line in lines]
 
 

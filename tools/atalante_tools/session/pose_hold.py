@@ -1,4 +1,4 @@
-"""Controller of `jog` and `vibrate`: holds the pose measured at the start, and moves one joint to a target angle."""
+"""Controller of `atalante jog` and `atalante vibrate`: holds the initial pose, and moves one joint to a target angle."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ from atalante_hal.robot import IMUS, JOINTS, MOTORS, Robot
 from atalante_hal.types import PERIOD, Command, State, Vector
 
 _PELVIS: Final = IMUS.index("pelvis")
-#: Peak over mean speed of the minimum-jerk profile: s'(1/2).
+#: Ratio of peak speed to mean speed of the minimum-jerk profile: ds/dx at x = 1/2.
 PEAK: Final = 15.0 / 8.0
 
 
 @dataclass(frozen=True)
 class Move:
-    """Move of one joint to an angle, along the minimum-jerk profile."""
+    """Motion of one joint to a target angle, along the minimum-jerk profile."""
 
     joint: int  # index in JOINTS
-    target: float  # target angle, rad
-    speed: float  # peak speed, rad/s
+    target: float  # target angle [rad]
+    speed: float  # peak speed [rad/s]
 
 
 def minimum_jerk(phase: float) -> tuple[float, float]:
-    """Return the minimum-jerk profile and its derivative: s = 10 x^3 - 15 x^4 + 6 x^5 (Flash and Hogan, 1985).
+    """Return the minimum-jerk profile s = 10 x^3 - 15 x^4 + 6 x^5 and its derivative (Flash and Hogan, 1985).
 
     Args:
-        phase: Time divided by the duration of the move; clipped to 0 to 1.
+        phase: Time divided by the duration of the move, x. It is clipped to 0 to 1.
 
     Returns:
-        Covered share of the distance, 0 to 1, and its derivative with respect to the phase.
+        Ratio s of covered distance to whole distance, 0 to 1, and its derivative ds/dx.
     """
     x = min(max(phase, 0.0), 1.0)
     return x**3 * (10.0 + x * (6.0 * x - 15.0)), 30.0 * (x * (1.0 - x)) ** 2
 
 
 class PoseHold:
-    """PD controller with the hold gains of the robot, plus gravity compensation of the suspended empty exoskeleton.
+    """PD controller with gravity compensation. It holds a pose with the hold gains of the robot.
 
     Attributes:
         telemetry: Reference angles, shape (12,) [rad].
@@ -52,12 +52,12 @@ class PoseHold:
     telemetry_fields: Sequence[tuple[str, int]] = (("reference", len(JOINTS)),)
 
     def __init__(self, robot: Robot, *, move: Move | None = None, vibration: Vector | None = None) -> None:
-        """Prepare the controller.
+        """Load the dynamics model and set the motion.
 
         Args:
-            robot: Robot with the hold gains.
-            move: Move of one joint; None: hold all joints.
-            vibration: Level of each motor, shape (8,), 0 to 1; None: all off.
+            robot: Hold gains and joint limits of the robot.
+            move: Motion of one joint. None: hold all joints.
+            vibration: Level of each vibration motor, shape (8,), 0 to 1. None: all motors are off.
         """
         self._robot, self._move = robot, move
         self._gravity = Gravity(pinocchio_model(urdf(ExoskeletonParameters(), robot)))
@@ -69,7 +69,7 @@ class PoseHold:
         self.telemetry = np.zeros_like(robot.hold_kp)
 
     def reset(self, state: State) -> None:
-        """Take the measured pose as the reference, and start the move from it.
+        """Set the reference to the measured pose, and start the motion there.
 
         Args:
             state: Measured state of the robot.
@@ -81,7 +81,7 @@ class PoseHold:
             self.duration = PEAK * abs(self._move.target - self._from) / self._move.speed
 
     def update(self, state: State) -> Command:
-        """Return the torque and vibration command of one cycle.
+        """Compute the torque and vibration command of one cycle.
 
         Args:
             state: Measured state of the robot.

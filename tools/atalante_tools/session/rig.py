@@ -1,8 +1,9 @@
-"""Rig of a run: `target -> buses -> Hal`, with an emulated robot when the target is embedded.
+"""Setup of a run: opens the buses of a target and creates the HAL. For an embedded target it also creates the emulated robot.
 
-The HAL code path is the same for every target: an embedded robot differs from a real one only in the bus. It runs in this
-process, where tests can inspect the emulator, or in a subprocess, where its physics runs in parallel with the HAL. The bytes on
-the bus are the same.
+    target -> buses -> Hal -> Rig
+
+The HAL runs the same code for every target. An embedded robot runs in this process, or in a subprocess in parallel with the
+HAL. The bytes on the bus are the same in all cases.
 """
 
 from __future__ import annotations
@@ -37,21 +38,21 @@ if TYPE_CHECKING:
     from atalante_emulator.faults import Fault
     from atalante_emulator.pendant import Operator
 
-#: Longest wait for the answers to a SYNC on the wall clock: half a cycle [s].
+#: Timeout of the answers to a SYNC on the wall clock: half a cycle [s].
 PATIENCE: Final = 0.5e-3
-#: Longest wait for the answers to a SYNC in lock-step, long enough for a slow machine [s].
+#: Timeout of the answers to a SYNC in lock-step, for slow computers [s].
 LOCKSTEP_PATIENCE: Final = 2.0
 
 
 @dataclass
 class Rig:
-    """HAL on its bus.
+    """HAL with its open bus, and the emulated robot if it runs in this process.
 
     Attributes:
         target: Bus and clock.
-        hal: The HAL.
-        emulator: Emulator of a robot embedded in this process; None: any other robot.
-        operator: Emulated operator of that robot; None: any other robot.
+        hal: HAL of the run.
+        emulator: Emulator of a robot in this process. None: the robot is in another process or real.
+        operator: Emulated operator of a robot in this process. None: the robot is in another process or real.
     """
 
     target: Target
@@ -62,21 +63,21 @@ class Rig:
     def run(
         self, controller: Controller, *, until: Callable[[State], bool], record: Callable[[], None] = lambda: None
     ) -> Statistics:
-        """Run the loop on the clock of the target. It ends in HOLD.
+        """Run the control loop on the clock of the target. The run ends in HOLD.
 
-        On the wall clock the process requests real-time priority and locked memory. A signal makes the HAL refuse every START
-        and change to HOLD; further signals do not interrupt this. `until` must read the stop request.
+        On the wall clock, the process requests real-time priority and locked memory. After a stop signal, the HAL rejects every
+        START and changes to HOLD. Further signals do not interrupt this. `until` must read the stop request.
 
         Args:
-            controller: Controller that is updated in every cycle.
+            controller: Controller that computes the command of every cycle.
             until: End condition, called with the state after every cycle.
-            record: Called after every cycle, to record it.
+            record: Function called after every cycle to record it.
 
         Returns:
             Statistics of the loop.
 
         Raises:
-            Stopped: If a signal arrived before the run; the robot was not driven.
+            Stopped: If a signal arrived before the run. The robot then did not move.
         """
         with ended_by(self.hal.end) as stop:
             stop.check()
@@ -104,33 +105,33 @@ def open_hal(
     robot_process: EmbeddedRobot | None = None,
     exoskeleton: ExoskeletonParameters | None = None,
 ) -> Iterator[Rig]:
-    """Open the buses, create the HAL and, for an embedded target, the emulated robot. Close everything after the block.
+    """Open the buses and create the HAL. For an embedded target, also create the emulated robot. Close them after the block.
 
     Args:
         target: Bus and clock.
-        network: Network; None: read from the project's DBC.
-        robot: Robot parameters; None: read from the project's file.
+        network: Nodes and messages. None: read from the DBC of the project.
+        robot: Robot parameters. None: read from the robot file of the project.
         seed: Seed of the sensor noise of the embedded robot.
-        pose: Initial joint angles of the embedded robot, shape (12,) [rad]; None: all zero.
-        operator: Emulated operator of the embedded robot; None: one that presses START as soon as the HAL is READY.
+        pose: Initial joint angles of the embedded robot, shape (12,) [rad]. None: all zero.
+        operator: Emulated operator of the embedded robot. None: an operator who presses START when the HAL is in READY.
         assistance_factor: Initial assistance factor Xi, 0 to 1.
         controller_fields: Name and size of each telemetry field of the controller.
         gait_hash: Hash of the gait that the HAL reports.
-        tap: Recorder of all frames; None: frames are not recorded.
+        tap: Recorder of all frames. None: frames are not recorded.
         faults: Faults to inject into the embedded robot.
-        robot_process: Subprocess that runs the embedded robot and is closed after the block. Its operator presses START as soon
-            as the HAL is READY. None: the embedded robot runs in this process.
-        exoskeleton: Geometry and masses of the embedded robot; None: default leg lengths.
+        robot_process: Subprocess for the embedded robot, which is closed after the block. Its operator presses START when the
+            HAL is in READY. None: the embedded robot runs in this process.
+        exoskeleton: Geometry and masses of the embedded robot. None: default leg lengths.
 
     Raises:
         ValueError: If both `operator` and `robot_process` are given.
-        FaultError: If a fault names a target or signal that the network does not have.
+        FaultError: If the network does not have the target or a signal of a fault.
         BusError: If a bus cannot be opened, or another HAL uses it.
         ChannelMapError: If the channel map is invalid.
         Failed: If the embedded robot needs PyBullet and it is not installed.
         Stopped: If a signal arrived before or during the start.
     """
-    check_stop()  # the exception of a signal may have been lost during imports
+    check_stop()  # an import may have discarded the exception of a signal
     network = network or atalante_dbc.load()
     robot = robot or load_robot()
     with ExitStack() as stack:
@@ -139,7 +140,7 @@ def open_hal(
             stack.enter_context(robot_process)
             if operator is not None:
                 raise ValueError(
-                    "operator must be None for a robot in a subprocess, which creates its own: remove `operator`"
+                    f"operator must be None for a robot in a subprocess, got {operator!r}: the subprocess has its own operator"
                 )
             robot_process.begin(SpawnConfig(network, robot, describe(robot, exoskeleton), pose, seed, faults))
             bus: Bus = robot_process.bus
@@ -173,7 +174,7 @@ def open_hal(
 
 
 def open_buses(network: Network, target: Target) -> dict[str, Bus]:
-    """Open the bus of each name in `network.buses`.
+    """Open all buses of the network, and return them by name.
 
     Args:
         network: Network with the bus names.
@@ -187,21 +188,21 @@ def open_buses(network: Network, target: Target) -> dict[str, Bus]:
 
 
 def join(network: Network, buses: dict[str, Bus]) -> Bus:
-    """Return one bus that sends and receives on all buses.
+    """Combine the open buses into one bus object, which sends and receives on all of them.
 
     Args:
-        network: Network that assigns messages to buses.
-        buses: Open bus of each name; the same object if several names share a channel.
+        network: Nodes and messages. Each message is assigned to a bus.
+        buses: Bus name -> open bus. Several names may share one bus object.
     """
     first, *others = {id(bus): bus for bus in buses.values()}.values()
     return JoinedBus(network, buses) if others else first
 
 
 class Watch:
-    """End condition of a run, called once per cycle. It prints the progress, or what the run is waiting for.
+    """End condition of a run, called once per cycle. It also prints a progress line.
 
-    A run ends when `done(state)` returns True while ACTIVE, when a signal arrives, or when the robot leaves ACTIVE or is in
-    FAULT. After the run `conclude` raises an error unless the run ended by `done`.
+    A run ends if `done(state)` returns True in ACTIVE, if a signal arrives, if the robot leaves ACTIVE, or if the robot is in
+    FAULT. After the run, `conclude` raises an error unless `done` ended the run.
     """
 
     def __init__(
@@ -214,7 +215,7 @@ class Watch:
         self._state, self._reason = SupervisorState.OFF, ""
 
     def __call__(self, state: State) -> bool:
-        """Return whether the run is over.
+        """Return whether the run is over. Print the progress line if it is due.
 
         Args:
             state: State of the robot after a cycle.
@@ -238,7 +239,7 @@ class Watch:
         return over
 
     def conclude(self) -> None:
-        """End the command with an error unless the run was completed.
+        """End the command with an error unless `done` ended the run.
 
         Raises:
             SystemExit: If a signal ended the run, with its exit code.
@@ -255,10 +256,10 @@ class Watch:
 
 
 def waiting_for(rig: Rig) -> str:
-    """Return what the run is waiting for before ACTIVE, with the command to type.
+    """Return the condition that the robot still waits for before ACTIVE, with the command that the user must type.
 
     Args:
-        rig: Rig whose robot is not ACTIVE yet.
+        rig: Rig of the run.
     """
     hal, target = rig.hal, rig.target
     if hal.state.supervisor is SupervisorState.OFF:

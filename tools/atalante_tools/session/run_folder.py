@@ -1,4 +1,4 @@
-"""Folder of a run of `atalante demo` or `airwalk`: locked during the run, summary and figure written at its end.
+"""Output folder of `atalante demo` and `atalante airwalk`. It is locked during a run and gets summary and figure at its end.
 
 results -> table, summary.json; recording -> figure
 """
@@ -23,16 +23,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Result:
-    """Result of one guide shape. The field names are the keys of `--json` and of summary.json."""
+    """Result of one guide shape. The field names are the JSON keys of `--json` and of summary.json.
+
+    `max_ratio`, `inside` and `filter_active` are measured after the first completed step.
+    """
 
     shape: str
-    certified: bool  # whether the guide is certified on the model at every assistance factor of the run
-    bound_hip_nm: float | None  # torque tolerated at the hip together with bound_knee_nm; None: not certified
-    bound_knee_nm: float | None  # the same at the knee
+    certified: bool  # whether the guide has a certificate at every assistance factor of the run
+    bound_hip_nm: (
+        float | None
+    )  # certified disturbance at the hip, simultaneous with the knee [Nm]. None: not certified.
+    bound_knee_nm: (
+        float | None
+    )  # certified disturbance at the knee, simultaneous with the hip [Nm]. None: not certified.
     steps: int  # number of completed right-stance steps
-    max_ratio: float  # largest |e| / q_bound after the first completed step
-    inside: float  # share of that time with both assisted joints inside the guide, 0 to 1
-    filter_active: float  # share of that time with an active filter, 0 to 1
+    max_ratio: float  # largest ratio of tracking error to guide width, |e| / q_bound
+    inside: float  # share of the time with both assisted joints inside the guide, 0 to 1
+    filter_active: float  # share of the time with an active guide filter, 0 to 1
     cycles: int
     real_time_factor: float
     frames: int
@@ -41,9 +48,9 @@ class Result:
 
 @contextmanager
 def run_folder(out: Path) -> Iterator[None]:
-    """Create the folder and lock it, because two runs must not write the same files.
+    """Create the folder of a run and lock it during the block. The lock prevents a second run in the same folder.
 
-    A new folder that is still empty after the block is removed.
+    If the folder is new and still empty after the block, it is removed.
 
     Args:
         out: Path of the folder.
@@ -60,7 +67,7 @@ def run_folder(out: Path) -> Iterator[None]:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise Failed(
-                f"another run is writing into {out}: wait for its end, or choose another folder with --out"
+                f"another run writes into {out}: wait for its end, or choose another folder with --out"
             ) from None
         yield
     finally:
@@ -69,23 +76,23 @@ def run_folder(out: Path) -> Iterator[None]:
             out.rmdir()
 
 
-def leave(out: Path, asked: Mapping[str, Any], results: Sequence[Result], recording: Recording) -> None:
-    """Write summary.json and the figure, and print the names of all files.
+def write_summary(out: Path, options: Mapping[str, Any], results: Sequence[Result], recording: Recording) -> None:
+    """Write summary.json and the figure, and print the names of all files in the folder of the run.
 
     Args:
         out: Folder of the run.
-        asked: Options of the user; the first keys of the summary.
-        results: Results, one per shape.
+        options: Options of the user. They are the first keys of the summary.
+        results: One result per guide shape.
         recording: Recording files, and whether they contain every cycle.
     """
-    summary = {**asked, "recording": asdict(recording), "shapes": [asdict(result) for result in results]}
+    summary = {**options, "recording": asdict(recording), "shapes": [asdict(result) for result in results]}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     figure = _figure(out)
     say(f"in {out}: {', '.join([*recording.files, 'summary.json', *([figure] if figure else [])])}")
 
 
 def _figure(out: Path) -> str:
-    """Draw the figure and return its name, or print why there is none and return an empty string."""
+    """Draw the figure and return its file name. If it cannot be drawn, print the reason and return an empty string."""
     name = "guide_shapes.png"
     try:
         from mcap.exceptions import McapError
@@ -106,7 +113,7 @@ def results_table(results: Sequence[Result]) -> str:
     """Return the results as a table for the terminal.
 
     Args:
-        results: Results, one per shape.
+        results: One result per guide shape.
     """
     head = ["shape", "certified", "bound hip Nm", "bound knee Nm", "steps", "max |e|/q_bound", "inside %", "filter active %",
             "cycles", "x real time", "frames", "CRC errors"]  # fmt: skip
@@ -116,7 +123,7 @@ def results_table(results: Sequence[Result]) -> str:
             "yes" if r.certified else "NO",
             *("-" if bound is None else f"{bound:.2f}" for bound in (r.bound_hip_nm, r.bound_knee_nm)),
             str(r.steps),
-            *_judged(r),
+            *_tracking_cells(r),
             str(r.cycles),
             f"{r.real_time_factor:.1f}",
             str(r.frames),
@@ -127,8 +134,8 @@ def results_table(results: Sequence[Result]) -> str:
     return table([head, *rows])
 
 
-def _judged(result: Result) -> tuple[str, str, str]:
-    """Return the three cells of the tracking error, which is measured after the first completed step."""
+def _tracking_cells(result: Result) -> tuple[str, str, str]:
+    """Return the three table cells of the tracking error. The cells are empty unless two steps are complete."""
     if result.steps < 2:
         return "-", "-", "-"
     return f"{result.max_ratio:.2f}", f"{100 * result.inside:.1f}", f"{100 * result.filter_active:.1f}"

@@ -1,12 +1,12 @@
-"""Embedded robot in a subprocess, so that its physics runs in parallel with the HAL and the controller.
+"""Embedded robot in a subprocess. The physics of the robot runs in parallel with the HAL and the controller.
 
     HAL <- SharedBus -> python -m atalante_tools.session.embedded: emulator -> body
 
-The child is a new interpreter in a separate process group. Ctrl-C therefore reaches only the parent, whose loop ends in HOLD and
-then closes the bus. If either process ends, the other detects it on the bus and ends too.
+The subprocess ("child") is a new Python interpreter in a separate process group. Ctrl-C therefore reaches only the parent. The
+loop of the parent ends in HOLD and then closes the bus. If one process ends, the other process detects it on the bus and ends.
 
-The two processes run on different cores. They wait for each other in turn, so the scheduler of the system would otherwise put
-both on one core, where they run several times slower.
+The two processes are assigned to different cores. Otherwise the scheduler of Linux puts both on one core, because they wait
+for each other, and both run several times slower.
 """
 
 from __future__ import annotations
@@ -31,36 +31,36 @@ from atalante_tools.session.body import require_engine
 if TYPE_CHECKING:
     from atalante_emulator.faults import Fault
 
-#: Longest wait for the answer to a SYNC, for the start of the robot, and for the end of the child [s].
+#: Timeouts of the answer to a SYNC, of the start of the robot, and of the end of the child [s].
 _PATIENCE, _START, _END = 2.0, 60.0, 5.0
 
 
 @dataclass(frozen=True)
 class SpawnConfig:
-    """Description of the robot that the child creates; sent through its stdin."""
+    """Description of the robot that the child creates. The parent sends it to the stdin of the child."""
 
     network: Network
     robot: Robot
     urdf: str
-    pose: Sequence[float] | None  # initial joint angles, shape (12,), rad; None: all zero
+    pose: Sequence[float] | None  # initial joint angles, shape (12,) [rad]. None: all zero.
     seed: int
     faults: Sequence[Fault]
 
 
 class EmbeddedRobot(Closing):
-    """Subprocess with the embedded robot; a context manager that closes it after the block.
+    """Subprocess with the embedded robot. Used as a context manager, it is closed after the block.
 
-    Create it early, because the child imports its modules while the parent prepares the run.
+    Create it early: the child imports its modules while the parent prepares the run.
 
     Attributes:
         bus: End of the HAL on the bus to the child.
     """
 
     _open: ClassVar[list[EmbeddedRobot]] = []
-    _cores: ClassVar[set[int]] = set()  # cores of this thread before the first open robot
+    _cores: ClassVar[set[int]] = set()  # processor cores of this thread before the first robot was opened
 
     def __init__(self) -> None:
-        """Start the child.
+        """Start the child process.
 
         Raises:
             Failed: If PyBullet is not installed.
@@ -75,13 +75,13 @@ class EmbeddedRobot(Closing):
             process_group=0,
         )
         self._begun = False
-        os.close(child_bell)  # with a copy left open here, the end of the child could not be detected
+        os.close(child_bell)  # an open copy in the parent would prevent the detection of the end of the child
         self.bus = SharedBus("embedded", memory, parent_bell, 0)
         self.bus.patience = _PATIENCE
         self._part_from_child()
 
     def _part_from_child(self) -> None:
-        """Assign different cores to this thread and the child. All open robots share the cores of the children."""
+        """Assign different processor cores to this thread and to the child. All children share their cores."""
         if not self._open:
             EmbeddedRobot._cores = os.sched_getaffinity(0)
         self._open.append(self)
@@ -94,30 +94,30 @@ class EmbeddedRobot(Closing):
         """Return the process identifier of the child."""
         return self._child.pid
 
-    def begin(self, order: SpawnConfig) -> None:
-        """Send the description to the child, and wait until the robot exists.
+    def begin(self, config: SpawnConfig) -> None:
+        """Send the description of the robot to the child, and wait until the child created the robot.
 
         Args:
-            order: Robot to create.
+            config: Description of the robot to create.
 
         Raises:
-            Failed: If the child cannot create the robot; the message contains the reason.
+            Failed: If the child cannot create the robot. The message contains the reason.
         """
         pipe = self._child.stdin
         assert pipe is not None
         self._begun = True
-        # If the child has already ended, ignore the broken pipe: `meet` below raises `BusDown` with the reason.
+        # The pipe is broken if the child already ended. `meet` then raises `BusDown` with the reason.
         with suppress(BrokenPipeError), pipe:
-            pickle.dump(order, pipe)
+            pickle.dump(config, pipe)
         try:
             self.bus.meet(_START)
         except BusDown as error:
             raise Failed(str(error)) from error
 
     def close(self) -> None:
-        """Close the bus and wait for the end of the child. A second call does nothing.
+        """Close the bus and wait for the end of the child. A second call has no effect.
 
-        Call it from the thread that created this object, because it restores the cores of that thread.
+        Only the thread that created this object may call it, because it restores the cores of that thread.
         """
         self.bus.close()
         if self in self._open:
@@ -125,7 +125,7 @@ class EmbeddedRobot(Closing):
             if not self._open:
                 os.sched_setaffinity(0, self._cores)
         if not self._begun:
-            self._child.kill()  # without a robot the child is still importing, and waiting for it is useless
+            self._child.kill()  # the child did not create a robot yet, so it can be killed
         try:
             self._child.wait(_END)
         except subprocess.TimeoutExpired:
@@ -136,13 +136,13 @@ class EmbeddedRobot(Closing):
 
 
 def halves(cores: set[int]) -> tuple[set[int], set[int]]:
-    """Split processor cores between this thread and the child.
+    """Divide processor cores between this thread and the child.
 
     Args:
-        cores: Available cores.
+        cores: Numbers of the available cores.
 
     Returns:
-        Cores of this thread (the larger half) and cores of the child. Both are the same core if there is only one.
+        Cores of this thread (the larger half) and cores of the child. If there is only one core, both get this core.
     """
     count = (len(cores) + 1) // 2
     first, others = set(sorted(cores)[:count]), set(sorted(cores)[count:])

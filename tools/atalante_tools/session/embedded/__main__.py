@@ -1,6 +1,7 @@
-"""Subprocess of the embedded robot: `python -m atalante_tools.session.embedded MEMORY BELL`, started by `EmbeddedRobot`.
+"""Main program of the subprocess with the embedded robot. `EmbeddedRobot` starts it.
 
-It reads the `SpawnConfig` from stdin; all other communication uses the bus. It ends when the other end of the bus closes.
+Command line: `python -m atalante_tools.session.embedded MEMORY BELL`. The program reads the `SpawnConfig` from stdin. All other
+communication uses the bus. The program ends when the HAL closes the bus.
 """
 
 from __future__ import annotations
@@ -14,30 +15,30 @@ from atalante_hal.bus.shared import SharedBus
 from atalante_tools.session.body import no_banner, open_described
 from atalante_tools.session.embedded import SpawnConfig
 
-with no_banner():  # these slow imports run while the parent prepares the `SpawnConfig`
+with no_banner():  # slow imports, in parallel with the preparations of the parent
     from atalante_emulator.emulator import Emulator
     from atalante_emulator.pendant import Operator
 
 
-def answer(bus: SharedBus, order: SpawnConfig) -> None:
-    """Emulate the robot until the bus is closed.
+def emulate(bus: SharedBus, config: SpawnConfig) -> None:
+    """Create the robot and answer each SYNC of the HAL until the bus is closed.
 
     Args:
-        bus: End of the robot on the bus.
-        order: Robot to create.
+        bus: Bus to the HAL.
+        config: Description of the robot to create.
     """
-    with open_described(order.urdf, order.pose) as body:
+    with open_described(config.urdf, config.pose) as body:
         emulator = Emulator(
-            order.network, order.robot, body, bus, seed=order.seed, operator=Operator(), faults=order.faults
+            config.network, config.robot, body, bus, seed=config.seed, operator=Operator(), faults=config.faults
         )
-        # All objects of this point are needed until the end, so the garbage collector need not scan them again.
+        # All objects that exist now are needed until the end, so the garbage collector need not scan them.
         gc.collect()
         gc.freeze()
         bus.serve(emulator.poll)
 
 
 def main(memory: str, bell: str) -> None:
-    """Create the robot and answer the SYNCs of the HAL.
+    """Read the description of the robot from stdin, and emulate the robot. Report an error to the parent on the bus.
 
     Args:
         memory: File descriptor of the shared memory, as text.
@@ -46,10 +47,10 @@ def main(memory: str, bell: str) -> None:
     bus = SharedBus("the embedded robot's bus", int(memory), int(bell), 1)
     reason = ""
     try:
-        answer(bus, pickle.load(sys.stdin.buffer))
+        emulate(bus, pickle.load(sys.stdin.buffer))
     except (BusDown, EOFError):
-        pass  # the parent has ended, maybe before it sent the `SpawnConfig`
-    except Exception as error:  # noqa: BLE001 - the parent reports every kind of error to the user
+        pass  # the parent ended, possibly before it sent the `SpawnConfig`
+    except Exception as error:  # noqa: BLE001 - the parent shows the error to the user
         reason = f"the robot's process failed with {type(error).__name__}: {error}"
     bus.close(reason)
 
