@@ -4,34 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import deque
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 from atalante_dbc import Message
-from atalante_emulator.haptics import Haptics
+from atalante_emulator.emulator import EmulatorParameters
+from atalante_emulator.haptics import Haptics, HapticsParameters
 from atalante_emulator.pendant import Operator
 from atalante_hal.wire.e2e import COUNTER_BYTE
-from atalante_hal.wire.frame import FLAG_FDF, Frames
-from atalante_tools.conform.requirement import Verdict
+from atalante_hal.wire.frame import FLAG_FDF, Frames, joined
+from atalante_tools.conform.examination import requirements_of
+from atalante_tools.conform.requirement import Verdict, examine
 
-from .conftest import (
-    NO_FRAME,
-    MakeSetup,
-    NodeSetup,
-    Reading,
-    is_good,
-    no_crc,
-    no_data_id,
-    no_length,
-    no_repetition,
-    not_passed,
-    protect,
-    put,
-    raw,
-    receive_as,
-)
+from . import wire
+from .conftest import MakeSetup, NodeSetup, not_passed, receive_as
 
 Patch = pytest.MonkeyPatch
 Break = Callable[[MakeSetup, Patch], NodeSetup]
@@ -73,27 +62,27 @@ def _sends(kind: str, change: Callable[[Frames, Message, int], Frames | None], n
 
 
 def _never_booting(frame: Frames, message: Message, _: int) -> Frames:
-    put(frame, message, "NodeState", 5)
-    return protect(frame, message)
+    wire.put(frame, message, "NodeState", 5)
+    return wire.protect(frame, message)
 
 
 def _every_other(frame: Frames, message: Message, number: int) -> Frames:
     if number > 1 and number % 2:
-        return NO_FRAME
-    return protect(frame, message, counter=number if number < 2 else number // 2 + 1)
+        return wire.NO_FRAME
+    return wire.protect(frame, message, counter=number if number < 2 else number // 2 + 1)
 
 
 def _one_missing(frame: Frames, _message: Message, number: int) -> Frames:
     """Drop one answer, 0.7 s after the start."""
-    return NO_FRAME if number == 700 else frame
+    return wire.NO_FRAME if number == 700 else frame
 
 
 def _counter_slips(frame: Frames, message: Message, number: int) -> Frames | None:
-    return protect(frame, message, counter=0x55) if number == 300 else None
+    return wire.protect(frame, message, counter=0x55) if number == 300 else None
 
 
 def _other_data_id(frame: Frames, message: Message, number: int) -> Frames | None:
-    return protect(frame, message, data_id=message.data_id ^ 1) if number % 1000 == 999 else None
+    return wire.protect(frame, message, data_id=message.data_id ^ 1) if number % 1000 == 999 else None
 
 
 def _no_bit_rate_switch(frame: Frames, _message: Message, _number: int) -> Frames:
@@ -103,7 +92,7 @@ def _no_bit_rate_switch(frame: Frames, _message: Message, _number: int) -> Frame
 
 def _reserved_bits(frame: Frames, message: Message, _: int) -> Frames:
     frame["data"][0][5] = 0xAA
-    return protect(frame, message)
+    return wire.protect(frame, message)
 
 
 def other_network(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
@@ -121,11 +110,11 @@ def raises_an_emergency(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
         nonlocal asked
         asked += 1
         if asked != 150:
-            return NO_FRAME
-        frame = np.zeros(1, NO_FRAME.dtype)
+            return wire.NO_FRAME
+        frame = np.zeros(1, wire.NO_FRAME.dtype)
         frame["can_id"] = message.frame_id
-        put(frame, message, "ErrorCode", 0x5000)
-        return protect(frame, message)
+        wire.put(frame, message, "ErrorCode", 0x5000)
+        return wire.protect(frame, message)
 
     setup.wire.from_node = lambda frame: frame
     setup.wire.unsolicited = once
@@ -133,7 +122,7 @@ def raises_an_emergency(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
 
 
 def sends_without_sync(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
-    last = np.zeros(1, NO_FRAME.dtype)
+    last = np.zeros(1, wire.NO_FRAME.dtype)
 
     def answer(frame: Frames, _message: Message, _number: int) -> None:
         last[:] = frame
@@ -143,8 +132,8 @@ def sends_without_sync(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
 
     def without_sync() -> Frames:
         if setup.wire.sync_sent:
-            return NO_FRAME
-        last[:] = protect(last, message, counter=int(last["data"][0, COUNTER_BYTE]) + 1 & 0xFF)
+            return wire.NO_FRAME
+        last[:] = wire.protect(last, message, counter=int(last["data"][0, COUNTER_BYTE]) + 1 & 0xFF)
         return last.copy()
 
     setup.wire.unsolicited = without_sync
@@ -154,7 +143,7 @@ def sends_without_sync(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
 # -- frames received ---------------------------------------------------------------------------------------------------
 
 
-def _receives(kind: str, change: Reading, node: str = IMU) -> Break:
+def _receives(kind: str, change: wire.Reading, node: str = IMU) -> Break:
     """Return a node that receives a message of the HAL changed by `change`."""
 
     def broken(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
@@ -179,7 +168,7 @@ def overflows_its_queue(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
             foreign += 1
             return frame
         overflow, foreign = foreign > 4, 0
-        return NO_FRAME if overflow else frame
+        return wire.NO_FRAME if overflow else frame
 
     setup.wire.to_node = to_node
     return setup
@@ -275,15 +264,15 @@ def _weak(motors: Haptics, level: np.ndarray, silence: int, cycles: int) -> None
     Haptics.advance(motors, np.minimum(level, 0.96), silence, cycles)
 
 
-def _levels(read: Callable[[list[int]], list[int]]) -> Reading:
+def _levels(read: Callable[[list[int]], list[int]]) -> wire.Reading:
     def change(frame: Frames, message: Message, _: dict) -> Frames | None:
-        if not is_good(frame, message):
+        if not wire.is_good(frame, message):
             return None
         names = [s.name for s in message.signals if s.name.endswith("_Level")]
-        codes = read([raw(frame, message, name) for name in names])
+        codes = read([wire.raw(frame, message, name) for name in names])
         for name, code in zip(names, codes, strict=True):
-            put(frame, message, name, code)
-        return protect(frame, message)
+            wire.put(frame, message, name, code)
+        return wire.protect(frame, message)
 
     return change
 
@@ -341,9 +330,9 @@ BROKEN: dict[str, tuple[Break, str]] = {
     "misses a SYNC": (_sends("STATE", _one_missing), "NODE-04"),
     "emergency at rest": (raises_an_emergency, "NODE-05"),
     "sends without SYNC": (sends_without_sync, "NODE-06"),
-    "no CRC of SYNC": (_receives("SYNC", no_crc), "NODE-07"),
-    "answers a repeated SYNC": (_receives("SYNC", no_repetition), "NODE-08"),
-    "answers any length of SYNC": (_receives("SYNC", no_length), "NODE-09"),
+    "no CRC of SYNC": (_receives("SYNC", wire.no_crc), "NODE-07"),
+    "answers a repeated SYNC": (_receives("SYNC", wire.no_repetition), "NODE-08"),
+    "answers any length of SYNC": (_receives("SYNC", wire.no_length), "NODE-09"),
     "receive queue overflows": (overflows_its_queue, "NODE-10"),
     "counter slips": (_sends("STATE", _counter_slips), "NODE-11"),
     "wrong Data ID sometimes": (_sends("STATE", _other_data_id), "NODE-12"),
@@ -375,10 +364,10 @@ BROKEN: dict[str, tuple[Break, str]] = {
         "HAPTICS-06",
     ),
     "never stops": (_with_motors(_never_stop), "HAPTICS-07"),
-    "no CRC": (_receives("COMMAND", no_crc, "HAPTICS"), "HAPTICS-08"),
-    "no Data ID": (_receives("COMMAND", no_data_id, "HAPTICS"), "HAPTICS-09"),
-    "accepts repeated levels": (_receives("COMMAND", no_repetition, "HAPTICS"), "HAPTICS-10"),
-    "accepts any length": (_receives("COMMAND", no_length, "HAPTICS"), "HAPTICS-11"),
+    "no CRC": (_receives("COMMAND", wire.no_crc, "HAPTICS"), "HAPTICS-08"),
+    "no Data ID": (_receives("COMMAND", wire.no_data_id, "HAPTICS"), "HAPTICS-09"),
+    "accepts repeated levels": (_receives("COMMAND", wire.no_repetition, "HAPTICS"), "HAPTICS-10"),
+    "accepts any length": (_receives("COMMAND", wire.no_length, "HAPTICS"), "HAPTICS-11"),
     "request without a press": (_pendant(Ghost), "PENDANT-01"),
     "dead-man stuck": (_set("DeadMan", 1.0, "PENDANT"), "PENDANT-02"),
     "START bounces": (_pendant(lambda: Bouncing(starts=False)), "PENDANT-03"),
@@ -400,7 +389,92 @@ def test_defective_node_fails_only_its_requirement(name: str, make_setup: MakeSe
 
 
 def test_every_requirement_has_a_defective_node(make_setup: MakeSetup):
-    from atalante_tools.conform.examination import requirements_of
-
     ids = {r.id for node in KINDS for r in requirements_of(make_setup(node).tester)}
     assert {expected for _, expected in BROKEN.values()} == ids
+
+
+# -- bounds: the requirement passes at half of its bound and fails at twice its bound ------------------------------------
+
+
+def _late_heartbeats(delay: Callable[[int], int]) -> Break:
+    """Return a node whose n-th heartbeat is `delay(n)` cycles late."""
+
+    def broken(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
+        del monkeypatch
+        setup = make_setup(IMU)
+        status, state = setup.message("STATUS").frame_id, setup.message("STATE").frame_id
+        cycle, number, waiting = 0, 0, deque[tuple[int, Frames]]()
+
+        def from_node(frame: Frames) -> Frames:
+            nonlocal cycle, number
+            can_id = int(frame["can_id"][0])
+            if can_id == status:
+                number += 1
+                waiting.append((cycle + delay(number), frame.copy()))
+                return wire.NO_FRAME
+            if can_id != state:
+                return frame
+            cycle += 1
+            return joined([frame, *([waiting.popleft()[1]] if waiting and waiting[0][0] <= cycle else [])])
+
+        setup.wire.from_node = from_node
+        return setup
+
+    return broken
+
+
+def _scaled(vector: str, axes: str, factor: float) -> Break:
+    def change(at: Callable[[str], int], _: int, values: np.ndarray) -> None:
+        for axis in axes:
+            values[at(f"{vector}{axis}")] *= factor
+
+    return _measures(change)
+
+
+def _tilted(angle: float) -> Break:
+    """Return an IMU with the acceleration turned about its y axis."""
+    c, s = math.cos(angle), math.sin(angle)
+
+    def change(at: Callable[[str], int], _: int, values: np.ndarray) -> None:
+        x, z = at("AccelX"), at("AccelZ")
+        values[[x, z]] = c * values[x] + s * values[z], c * values[z] - s * values[x]
+
+    return _measures(change)
+
+
+def _offset(signal: str, value: float, node: str = IMU) -> Break:
+    def change(at: Callable[[str], int], _: int, values: np.ndarray) -> None:
+        values[at(signal)] += value
+
+    return _measures(change, node)
+
+
+def _slow_motors(rise_time: float) -> Break:
+    def broken(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
+        del monkeypatch
+        return make_setup("HAPTICS", parameters=EmulatorParameters(haptics=HapticsParameters(rise_time)))
+
+    return broken
+
+
+#: Requirement and the quantity of its bound -> node with a defect of the given multiple of the bound.
+BOUNDS: dict[tuple[str, str], Callable[[float], Break]] = {
+    ("NODE-03", "mean period"): lambda share: _late_heartbeats(lambda number: round(10 * share) * number),
+    ("NODE-03", "single period"): lambda share: _late_heartbeats(lambda number: round(50 * share) * (number == 3)),
+    ("IMU-01", "norm"): lambda share: _scaled("Quaternion", "WXYZ", 1.0 - 1e-3 * share),
+    ("IMU-02", "specific force"): lambda share: _scaled("Accel", "XYZ", 1.0 + 0.3 / 9.81 * share),
+    ("IMU-03", "tilt"): lambda share: _tilted(math.radians(3.0) * share),
+    ("IMU-04", "rate"): lambda share: _offset("GyroY", 0.05 * share),
+    ("FOOT-01", "force"): lambda share: _offset("RL_ForceZ", 10.0 * share, "FOOT_LEFT"),
+    ("HAPTICS-02", "time constant"): lambda share: _slow_motors(0.06 * share),
+}
+
+
+@pytest.mark.parametrize(("share", "verdict"), [(0.5, Verdict.PASSED), (2.0, Verdict.FAILED)])
+@pytest.mark.parametrize(("requirement", "quantity"), BOUNDS)
+def test_a_requirement_passes_at_half_and_fails_at_twice_its_bound(
+    requirement: str, quantity: str, share: float, verdict: Verdict, make_setup: MakeSetup, monkeypatch: Patch
+):
+    tester = BOUNDS[requirement, quantity](share)(make_setup, monkeypatch).tester
+    (result,) = examine(tester, [r for r in requirements_of(tester) if r.id == requirement])
+    assert result.verdict is verdict, result.measured
