@@ -256,7 +256,9 @@ def _pair_table(followed_by: int) -> npt.NDArray[np.uint16]:
 
 
 def crc_of_zeros(length: int, data_id: int) -> int:
-    """Return the CRC of a payload of zeros, to which the contributions of the payload bytes are added.
+    """Return the CRC of a payload whose bytes are all zero.
+
+    The contributions of the payload bytes are added to it (over GF(2)).
 
     Args:
         length: payload length with the CRC, bytes.

@@ -65,7 +65,7 @@ class DriveRules:
         self._plan, self._findings = plan, findings
         self._limit_ns = project.number("cia402-response", "limit_ms") * 1e6
         state, command = project.text("cia402-transition", "state"), project.text("cia402-response", "command")
-        #: Drives of each family of state messages, by the first row of the family.
+        #: Drives with equal state messages (`plan.Family`). The key is the first row of the family.
         self.drives: dict[int, list[_Drive]] = {}
         for family in plan.families:
             index = next((p for p, f in enumerate(family.codec.fields) if f.name == state), None)

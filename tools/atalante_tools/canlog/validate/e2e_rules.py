@@ -34,7 +34,7 @@ class CrcRules:
     def __init__(self, plan: Plan, findings: Findings) -> None:
         self._plan, self._findings = plan, findings
         lengths = np.where(plan.protected, plan.lengths, 0)
-        #: Range of rows of the protected messages of each payload length.
+        #: Rows of the protected messages, as one range per payload length.
         self._spans = [
             range(int(r[0]), int(r[-1]) + 1) for n in np.unique(lengths[lengths > 0]) for r in [_at(plan, n)]
         ]
@@ -98,7 +98,7 @@ def _at(plan: Plan, length: int) -> npt.NDArray[np.intp]:
 
 
 class Counters:
-    """Alive counters of all messages, with the last counter of each message."""
+    """Calculator of alive counter steps, which stores the last counter of each message."""
 
     def __init__(self, plan: Plan) -> None:
         self._protected = plan.protected

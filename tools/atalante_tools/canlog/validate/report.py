@@ -20,7 +20,7 @@ _NAMES = 12
 
 @dataclass(frozen=True)
 class Report:
-    """Result of one log or live bus."""
+    """Result of the check of one log or one live bus."""
 
     name: str  # name of the log or the bus
     validator: Validator

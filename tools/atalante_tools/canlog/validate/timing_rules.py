@@ -61,7 +61,7 @@ class TimingRules:
         return bool(self._arrived[row] != _NEVER)
 
     def arrived(self, rows: Rows, stamps: npt.NDArray[np.int64]) -> None:
-        """Record the arrival of rejected frames.
+        """Store the arrival times of rejected frames.
 
         Args:
             rows: row of each frame, shape (k,).
