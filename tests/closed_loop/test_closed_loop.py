@@ -1,4 +1,4 @@
-"""The whole stack closed over a bus: one behaviour class, one subclass a bus that only says how the two ends meet.
+"""Closed loop of HAL, controller and emulator: the same test on each bus; a subclass per bus connects the two ends.
 
 The SocketCAN subclass is in tests/vcan, where the emulator is a process of its own.
 """
@@ -29,21 +29,21 @@ from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import DriveState
 
 S = SupervisorState
-#: A short way to the first pose: what these tests want is the steps.
+#: Short motion to the first pose, because these tests are about the steps.
 CONFIG = AirwalkConfig(startup=0.5)
 
 
 class ClosedLoop:
-    """A right-stance step and a half, from switched off to HOLD."""
+    """One and a half steps, from OFF to HOLD."""
 
-    #: s, longest wait for the nodes' answers; lock-step, so a slow machine only takes longer.
+    #: Longest wait for the frames of the nodes [s]. In lock-step, a slow machine only takes longer.
     patience = 5.0
     until_phase = 1.5  # steps
 
     @pytest.fixture
     def bus(self) -> Iterator[Bus]:
-        """The HAL's end; the emulator with an operator at Xi = 0.5 answers at the other."""
-        raise NotImplementedError("a subclass says how the ends meet")  # pragma: no cover
+        """The end of the HAL; the emulator with an operator at Xi = 0.5 is at the other end."""
+        raise NotImplementedError("a subclass connects the ends")  # pragma: no cover
 
     @pytest.fixture
     def walked(self, bus: Bus, network: Network, robot: Robot) -> Any:
@@ -68,7 +68,7 @@ class ClosedLoop:
         assert controller.statistics.steps == 1, hal.reason
         assert [e.code for e in hal.events if e.code in S.__members__] == ["READY", "ACTIVE", "HOLD"]
         assert hal.crc_errors == 0
-        # Tracking: every joint near its reference, the assisted ones inside the guide.
+        # Every joint follows its reference, and the assisted joints are inside the guide.
         walking = active & (column["controller.phase"][:, 0] > 0)
         off = np.abs(column["position"] - column["controller.q_des"])[walking]
         assert math.degrees(off.max()) < 6.0
@@ -77,7 +77,7 @@ class ClosedLoop:
         assert (column["assistance_factor"][active] == 0.5).all()
         assert (np.abs(column["torque_command"]) <= hal.robot.torque_max).all()
         assert (column["drive_state"][active] == DriveState.OPERATION_ENABLED).all()
-        # The motion is a walk and not a robot that stands still.
+        # The robot walks: its left knee bends by more than 30 degrees.
         assert math.degrees(np.ptp(column["position"][active][:, 3])) > 30.0
         assert hal.state.supervisor is S.HOLD
         assert (hal.state.drive_state == DriveState.QUICK_STOP_ACTIVE).all()

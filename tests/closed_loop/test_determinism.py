@@ -1,4 +1,4 @@
-"""One seed, one sequence of bytes: on the bus, whatever else the machine does, and in whatever process the robot is."""
+"""Determinism: one seed gives one sequence of frames, in one process or in two."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from atalante_tools.session.rig import open_hal
 
 
 class Log:
-    """Every byte of every frame, in order."""
+    """Tap that keeps identifier and data of every frame, in order."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -56,7 +56,7 @@ def log_of(network, robot):
     return walk
 
 
-def test_one_seed_gives_the_same_bytes_and_another_does_not(log_of):
+def test_same_seed_gives_the_same_frames_and_another_seed_does_not(log_of):
     first = log_of(7)
     assert len(first) > 1400 * 20 * 12
     assert log_of(7) == first

@@ -1,4 +1,4 @@
-"""Gravity of the hanging exoskeleton against Pinocchio asked another way."""
+"""Gravity torque of the suspended exoskeleton, compared with Pinocchio's generalized gravity."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MODEL = pinocchio_model(URDF)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 
-def test_gravity_of_a_level_pelvis_is_pinocchios():
+def test_gravity_of_a_level_pelvis_matches_pinocchio():
     rng, gravity, data = np.random.default_rng(5), Gravity(MODEL), MODEL.model.createData()
     for _ in range(20):
         q = rng.uniform(ROBOT.position_min, ROBOT.position_max)
@@ -28,7 +28,7 @@ def test_gravity_of_a_level_pelvis_is_pinocchios():
         )
 
 
-def test_gravity_of_a_tilted_pelvis_is_that_of_a_floating_base():
+def test_gravity_of_a_tilted_pelvis_matches_a_floating_base():
     rng, gravity = np.random.default_rng(6), Gravity(MODEL)
     floating = pinocchio_model(URDF, fixed_base=False)
     data = floating.model.createData()
@@ -42,7 +42,7 @@ def test_gravity_of_a_tilted_pelvis_is_that_of_a_floating_base():
         np.testing.assert_allclose(gravity.torque(q, tuple(attitude)), expected, atol=1e-9)
 
 
-def test_gravity_goes_by_the_joint_map():
+def test_gravity_uses_the_joint_map_of_the_model():
     order = np.random.default_rng(7).permutation(12)
     reordered = ArticulatedModel(MODEL.model, MODEL.q[order], MODEL.v[order])
     q = np.random.default_rng(8).uniform(ROBOT.position_min, ROBOT.position_max)
@@ -50,7 +50,7 @@ def test_gravity_goes_by_the_joint_map():
     np.testing.assert_allclose(Gravity(reordered).torque(q[order], LEVEL), expected[order], atol=1e-12)
 
 
-def test_gravity_leaves_the_model_it_was_given_alone():
+def test_gravity_does_not_change_its_model():
     gravity = Gravity(MODEL)
     gravity.torque(np.zeros(12), (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0))
     np.testing.assert_allclose(MODEL.model.gravity.linear, [0.0, 0.0, -9.81])

@@ -24,8 +24,8 @@ def random_states(count: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]
     ]
 
 
-class OnItsFoot:
-    """Energy of the same robot with its right foot flat on the ground: kinematics alone, no inverse dynamics."""
+class FixedFootEnergy:
+    """Energy of the same robot with its right foot flat on the ground, computed without inverse dynamics."""
 
     def __init__(self) -> None:
         self.floating = pinocchio_model(urdf(ExoskeletonParameters(), ROBOT, PATIENT), fixed_base=False)
@@ -52,16 +52,16 @@ class OnItsFoot:
         return (ahead - behind) / (2 * step)
 
 
-def test_joints_supply_the_power_that_the_energy_gains() -> None:
-    """A foot at rest takes no power: what the joints put in is the change of the energy."""
-    body = OnItsFoot()
+def test_joint_power_is_the_change_of_the_energy() -> None:
+    """The stance foot is at rest and takes no power, so the power of the joints is the change of the energy."""
+    body = FixedFootEnergy()
     for q, qd, qdd in random_states(20):
         torque = DYNAMICS.forces(q, qd, qdd).torque
         assert torque @ qd == pytest.approx(body.power(q, qd, qdd), rel=1e-4, abs=1e-2)
 
 
-def test_at_rest_the_ground_carries_the_weight_under_the_centre_of_mass() -> None:
-    body = OnItsFoot()
+def test_ground_wrench_at_rest_is_the_weight_at_the_centre_of_mass() -> None:
+    body = FixedFootEnergy()
     for q, _, _ in random_states(20):
         torque, force, moment, _ = DYNAMICS.forces(q, np.zeros(12), np.zeros(12))
         full = body.configuration(q)
@@ -76,9 +76,9 @@ def test_at_rest_the_ground_carries_the_weight_under_the_centre_of_mass() -> Non
         np.testing.assert_allclose(torque, gradient, atol=1e-3)
 
 
-def test_feedforward_and_gravity_of_the_hanging_exoskeleton_are_the_torque_that_walks() -> None:
+def test_feedforward_and_suspended_gravity_give_the_walking_torque() -> None:
     gait = load_gait(AIRWALK_GAIT, ROBOT)
-    slow = 3.0  # s: drawn by hand for the air, it would ask too much of the ground in its own time
+    slow = 3.0  # step duration [s]; at its own duration, this gait for the air needs too large ground forces
     phase = np.linspace(0.0, 1.0, 41)
     q, qd, qdd = motion(gait.coefficients, slow, phase)
     fitted = pinocchio_model(urdf(ExoskeletonParameters().fitted(PATIENT), ROBOT))
@@ -91,15 +91,15 @@ def test_feedforward_and_gravity_of_the_hanging_exoskeleton_are_the_torque_that_
     assert np.abs(walked - demanded).max() < 0.02 * np.abs(demanded).max()
 
 
-def test_the_swing_leg_of_an_empty_exoskeleton_needs_no_feedforward_at_rest() -> None:
-    """Its weight is the same, standing on the other foot or hanging from the pelvis: u_g is all of it."""
+def test_swing_leg_without_patient_needs_no_feedforward_at_rest() -> None:
+    """Gravity loads the swing leg equally in stance and suspended, so u_g is the complete torque."""
     q = load_gait(AIRWALK_GAIT, ROBOT).tables().q[300]
     feedforward = stance_dynamics(ROBOT).feedforward(np.repeat(q[:, None], 8, axis=1), 1.0)
     assert np.abs(feedforward[:6]).max() < 1e-9
     assert np.abs(feedforward[6:]).max() > 10.0
 
 
-def test_a_heavier_patient_asks_for_more() -> None:
+def test_ground_force_includes_the_mass_of_the_patient() -> None:
     q = load_gait(AIRWALK_GAIT, ROBOT).tables().q[400]
     forces = [
         stance_dynamics(ROBOT, patient).forces(q, np.zeros(12), np.zeros(12)).force[2]
@@ -108,7 +108,7 @@ def test_a_heavier_patient_asks_for_more() -> None:
     np.testing.assert_allclose(forces, [82.5 * GRAVITY, 140.5 * GRAVITY, 173.5 * GRAVITY])
 
 
-def test_the_text_needs_every_joint() -> None:
+def test_urdf_without_a_joint_is_rejected() -> None:
     text = urdf(ExoskeletonParameters(), ROBOT).replace('"right_HA"', '"spare"')
     with pytest.raises(ValueError, match="right_HA is missing"):
         StanceDynamics(text, urdf(ExoskeletonParameters(), ROBOT))

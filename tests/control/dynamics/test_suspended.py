@@ -20,7 +20,7 @@ ROBOT = load_robot()
 EXOSKELETON = ExoskeletonParameters().fitted(Patient(80.0, 1.85))
 
 
-def test_gravity_and_feedforward_together_are_the_torque_of_the_motion() -> None:
+def test_gravity_and_feedforward_give_the_torque_of_the_motion() -> None:
     gait = suspended_gait(load_gait(AIRWALK_GAIT, ROBOT), EXOSKELETON, ROBOT)
     model, into, out_of = pinocchio_model(urdf(EXOSKELETON, ROBOT))
     data = model.createData()
@@ -36,7 +36,7 @@ def test_gravity_and_feedforward_together_are_the_torque_of_the_motion() -> None
     assert np.abs(u_f - demanded).max() < 0.04 * np.abs(demanded).max()
 
 
-def test_trajectories_stay() -> None:
+def test_suspended_gait_keeps_its_trajectories() -> None:
     gait = load_gait(AIRWALK_GAIT, ROBOT)
     np.testing.assert_array_equal(suspended_gait(gait, EXOSKELETON, ROBOT).coefficients, gait.coefficients)
 
@@ -61,7 +61,7 @@ ANKLE_OFFSET = AirwalkConfig().ankle_offset
 
 
 def shifted(joint: str, angle: float) -> Gait:
-    """The gait of the air with a joint of both legs turned by an angle [rad]."""
+    """Return the airwalk gait with an offset of one joint of both legs [rad]."""
     rows = [JOINTS.index(f"{side}_{joint}") for side in ("left", "right")]
     points = AIRWALK.coefficients.copy()
     points[rows] += angle
@@ -69,14 +69,14 @@ def shifted(joint: str, angle: float) -> Gait:
 
 
 def bent(points: tuple[int, ...], angle: float) -> Gait:
-    """The gait of the air with control points of the left knee moved by an angle [rad]."""
+    """Return the airwalk gait with an offset of some control points of the left knee [rad]."""
     moved = AIRWALK.coefficients.copy()
     moved[JOINTS.index("left_SK"), points] += angle
     return replace(AIRWALK, coefficients=moved)
 
 
 def pushed(torque: float) -> Gait:
-    """The gait of the air with a constant feedforward of both henke ankles [Nm]."""
+    """Return the airwalk gait with a constant feedforward of both Henke ankles [Nm]."""
     feedforward = np.zeros_like(AIRWALK.coefficients)
     feedforward[[JOINTS.index("left_HA"), JOINTS.index("right_HA")]] = torque
     return replace(AIRWALK, feedforward=feedforward)
@@ -108,12 +108,12 @@ def endless(gait: Gait) -> Gait:
     ],
     ids=["86 degrees beyond", "between the ends", "jump", "shape", "nan", "torque", "torque backwards", "speed"],
 )  # fmt: skip
-def test_the_controller_takes_no_gait_that_is_beyond_a_limit(gait: Gait, said: str) -> None:
+def test_controller_rejects_a_gait_beyond_a_limit(gait: Gait, said: str) -> None:
     with pytest.raises(GaitError, match=said):
         AirwalkController(ROBOT, gait, SHAPES["constant"])
 
 
-def test_the_offset_of_the_ankles_counts() -> None:
+def test_ankle_offset_is_included_in_the_angle_limit() -> None:
     ankle = JOINTS.index("left_SA")
     room = ROBOT.position_max[ankle] - AIRWALK.tables().q[:, ankle].max()
     gait = shifted("SA", room - 0.5 * ANKLE_OFFSET)
@@ -123,7 +123,7 @@ def test_the_offset_of_the_ankles_counts() -> None:
     AirwalkController(ROBOT, gait, SHAPES["constant"], AirwalkConfig(ankle_offset=0.4 * ANKLE_OFFSET))
 
 
-def test_a_gait_without_feedforward_is_judged_by_the_torque_its_motion_asks_for() -> None:
+def test_gait_without_feedforward_is_checked_with_its_inverse_dynamics() -> None:
     articulated = pinocchio_model(urdf(EXOSKELETON, ROBOT))
     gravity, hip = Gravity(articulated), JOINTS.index("left_TH")
     tables = suspended_gait(AIRWALK, EXOSKELETON, ROBOT).tables()

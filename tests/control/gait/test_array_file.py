@@ -1,4 +1,4 @@
-"""Damaged .npz files: 2,000 seeded corruptions of the shipped network end in one error, or change nothing, in little memory."""
+"""Damaged .npz files: 2,000 random corruptions of the shipped network raise one error or change nothing, in little memory."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from atalante_control.dynamics.gait_network import DEFAULT_NETWORK, GaitNetwork,
 from atalante_control.gait.array_file import ArrayFileError, read_arrays, write_arrays
 
 SHIPPED = DEFAULT_NETWORK.read_bytes()
-SEEDS = 400  # of each of five kinds of corruption
-#: Bytes that a load may allocate. The largest file that is read has 0.4 MB.
+SEEDS = 400  # per kind of corruption; there are five kinds
+#: Memory that a load may allocate [bytes]. The largest valid file has 0.4 MB.
 MEMORY_MAX = 4_000_000
 BOMB_SIZE = 256_000_000  # bytes after decompression
 STORED, DEFLATED = 0, 8
@@ -30,7 +30,7 @@ STORED, DEFLATED = 0, 8
 
 @dataclass(frozen=True)
 class Member:
-    """What the headers of a zip archive say of a member, true or not, and its compressed bytes."""
+    """A member of a zip archive: the fields of its headers, true or false, and its compressed bytes."""
 
     name: str
     packed: bytes
@@ -46,7 +46,7 @@ def member(name: str, content: bytes) -> Member:
 
 
 def archive(members: list[Member]) -> bytes:
-    """A zip file, written without zipfile, which refuses to lie."""
+    """Return a zip file. The module zipfile writes only true headers, so this function writes the bytes itself."""
     body, directory = b"", b""
     for m in members:
         name = m.name.encode()
@@ -70,7 +70,7 @@ def packed() -> tuple[Member, ...]:
 
 @cache
 def bomb() -> Member:
-    """Zeros behind the header of an array that has them all."""
+    """Return a valid array of zeros that expands to `BOMB_SIZE`."""
     compressor = zlib.compressobj(wbits=-15)
     zeros, head = bytes(1_000_000), header("<f8", (BOMB_SIZE // 8,))
     content, crc = compressor.compress(head), zlib.crc32(head)
@@ -85,7 +85,7 @@ def header(descr: object, shape: object, *, fortran: object = False) -> bytes:
 
 
 def flipped(rng: random.Random) -> bytes:
-    """One to three bits are wrong, in half of the files in the directory at the end."""
+    """Flip one to three bits; in half of the files they are in the directory at the end."""
     content = bytearray(SHIPPED)
     first = rng.choice((0, len(content) - 900))
     for _ in range(rng.randint(1, 3)):
@@ -94,13 +94,13 @@ def flipped(rng: random.Random) -> bytes:
 
 
 def cut(rng: random.Random) -> bytes:
-    """Bytes are missing at the end or in the middle, or there are some more."""
+    """Remove bytes at the end or in the middle, or repeat some."""
     a, b = sorted(rng.randrange(len(SHIPPED)) for _ in range(2))
     return rng.choice((SHIPPED[:a], SHIPPED[:a] + SHIPPED[b:], SHIPPED[:b] + SHIPPED[a:], SHIPPED[a:], bytes(a)))
 
 
 def swapped(rng: random.Random) -> bytes:
-    """Well-formed members under each other's names, doubled, left out, or of another name."""
+    """Swap, duplicate, remove or rename valid members."""
     found = list(packed())
     kind, (i, j) = rng.randrange(4), rng.sample(range(len(found)), 2)
     if kind == 0:
@@ -118,7 +118,7 @@ def swapped(rng: random.Random) -> bytes:
 
 
 def misdescribed(rng: random.Random) -> bytes:
-    """A .npy header promises another type or another size than the bytes have, with a correct CRC-32."""
+    """Change type or size in a .npy header; the CRC-32 is correct."""
     items = list(members())
     i = rng.randrange(len(items))
     name, content = items[i]
@@ -141,7 +141,7 @@ def misdescribed(rng: random.Random) -> bytes:
 
 
 def oversized(rng: random.Random) -> bytes:
-    """A member expands to 256 MB, lies about its size, or there are as many members as fit."""
+    """Let a member expand to 256 MB or have a false size, or add thousands of members."""
     found = list(packed())
     i = rng.randrange(len(found))
     name, honest = found[i].name, found[i]
@@ -172,7 +172,7 @@ def little_memory() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("corrupt", [flipped, cut, swapped, misdescribed, oversized])
-def test_a_corrupted_network_is_refused_or_unchanged(corrupt: Callable[[random.Random], bytes], tmp_path: Path) -> None:
+def test_corrupted_network_is_rejected_or_unchanged(corrupt: Callable[[random.Random], bytes], tmp_path: Path) -> None:
     intact, path, refused = load_network(), tmp_path / "network.npz", 0
     contents = [corrupt(random.Random(seed)) for seed in range(SEEDS)]
     tracemalloc.start()
@@ -190,17 +190,17 @@ def test_a_corrupted_network_is_refused_or_unchanged(corrupt: Callable[[random.R
                     assert "\n" not in said, seed
     finally:
         tracemalloc.stop()
-    # Some bits mean nothing, a date or a comment; every other corruption is found.
+    # Flipped bits of a date or a comment have no effect; every other corruption is found.
     assert refused > (0.7 * SEEDS if corrupt is flipped else 0.98 * SEEDS)
 
 
-def test_the_members_of_the_shipped_network_repacked_are_the_same_network(tmp_path: Path) -> None:
+def test_repacked_network_is_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "network.npz"
     path.write_bytes(archive(list(packed())))
     assert same(load_network(path), load_network())
 
 
-def test_two_biases_under_each_others_names_are_found_by_the_checksum_alone(tmp_path: Path) -> None:
+def test_swapped_biases_are_found_by_the_checksum(tmp_path: Path) -> None:
     names = {"bias_0.npy": "bias_1.npy", "bias_1.npy": "bias_0.npy"}
     path = tmp_path / "network.npz"
     path.write_bytes(archive([replace(m, name=names.get(m.name, m.name)) for m in packed()]))
@@ -209,7 +209,7 @@ def test_two_biases_under_each_others_names_are_found_by_the_checksum_alone(tmp_
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_compression_with_a_dictionary_of_the_file_s_choice_is_refused(tmp_path: Path, method: int) -> None:
+def test_other_compression_methods_are_rejected(tmp_path: Path, method: int) -> None:
     path = tmp_path / "network.npz"
     with zipfile.ZipFile(path, "w", method) as file:
         for name, content in members():
@@ -218,7 +218,7 @@ def test_compression_with_a_dictionary_of_the_file_s_choice_is_refused(tmp_path:
         load_network(path)
 
 
-def test_a_file_over_its_size_is_not_read(tmp_path: Path) -> None:
+def test_file_above_the_size_limit_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "arrays.npz"
     write_arrays(path, {"a": np.zeros(4)})
     size = path.stat().st_size
@@ -230,7 +230,7 @@ def test_a_file_over_its_size_is_not_read(tmp_path: Path) -> None:
         load_network(Path("/dev/zero"))
 
 
-def test_arrays_are_read_back_to_the_bit(tmp_path: Path) -> None:
+def test_arrays_are_read_back_bit_for_bit(tmp_path: Path) -> None:
     path = tmp_path / "arrays.npz"
     arrays = {"a": np.array([[1.0, -0.0], [np.nan, np.inf]]).T, "text": np.array(["e", "\N{GREEK SMALL LETTER XI}"])}
     write_arrays(path, arrays)

@@ -1,4 +1,4 @@
-"""Gaits: Bezier arithmetic, the mirrored step, and a loader that names what is wrong."""
+"""Gaits: Bezier polynomials, the mirrored step, and errors of the loader."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_bezier_derivative_and_power_basis_agree():
     np.testing.assert_allclose(bezier(derivative(control_points), phase), slope, atol=1e-10)
 
 
-def test_tables_are_their_own_derivatives():
+def test_tables_match_their_numerical_derivatives():
     tables = AIRWALK.tables()
     assert tables.q.shape == (AIRWALK.cycles + 1, len(JOINTS))
     np.testing.assert_allclose(np.gradient(tables.q, PERIOD, axis=0)[1:-1], tables.qd[1:-1], atol=1e-4)
@@ -80,7 +80,7 @@ def test_mirroring_swaps_legs_and_signs_and_is_its_own_inverse():
     np.testing.assert_array_equal(left.mirrored().coefficients, AIRWALK.coefficients)
 
 
-def test_airwalk_gait_is_periodic_through_the_leg_swap_within_limits_and_slow():
+def test_airwalk_gait_is_periodic_slow_and_within_limits():
     right, left = AIRWALK.tables(), AIRWALK.mirrored().tables()
     assert AIRWALK.duration == 0.8
     np.testing.assert_allclose(right.q[-1], left.q[0], atol=1e-12)
@@ -95,7 +95,7 @@ def test_airwalk_gait_is_periodic_through_the_leg_swap_within_limits_and_slow():
     assert knee[-1] < 25.0
 
 
-def test_hash_follows_what_is_walked_and_nothing_else():
+def test_hash_depends_only_on_trajectory_and_duration():
     other = AIRWALK.coefficients.copy()
     other[3, 4] += 1e-6
     assert Gait("renamed", AIRWALK.duration, AIRWALK.coefficients).hash32 == AIRWALK.hash32
@@ -103,7 +103,7 @@ def test_hash_follows_what_is_walked_and_nothing_else():
     assert Gait("airwalk", 0.81, AIRWALK.coefficients).hash32 != AIRWALK.hash32
 
 
-def test_what_the_library_will_need_is_kept(tmp_path: Path):
+def test_loader_keeps_feedforward_parameters_and_solver_record(tmp_path: Path):
     raw = document()
     raw["feedforward"] = {joint: [1.0 * i] * 8 for i, joint in enumerate(JOINTS)}
     raw["parameters"] = {"patient_mass": 75.0, "step_length": 0.16}
@@ -140,20 +140,20 @@ def test_what_the_library_will_need_is_kept(tmp_path: Path):
         ),
     ],
 )
-def test_loader_names_the_key_and_what_is_valid(tmp_path: Path, change: Any, said: str):
+def test_invalid_gait_file_is_rejected_with_its_key(tmp_path: Path, change: Any, said: str):
     raw = document()
     change(raw)
     assert said in refused(tmp_path, raw)
 
 
-def test_loader_refuses_what_is_not_a_number(tmp_path: Path):
+def test_gait_file_with_nan_or_infinity_is_rejected(tmp_path: Path):
     text = AIRWALK_GAIT.read_text()
     assert "must be finite, got NaN" in refused(tmp_path, text.replace("0.384", "NaN", 1))
     assert "must be finite, got Infinity" in refused(tmp_path, text.replace("0.384", "Infinity", 1))
     assert "finite" in refused(tmp_path, text.replace("0.384", "1e999", 1))
 
 
-def test_loader_refuses_a_file_that_is_none(tmp_path: Path):
+def test_file_without_a_gait_is_rejected(tmp_path: Path):
     refused(tmp_path, "{")
     refused(tmp_path, "[]")
     with pytest.raises(GaitError):
@@ -166,7 +166,7 @@ def shift(raw: dict[str, Any], joint: str, points: tuple[int, ...], by: float) -
     return raw
 
 
-def test_loader_refuses_a_jump_at_the_step_change(tmp_path: Path):
+def test_gait_with_a_jump_at_the_step_change_is_rejected(tmp_path: Path):
     said = refused(tmp_path, shift(document(), "left_SK", (6, 7), math.radians(0.11)))
     assert "jump of joints.left_SK at the step change must be" in said
     assert " rad, got " in said
@@ -178,7 +178,7 @@ def test_loader_refuses_a_jump_at_the_step_change(tmp_path: Path):
     assert " rad/s, got " in said
 
 
-def test_loader_refuses_what_the_robot_cannot_do(tmp_path: Path):
+def test_gait_beyond_angle_or_speed_limit_is_rejected(tmp_path: Path):
     said = refused(tmp_path, shift(document(), "left_SA", (3, 4), -0.2))
     assert re.search(
         r"angle of joints\.left_SA must be -15\.986 to 8\.9954 deg, got -1[67]\.\d+ deg "
@@ -186,7 +186,7 @@ def test_loader_refuses_what_the_robot_cannot_do(tmp_path: Path):
         said,
     )
     fast = document()
-    fast["duration"] = 0.3  # the same way in less than half the time
+    fast["duration"] = 0.3  # the same motion in less than half the time
     assert "speed of joints.left_SK must be -4 to 4 rad/s, got " in refused(tmp_path, fast)
 
 
@@ -196,7 +196,7 @@ def knees_bent_by(angle: float) -> Gait:
     return replace(AIRWALK, coefficients=points)
 
 
-def test_a_limit_that_is_left_between_two_cycles_is_found():
+def test_limit_exceeded_between_two_cycles_is_found():
     knee = JOINTS.index("left_SK")
     phase = np.linspace(0.0, 1.0, 2_000_001)
     most, sampled = bezier(AIRWALK.coefficients[[knee]], phase).max(), AIRWALK.tables().q[:, knee].max()
@@ -208,7 +208,7 @@ def test_a_limit_that_is_left_between_two_cycles_is_found():
         GaitError, match=r"angle of joints\.left_SK must be 0 to 110\.01 deg, got 110\.01 deg at phase 0\.\d+"
     ):
         check_gait(gait, ROBOT)
-    check_gait(knees_bent_by(limit - most), ROBOT)  # touched, not left
+    check_gait(knees_bent_by(limit - most), ROBOT)  # exactly at the limit
 
 
 @pytest.mark.parametrize(
@@ -231,17 +231,17 @@ def test_a_limit_that_is_left_between_two_cycles_is_found():
     ],
 )  # fmt: skip
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_a_malformed_gait_is_refused_whoever_made_it(change: dict[str, Any], said: str):
+def test_gait_with_invalid_arrays_is_rejected(change: dict[str, Any], said: str):
     with pytest.raises(GaitError, match=said):
         check_gait(replace(AIRWALK, **change), ROBOT)
 
 
-def test_a_duration_of_numpy_is_a_duration():
+def test_numpy_float_is_accepted_as_duration():
     check_gait(replace(AIRWALK, duration=np.float64(0.8)), ROBOT)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_feedforward_and_gravity_together_keep_the_torque_limit(sign: float):
+def test_sum_of_feedforward_and_gravity_must_be_within_torque_limit(sign: float):
     hip = JOINTS.index("right_SH")
     most = ROBOT.torque_max[hip]
     feedforward = np.zeros((12, 8))
@@ -257,7 +257,7 @@ def test_feedforward_and_gravity_together_keep_the_torque_limit(sign: float):
         check_gait(gait, ROBOT, gravity=gravity(0.401 * sign))
 
 
-def test_a_written_gait_is_read_back_to_the_bit(tmp_path: Path) -> None:
+def test_written_gait_is_read_back_bit_for_bit(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     feedforward = rng.normal(size=(12, 8)) * 10.0
     gait = Gait(

@@ -14,7 +14,9 @@ DURATIONS = st.floats(0.3, 3.0)
 
 
 @given(ALPHAS, DURATIONS, st.floats(-1.0, 1.0), st.floats(-4.0, 4.0))
-def test_starts_at_the_deviation_and_ends_at_rest(alpha: float, duration: float, deviation: float, rate: float):
+def test_re_centring_starts_at_the_deviation_and_ends_at_zero(
+    alpha: float, duration: float, deviation: float, rate: float
+):
     deadbeat = Deadbeat(duration, alpha)
     value, slope, _ = deadbeat.basis(np.array([0.0, deadbeat.end * (1 - 1e-12)]))
     weights = np.array([deviation, rate])
@@ -23,14 +25,14 @@ def test_starts_at_the_deviation_and_ends_at_rest(alpha: float, duration: float,
 
 
 @given(ALPHAS, DURATIONS)
-def test_is_exactly_zero_from_alpha_t_on(alpha: float, duration: float):
+def test_re_centring_is_exactly_zero_from_alpha_t_on(alpha: float, duration: float):
     deadbeat = Deadbeat(duration, alpha)
     late = deadbeat.end + np.linspace(0.0, duration, 5)
     assert all(not part.any() for part in deadbeat.basis(late))
     assert not deadbeat.s(late, np.ones(3), np.ones(3)).any()
 
 
-def test_derivatives_are_those_of_the_cubic():
+def test_derivatives_match_the_cubic():
     deadbeat = Deadbeat(0.8, 0.4)
     time = np.linspace(0.0, deadbeat.end, 400, endpoint=False)
     value, slope, curvature = deadbeat.basis(time)
@@ -40,7 +42,7 @@ def test_derivatives_are_those_of_the_cubic():
     np.testing.assert_allclose(np.diff(curvature, 2), 0.0, atol=1e-9)  # a cubic's second derivative is a line
 
 
-def test_s_is_linear_in_the_deviations():
+def test_re_centring_is_linear_in_the_deviations():
     deadbeat, time = Deadbeat(0.8), np.linspace(0.0, 0.8, 9)
     a, b = np.array([0.1, -0.2]), np.array([1.0, 3.0])
     zero = np.zeros(2)
@@ -51,6 +53,6 @@ def test_s_is_linear_in_the_deviations():
 
 
 @pytest.mark.parametrize(("duration", "alpha"), [(0.0, 0.3), (-1.0, 0.3), (float("nan"), 0.3), (0.8, 0.0), (0.8, 1.1)])
-def test_refuses_what_is_no_step(duration: float, alpha: float):
+def test_invalid_duration_or_alpha_is_rejected(duration: float, alpha: float):
     with pytest.raises(ValueError, match=r"step|alpha"):
         Deadbeat(duration, alpha)

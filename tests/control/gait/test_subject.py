@@ -8,7 +8,7 @@ from atalante_control.model import Patient
 PATIENT = Patient(75.0, 1.75, thigh_length=0.44)
 
 
-def test_parameters_are_those_of_a_gait_file() -> None:
+def test_parameters_have_the_keys_of_a_gait_file() -> None:
     assert Subject(PATIENT, 0.16, 0.8).parameters() == {
         "patient_mass": 75.0,
         "patient_height": 1.75,
@@ -28,6 +28,6 @@ def test_parameters_are_those_of_a_gait_file() -> None:
         (0.16, 0.8004, "step duration must be a whole number of milliseconds, got 0.8004 s"),
     ],
 )
-def test_an_impossible_step_is_refused(length: float, duration: float, sentence: str) -> None:
+def test_step_out_of_range_is_rejected(length: float, duration: float, sentence: str) -> None:
     with pytest.raises(ValueError, match=f"^{sentence}$"):
         Subject(PATIENT, length, duration)

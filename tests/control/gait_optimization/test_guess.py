@@ -1,4 +1,4 @@
-"""Where the optimiser starts: a step that is kinematically a step."""
+"""Initial guess of the optimiser: the swing foot makes a step."""
 
 from __future__ import annotations
 
@@ -25,9 +25,7 @@ def problem() -> StepProblem:
 
 
 @pytest.mark.parametrize(("height", "length"), list(product((1.62, 1.93), (0.10, 0.20))))
-def test_the_swing_foot_goes_from_behind_to_ahead_and_is_up_between(
-    problem: StepProblem, height: float, length: float
-) -> None:
+def test_swing_foot_of_the_guess_makes_a_step(problem: StepProblem, height: float, length: float) -> None:
     subject = Subject(Patient(75.0, height), length, 0.8)
     coefficients = guess(problem, problem.parameters(subject.patient, 0.8, length), subject)
     poses = bezier(coefficients, np.array([0.0, 0.5, 1.0]))

@@ -1,4 +1,4 @@
-"""The sparse program: its derivatives against finite differences, its rows against what was asked for."""
+"""Nonlinear program: values, bounds and derivatives, compared with finite differences."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from atalante_control.gait_optimization.nlp import NAMES, Functions, NonlinearPr
 
 P = np.array([1.3, 0.7])
 X = np.array([0.2, -0.4, 0.9, 1.1, -0.8])
-PLACES = [np.array([0, 2]), np.array([2, 1]), np.array([4, 3])]  # unknown 2 is in two places
+PLACES = [np.array([0, 2]), np.array([2, 1]), np.array([4, 3])]  # unknown 2 occurs twice
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def functions(program: NonlinearProgram) -> Functions:
 
 
 def slopes(function: object, count: int) -> np.ndarray:
-    """Central differences of a function of x."""
+    """Return the central differences of a function of x."""
     step = 1e-6
     columns = []
     for k in range(count):
@@ -43,7 +43,7 @@ def slopes(function: object, count: int) -> np.ndarray:
     return np.array(columns).T
 
 
-def test_values(program: NonlinearProgram, functions: Functions) -> None:
+def test_objective_and_constraints_have_the_expected_values(program: NonlinearProgram, functions: Functions) -> None:
     expected = [X[0] + 2.0 * X[2]]
     for a, b in PLACES:
         expected += [(X[a] ** 2 + X[b] ** 2) * P[0] / 4.0, X[a] * X[b] ** 2 / 2.0, np.sin(X[a]) / 2.0]
@@ -52,7 +52,7 @@ def test_values(program: NonlinearProgram, functions: Functions) -> None:
     assert float(functions.objective(X, P)) == pytest.approx(objective, rel=1e-14)
 
 
-def test_derivatives(program: NonlinearProgram, functions: Functions) -> None:
+def test_derivatives_match_finite_differences(program: NonlinearProgram, functions: Functions) -> None:
     rows = len(program.lower)
     gradient = np.array(functions.gradient(X, P)[1]).ravel()
     np.testing.assert_allclose(gradient, slopes(lambda x: functions.objective(x, P), 5)[0], atol=1e-8)
@@ -69,7 +69,7 @@ def test_derivatives(program: NonlinearProgram, functions: Functions) -> None:
     np.testing.assert_allclose(upper + np.triu(upper, 1).T, slopes(lagrangian_slope, 5), atol=1e-7)
 
 
-def test_bounds_are_over_the_groups_size_and_may_change_from_place_to_place(program: NonlinearProgram) -> None:
+def test_bounds_are_scaled_and_may_differ_at_each_place(program: NonlinearProgram) -> None:
     circle = next(group for group in program.groups if group.name == "circle")
     assert program.upper[circle.rows].tolist() == [0.25, 0.5, 0.75]
     product = next(group for group in program.groups if group.name == "product")
@@ -77,10 +77,10 @@ def test_bounds_are_over_the_groups_size_and_may_change_from_place_to_place(prog
     assert program.lower[0] == program.upper[0] == 3.0
 
 
-def test_every_row_is_in_one_group(program: NonlinearProgram) -> None:
+def test_each_constraint_row_is_in_one_group(program: NonlinearProgram) -> None:
     rows = np.concatenate([group.rows for group in program.groups])
     assert sorted(rows.tolist()) == list(range(len(program.lower)))
 
 
-def test_functions_are_named_as_the_solver_calls_them(functions: Functions) -> None:
+def test_functions_have_the_names_of_the_solver(functions: Functions) -> None:
     assert tuple(function.name() for function in functions) == NAMES

@@ -1,4 +1,4 @@
-"""Calls over processes: what comes back, and how an iteration that is left ends."""
+"""Parallel calls in processes: their results, and the end of an interrupted iteration."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def doubled(number: int) -> tuple[int, int]:
     return 2 * number, os.getpid()
 
 
-def hears_ctrl_c(_: int) -> bool:
+def handles_ctrl_c(_: int) -> bool:
     return signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
 
 
@@ -27,23 +27,23 @@ def slow(seconds: float) -> int:
     return os.getpid()
 
 
-def test_one_job_is_this_process_in_order() -> None:
+def test_one_job_runs_in_this_process_in_order() -> None:
     assert list(fan_out(doubled, range(4))) == [(2 * number, os.getpid()) for number in range(4)]
 
 
-def test_processes_give_the_same_results_and_are_not_this_one() -> None:
+def test_two_jobs_run_in_other_processes_with_the_same_results() -> None:
     found = list(fan_out(doubled, range(8), jobs=2))
     assert sorted(number for number, _ in found) == [0, 2, 4, 6, 8, 10, 12, 14]
     assert os.getpid() not in {process for _, process in found}
 
 
-def test_ctrl_c_is_for_the_caller_alone() -> None:
-    assert not any(fan_out(hears_ctrl_c, range(4), jobs=2))
-    assert hears_ctrl_c(0)
+def test_worker_processes_ignore_ctrl_c() -> None:
+    assert not any(fan_out(handles_ctrl_c, range(4), jobs=2))
+    assert handles_ctrl_c(0)
 
 
-def test_an_iteration_that_is_left_ends_its_processes_without_a_word() -> None:
-    """Warnings are errors in these tests."""
+def test_closing_the_iteration_ends_its_processes_without_a_warning() -> None:
+    """A warning would fail this test."""
     results = fan_out(slow, [0.0, 600.0, 600.0, 600.0], jobs=2)
     process = next(results)
     results.close()
@@ -58,7 +58,7 @@ def test_an_iteration_that_is_left_ends_its_processes_without_a_word() -> None:
 
 
 @pytest.mark.parametrize(("error", "told"), [(KeyError, []), (ValueError, [ValueError])])
-def test_that_loky_stumbles_over_calls_it_has_forgotten_is_not_told(
+def test_key_error_of_loky_at_shutdown_is_suppressed(
     error: type[Exception], told: list[type[Exception]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hand_out = _ExecutorManagerThread.add_call_item_to_queue
@@ -77,12 +77,12 @@ def test_that_loky_stumbles_over_calls_it_has_forgotten_is_not_told(
     assert said == told
 
 
-def test_no_result_for_too_long_is_told() -> None:
+def test_missing_result_raises_timeout_error() -> None:
     with pytest.raises(TimeoutError):
         list(fan_out(slow, [600.0], jobs=2, patience=0.1))
 
 
-def test_what_is_missing_is_said_with_what_to_type(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_dependency_error_contains_the_command_to_type(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(FanOutError, match="start one with `dask scheduler`"):
         list(fan_out(doubled, [1], cluster="not an address"))
     monkeypatch.setitem(sys.modules, "distributed", None)

@@ -1,4 +1,4 @@
-"""Whether a landing pose exists: the paper's subjects and steps have one; a leg that is too short is named by its joint."""
+"""Reach of the legs: the subjects and steps of the paper have a landing pose; a step out of reach names the joint."""
 
 from __future__ import annotations
 
@@ -24,18 +24,20 @@ def reach(problem: StepProblem) -> Reach:
 
 
 @pytest.mark.parametrize(("height", "length"), list(product((1.62, 1.75, 1.93), (0.10, 0.20))))
-def test_steps_of_the_library_are_in_reach(problem: StepProblem, reach: Reach, height: float, length: float) -> None:
+def test_steps_of_the_library_are_within_reach(
+    problem: StepProblem, reach: Reach, height: float, length: float
+) -> None:
     assert reach.refusal(problem.parameters(Patient(75.0, height), 0.8, length), length) is None
 
 
-def test_what_is_out_of_reach_is_said_by_joint_and_angle(problem: StepProblem, reach: Reach) -> None:
+def test_step_out_of_reach_is_rejected_with_joint_and_angle(problem: StepProblem, reach: Reach) -> None:
     refusal = reach.refusal(problem.parameters(Patient(110.0, 1.5), 0.8, 0.4), 0.4)
     assert refusal is not None
     assert "0.4 m apart right_SA would be at -15" in refusal
     assert "limit for gaits is -14.0 degrees" in refusal
 
 
-def test_further_is_worse(problem: StepProblem, reach: Reach) -> None:
+def test_only_the_longest_steps_are_out_of_reach(problem: StepProblem, reach: Reach) -> None:
     refusals = [
         reach.refusal(problem.parameters(Patient(75.0, 1.5), 0.8, length), length) for length in (0.3, 0.4, 0.5)
     ]

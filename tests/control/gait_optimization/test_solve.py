@@ -1,4 +1,4 @@
-"""A step solved: residuals, determinism, warm starts, steps from and to rest, sentences for what cannot be walked."""
+"""Gait solver: residuals, determinism, warm starts, start and stop steps, and errors for infeasible gaits."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def solved() -> SolvedGait:
     return solve(SUBJECT)
 
 
-def test_solved_within_the_residual(solved: SolvedGait) -> None:
+def test_solved_gait_has_residuals_below_the_limit(solved: SolvedGait) -> None:
     assert solved.status == SOLVED
     assert solved.max_residual < RESIDUAL
     assert all(residual.value < RESIDUAL for residual in solved.residuals.values())
@@ -34,7 +34,7 @@ def test_solved_within_the_residual(solved: SolvedGait) -> None:
     assert wanted <= set(solved.residuals)
 
 
-def test_it_is_a_gait_of_the_robot_with_its_record(solved: SolvedGait, tmp_path: Path) -> None:
+def test_solved_gait_is_valid_and_keeps_its_solver_record(solved: SolvedGait, tmp_path: Path) -> None:
     check_gait(solved.gait, ROBOT)
     path = tmp_path / "gait.json"
     write_gait(solved.gait, path)
@@ -46,19 +46,19 @@ def test_it_is_a_gait_of_the_robot_with_its_record(solved: SolvedGait, tmp_path:
     assert read.solver["max_residual"] < RESIDUAL
 
 
-def test_torques_are_those_of_the_class_of_machine(solved: SolvedGait) -> None:
-    # Another optimiser with other weights found 162, 86, 44, 99, 93, 29 Nm for the stance leg of this subject.
+def test_peak_torques_are_close_to_published_results(solved: SolvedGait) -> None:
+    # Another optimiser, with other weights, gives 162, 86, 44, 99, 93, 29 Nm for the stance leg of this subject.
     stance = solved.peak_torque[6:]
     assert 120.0 < stance[JOINTS.index("right_FH") - 6] < 200.0
     assert (stance < np.array([200.0, 90.0, 80.0, 110.0, 100.0, 40.0])).all()
     assert (solved.peak_torque < 0.9 * ROBOT.torque_max).all()
 
 
-def test_same_request_same_bits(solved: SolvedGait) -> None:
+def test_same_request_gives_the_same_gait(solved: SolvedGait) -> None:
     assert solve(SUBJECT).gait.hash32 == solved.gait.hash32
 
 
-def test_a_neighbour_makes_it_faster_not_different(solved: SolvedGait) -> None:
+def test_warm_start_is_faster_and_gives_the_same_gait(solved: SolvedGait) -> None:
     other = Subject(Patient(78.0, 1.77), 0.15, 0.83)
     cold, warm = solve(other), solve(other, solved.gait)
     assert warm.solved
@@ -67,7 +67,7 @@ def test_a_neighbour_makes_it_faster_not_different(solved: SolvedGait) -> None:
 
 
 @pytest.mark.parametrize("kind", ["start", "stop"])
-def test_steps_from_and_to_rest_join_the_gait(solved: SolvedGait, kind: Kind) -> None:
+def test_start_and_stop_steps_join_the_periodic_gait(solved: SolvedGait, kind: Kind) -> None:
     step = solve(SUBJECT, kind=kind)
     assert step.solved
     assert step.gait.duration == TRANSITION
@@ -80,13 +80,13 @@ def test_steps_from_and_to_rest_join_the_gait(solved: SolvedGait, kind: Kind) ->
     np.testing.assert_allclose(qd[resting], 0.0, atol=1e-9)
 
 
-def test_the_next_step_is_the_mirrored_one(solved: SolvedGait) -> None:
+def test_gait_continues_in_the_mirrored_step(solved: SolvedGait) -> None:
     q, qd, _ = motion(solved.gait.coefficients, solved.gait.duration, np.array([0.0, 1.0]))
     np.testing.assert_allclose(q[1], SIGN * q[0][SWAP], atol=1e-9)
     np.testing.assert_allclose(qd[1], SIGN * qd[0][SWAP], atol=Requirements().impact_jump + 1e-9)
 
 
-def test_what_is_out_of_reach_is_said_at_once() -> None:
+def test_step_out_of_reach_is_rejected_without_iterations() -> None:
     subject = Subject(Patient(110.0, 1.5), 0.4, 0.4)
     outcome = solve(subject)
     assert not outcome.solved
@@ -94,7 +94,7 @@ def test_what_is_out_of_reach_is_said_at_once() -> None:
     assert outcome.status.startswith(f"no such gait for {subject}: with both feet flat on the ground")
 
 
-def test_what_cannot_be_walked_is_named_by_its_constraint() -> None:
+def test_infeasible_gait_names_the_violated_constraint() -> None:
     outcome = solve(Subject(Patient(75.0, 1.75), 0.4, 0.4))
     assert not outcome.solved
     assert "is violated by" in outcome.status
@@ -102,7 +102,7 @@ def test_what_cannot_be_walked_is_named_by_its_constraint() -> None:
     assert isinstance(outcome.gait, Gait)
 
 
-def test_progress_counts_iterations(solved: SolvedGait) -> None:
+def test_progress_is_called_in_every_iteration(solved: SolvedGait) -> None:
     seen: list[tuple[int, float]] = []
     watched = solve(SUBJECT, progress=lambda iteration, violation: seen.append((iteration, violation)))
     assert [iteration for iteration, _ in seen] == list(range(watched.iterations + 1))

@@ -1,4 +1,4 @@
-"""The program of a step: its derivatives, what follows from a motion alone, and violations in physical units."""
+"""Nonlinear program of a step: derivatives, dependent unknowns and constraint violations in physical units."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def violations(
     return {name: residual.value for name, residual in found.items()}
 
 
-def test_derivatives_along_random_directions(
+def test_derivatives_match_finite_differences_along_random_directions(
     problem: StepProblem, functions: Functions, coefficients: np.ndarray, parameters: np.ndarray
 ) -> None:
     random = np.random.default_rng(5)
@@ -88,12 +88,14 @@ def test_violations_are_in_physical_units(
 ) -> None:
     before = violations(problem, functions, coefficients, parameters)
     bent = coefficients.copy()
-    bent[JOINTS.index("left_HA"), 0] += 0.5  # rad, at the first node alone exactly
+    bent[JOINTS.index("left_HA"), 0] += 0.5  # rad, changes exactly only the first node
     after = violations(problem, functions, bent, parameters)
     assert after["periodicity"] == pytest.approx(0.5, abs=before["periodicity"] + 1e-12)
     place = coefficients.copy()
     place[JOINTS.index("left_SK"), -1] += 0.1
-    assert violations(problem, functions, place, parameters)["landing position"] > 0.02  # m, 0.1 rad on 0.43 m of shank
+    assert (
+        violations(problem, functions, place, parameters)["landing position"] > 0.02
+    )  # m; 0.1 rad turn a shank of 0.43 m
     backwards = coefficients.copy()
     backwards[JOINTS.index("right_SK")] = -0.5
     assert violations(problem, functions, backwards, parameters)["joint limits"] == pytest.approx(
@@ -101,7 +103,7 @@ def test_violations_are_in_physical_units(
     )
 
 
-def test_bounds_are_the_robots_less_the_margins(problem: StepProblem) -> None:
+def test_bounds_are_the_robot_limits_minus_the_margins(problem: StepProblem) -> None:
     low, high = problem.joint_range()
     knees = [i for i, joint in enumerate(JOINTS) if joint.endswith("SK")]
     others = [i for i in range(len(JOINTS)) if i not in knees]
@@ -116,14 +118,14 @@ def test_bounds_are_the_robots_less_the_margins(problem: StepProblem) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_group_has_a_unit_and_only_the_periodic_step_hits_the_ground(kind: str) -> None:
+def test_only_the_periodic_step_has_an_impact_constraint(kind: str) -> None:
     step = StepProblem(kind, ROBOT, REQUIREMENTS)
     assert {group.name for group in step.program.groups} <= set(step.units)
     assert ("impact map" in step.units) == (kind == "periodic")
     assert ("rest" in step.units) == (kind != "periodic")
 
 
-def test_standing_still_carries_the_weight(problem: StepProblem, parameters: np.ndarray) -> None:
+def test_ground_force_at_standstill_is_the_weight(problem: StepProblem, parameters: np.ndarray) -> None:
     still = np.zeros((len(JOINTS), 8))
     still[[3, 9]] = 0.3
     x = problem.unknowns(still, parameters)

@@ -1,4 +1,4 @@
-"""Inverse dynamics in CasADi symbols against Pinocchio: torques, ground wrench, kinematics, impulses."""
+"""Symbolic dynamics compared with Pinocchio: torques, ground wrench and kinematics."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def states(count: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("patient", [None, PATIENT, Patient(45.0, 2.0)])
-def test_torques_and_ground_wrench_are_pinocchios(chain: Chain, patient: Patient | None) -> None:
+def test_torques_and_ground_wrench_match_pinocchio(chain: Chain, patient: Patient | None) -> None:
     worn = links(ExoskeletonParameters(), patient)
-    # One set of expressions serves every patient; the empty exoskeleton has more zeros and gets its own.
+    # One set of expressions is valid for every patient; the exoskeleton without patient has its own.
     own = chain if patient else Chain(worn)
     function, witness = inverse_dynamics(own), stance_dynamics(load_robot(), patient)
     for state in states(20):
@@ -47,7 +47,7 @@ def test_torques_and_ground_wrench_are_pinocchios(chain: Chain, patient: Patient
         np.testing.assert_allclose(moment, expected.moment, rtol=1e-9, atol=1e-9)
 
 
-def test_kinematics_are_pinocchios(chain: Chain) -> None:
+def test_kinematics_match_pinocchio(chain: Chain) -> None:
     worn = links(ExoskeletonParameters(), PATIENT)
     q, qd = casadi.SX.sym("q", len(JOINTS)), casadi.SX.sym("qd", len(JOINTS))
     frames = chain.frames(q, qd)
@@ -69,7 +69,7 @@ def test_kinematics_are_pinocchios(chain: Chain) -> None:
             relative = data.oMf[stance].actInv(data.oMf[frame])
             np.testing.assert_allclose(rotation, relative.rotation, atol=1e-12)
             np.testing.assert_allclose(place.ravel(), relative.translation, atol=1e-12)
-            # As seen from the stance foot, which moves in this model: its twist is taken off.
+            # The expressions are relative to the stance foot, which moves in this model, so its twist is subtracted.
             local = pinocchio.ReferenceFrame.LOCAL
             own = pinocchio.getFrameVelocity(model, data, frame, local)
             carried = relative.actInv(pinocchio.getFrameVelocity(model, data, stance, local))
@@ -77,20 +77,20 @@ def test_kinematics_are_pinocchios(chain: Chain) -> None:
             np.testing.assert_allclose(angular.ravel(), (own - carried).angular, atol=1e-12)
 
 
-def test_weight_rests_on_the_ground(chain: Chain) -> None:
+def test_ground_force_at_rest_is_the_weight(chain: Chain) -> None:
     worn = links(ExoskeletonParameters(), PATIENT)
     still = np.zeros(len(JOINTS))
     force = np.array(inverse_dynamics(chain)(states(1)[0, 0], still, still, chain.values(worn))[1]).ravel()
     np.testing.assert_allclose(force, UP * sum(link.inertia.mass for link in worn), rtol=1e-12, atol=1e-9)
 
 
-def test_fixed_links_belong_to_the_body_that_carries_them() -> None:
+def test_fixed_links_are_merged_into_their_body() -> None:
     worn = links(ExoskeletonParameters(), PATIENT)
     assert len(bodies(worn)) == 1 + len(JOINTS)
     assert sum(body.mass for body in bodies(worn)) == pytest.approx(sum(link.inertia.mass for link in worn), rel=1e-14)
 
 
-def test_a_robot_the_expressions_do_not_fit_is_refused(chain: Chain) -> None:
+def test_robot_with_other_axes_is_rejected(chain: Chain) -> None:
     worn = links(ExoskeletonParameters(ha_axis=(1.0, 0.0, 0.0)), PATIENT)
     with pytest.raises(ValueError, match="must be those of the reference robot"):
         chain.values(worn)

@@ -1,8 +1,8 @@
-"""The printed bound against an adversary: the controller's own filters, pushed by exactly what they are built for.
+"""Adversary at the printed bounds: the filters of the controller under exactly the disturbances they are built for.
 
-Two plants, both without what the certificate leaves out (real torque and rate limits, delay, hand-over torque). On the
-ideal one, separate inertias, a search over switching pushes tries to leave the guide. On the coupled one, the mass matrix of
-the swing leg's hip and knee, real torques of exactly the printed pair push, in every direction and with the switching found.
+Two plants without the effects that the certificate ignores: torque and rate limits, delay, hand-over torque. On the
+ideal plant, two separate inertias, a search over switching pushes tries to leave the guide. On the coupled plant, the mass matrix
+of hip and knee of the swing leg, real torques of exactly the printed pair push in every direction, with the switching found.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def controller(shape: str) -> AirwalkController:
 
 
 def desired(guide: GuideFilter, deviation: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """q_des and q_des' of SH and SK by cycle, each shape (n, 2)."""
+    """Return q_des and q_des' of SH and SK in each cycle, each of shape (n, 2)."""
     time = np.arange(guide.cycles + 1) * PERIOD
     phase = time / GAIT.duration
     (c0, c1), (c0d, c1d), _ = guide.deadbeat.basis(time)
@@ -69,9 +69,9 @@ def search(
     high: float,
     cells: int,
 ) -> tuple[float, np.ndarray]:
-    """Reach as far as switching pushes go: from the re-centred state, each state under both, one state a cell kept.
+    """Search the switching disturbance with the largest error, from the re-centred state; each grid cell keeps one state.
 
-    Every state is one the plant really gets to, with the filter's memory.
+    Every state is reachable, and includes the memory of the filter.
 
     Args:
         joints, flow, step: tables of the filter.
@@ -81,13 +81,15 @@ def search(
         cells: of e and of e' across three bounds, and +-4 rad/s.
 
     Returns:
-        Largest |e| / q_bound, and the pushes that lead there, -1 or 1 a cycle (0 after it), shape (n - 1,).
+        Largest |e| / q_bound, and its push in each cycle, -1 or 1, shape (n - 1,).
     """
     cycles, inertia = len(q_des) - 1, joints[target]["inertia"]
     now, then = np.zeros((cells * cells, 4)), np.zeros((cells * cells, 4))
     now[0, 2] = 1.0
     count, worst, worst_cycle, worst_state = 1, 0.0, 0, 0
-    parents = np.zeros((cycles, cells * cells), np.int64)  # twice the state before, 1 more for the upper push
+    parents = np.zeros(
+        (cycles, cells * cells), np.int64
+    )  # twice the index of the previous state, plus 1 for the upper push
     kept, errors = np.zeros((cells, cells), np.int64), np.zeros(2)
     rates = np.zeros(2)
     for cycle in range(cycles):
@@ -129,7 +131,7 @@ def search(
 
 
 def worst_switching(guide: GuideFilter, xi: float, target: int, factor: float = 1.0) -> tuple[float, float, np.ndarray]:
-    """Worst of the hand-over box on the ideal plant: |e| / q_bound, index of the corner, pushes."""
+    """Return the worst case of the hand-over box on the ideal plant: |e| / q_bound, index of the corner, pushes."""
     low, high = (factor * bound for bound in guide.config.disturbance[target])
     found = []
     for corner, (deviation, rate) in enumerate(BOX):
@@ -142,17 +144,17 @@ def worst_switching(guide: GuideFilter, xi: float, target: int, factor: float = 
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize(("shape", "xi"), CERTIFIED)
-def test_the_ideal_plant_is_kept_at_the_bound_the_running_filter_is_built_for(shape: str, xi: float):
+def test_certified_guide_contains_the_ideal_plant_at_the_filter_bound(shape: str, xi: float):
     assert controller(shape).certificate(xi).certified
     guide = controller(shape).guide_at(xi)
     for target in (0, 1):
         ratio, _, _ = worst_switching(guide, xi, target)
-        assert 0.9 < ratio <= LIMIT  # the search comes close to the edge: it is no weak adversary
+        assert 0.9 < ratio <= LIMIT  # the search comes close to the bound, so the adversary is strong
 
 
 @pytest.mark.exhaustive
-def test_the_running_filter_is_left_at_the_bound_of_a_filter_built_for_more():
-    """`u_ext_max` is of another filter: why it is not printed."""
+def test_disturbance_above_the_filter_bound_leaves_the_guide():
+    """`u_ext_max` holds for another filter, so it is not printed."""
     certificate, guide = controller("constant").certificate(0.5), controller("constant").guide_at(0.5)
     for target, joint in enumerate(certificate.joints):
         factor = joint.u_ext_max[1] / joint.u_ext[1]
@@ -166,7 +168,7 @@ Push = Callable[[int, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def coupled_step(guide: GuideFilter, xi: float, corner: int, push: Push) -> tuple[float, float]:
-    """Largest |e| / q_bound over a step of the coupled leg, and largest part of the ideal bounds the push came to.
+    """Return the largest |e| / q_bound over a step of the coupled leg, and the largest ratio of the push to the ideal bounds.
 
     Args:
         push: cycle, e, e' and A = J M^-1 to real torques [Nm], each shape (2,).
@@ -193,7 +195,7 @@ def coupled_step(guide: GuideFilter, xi: float, corner: int, push: Push) -> tupl
 
 
 def acceleration(q: np.ndarray, qd: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    """q'' of the coupled pair, from its mass matrix and velocity torques."""
+    """Return q'' of the coupled pair, from its mass matrix and velocity torques."""
     m11, m12, m22 = INERTIA.block(float(q[1]))
     (_, b11, c11), (_, b12, c12), _ = INERTIA.fit.tolist()
     s, c = np.sin(q[1]), np.cos(q[1])
@@ -203,7 +205,7 @@ def acceleration(q: np.ndarray, qd: np.ndarray, torque: np.ndarray) -> np.ndarra
 
 
 def real_pushes(pair: np.ndarray, switching: list[np.ndarray]) -> dict[str, Push]:
-    """Pushes of exactly the pair; with `along`, in the direction that counts most on joint j."""
+    """Return pushes of exactly the pair; `along` gives the direction with the largest effect on a joint."""
 
     def along(joint: int, sign: Callable[[int, float, float], float]) -> Push:
         return lambda k, e, ed, counts: sign(k, e[joint], ed[joint]) * np.sign(counts[joint]) * pair
@@ -226,7 +228,7 @@ def real_pushes(pair: np.ndarray, switching: list[np.ndarray]) -> dict[str, Push
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize(("shape", "xi"), CERTIFIED)
-def test_the_coupled_leg_is_kept_at_the_printed_real_torques(shape: str, xi: float):
+def test_certified_guide_contains_the_coupled_leg_at_the_printed_torques(shape: str, xi: float):
     bound = controller(shape).certificate(xi).joint_torque
     assert bound is not None
     guide = controller(shape).guide_at(xi)
@@ -238,12 +240,12 @@ def test_the_coupled_leg_is_kept_at_the_printed_real_torques(shape: str, xi: flo
     }
     worst = max(ends, key=lambda end: ends[end][0])
     assert ends[worst][0] <= LIMIT, worst
-    # The pair is tight: it comes to the bound of a joint in some pose, and never beyond.
+    # The pair is tight: in some pose it reaches the bound of a joint, and it never exceeds it.
     reached = max(reached for _, reached in ends.values())
     assert 0.93 < reached <= 1.0
 
 
-def test_real_torques_well_above_the_printed_ones_leave_the_guide():
+def test_five_times_the_printed_torques_leave_the_guide():
     guide, bound = controller("constant").guide_at(0.5), controller("constant").certificate(0.5).joint_torque
     assert bound is not None
     push = real_pushes(5.0 * np.array([bound.hip, bound.knee]), [np.ones(1)] * 2)["SH up"]

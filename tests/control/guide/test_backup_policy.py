@@ -1,4 +1,4 @@
-"""Backup policy: its flow against the differential equation, over-, under- and critically damped."""
+"""Backup policy: its flow compared with the differential equation; overdamped, underdamped and critically damped."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def system(policy: BackupPolicy) -> np.ndarray:
 
 
 def exponential(matrix: np.ndarray) -> np.ndarray:
-    """Scaling and squaring of the series."""
+    """Return the matrix exponential by scaling and squaring of the series."""
     small, result, term = matrix / 2**12, np.eye(2), np.eye(2)
     for i in range(1, 12):
         term = term @ small / i
@@ -44,7 +44,7 @@ def test_transition_is_the_matrix_exponential(policy: BackupPolicy):
 
 
 @given(st.floats(0.2, 3.0), st.floats(5.0, 80.0), st.floats(0.5, 20.0), st.floats(0.0, 0.5), st.floats(0.0, 0.5))
-def test_transition_is_a_group(damping: float, rate: float, inertia: float, a: float, b: float):
+def test_transitions_of_consecutive_times_multiply(damping: float, rate: float, inertia: float, a: float, b: float):
     policy = BackupPolicy(inertia * rate**2, 2 * damping * inertia * rate, inertia)
     one, other, both = policy.transition(np.array([a, b, a + b]))
     np.testing.assert_allclose(one @ other, both, atol=1e-9 * rate)
@@ -57,7 +57,7 @@ def test_flow_is_continuous_through_critical_damping(nudge: float):
     np.testing.assert_allclose(near.step_response(TAU), CRITICAL.step_response(TAU), atol=1e-8)
 
 
-def test_monotone_is_told_by_the_damping():
+def test_only_damped_loops_are_monotone():
     assert [p.monotone for p in POLICIES] == [True, True, False]
 
 
@@ -99,7 +99,7 @@ def test_disturbance_bounds_every_signal_and_is_reached(policy: BackupPolicy):
     rng = np.random.default_rng(2)
     signals = [np.full(900, high), np.full(900, low)]
     signals += [rng.choice([low, high], size=90).repeat(10) for _ in range(20)]
-    # The worst at the end: push with the sign of the impulse response seen backwards from there.
+    # The worst disturbance at the end has the sign of the time-reversed impulse response.
     backwards = policy.step_response(TAU[1:] - 5e-4)[::-1, 1]
     signals.append(np.where(backwards > 0.0, high, low))
     for signal in signals:
@@ -125,7 +125,7 @@ DEADBEAT = Deadbeat(0.8, 0.4)
 
 
 def forcing(policy: BackupPolicy, time: np.ndarray, part: int) -> np.ndarray:
-    """u_f / J - q_des'' of one part: nominal with feedforward, then the two deadbeat cubics."""
+    """Return u_f / J - q_des'' of one part: nominal motion with feedforward, or one of the two re-centring cubics."""
     if part:
         return -DEADBEAT.basis(time)[2][part - 1]
     late, second = time > 0.8, derivative(derivative(np.stack([NOW, THEN]))) / 0.64
@@ -143,7 +143,7 @@ def test_forced_response_is_integrated_by_runge_kutta(policy: BackupPolicy, part
     time = np.arange(901) * 1e-3
     response = forced_response(policy, DEADBEAT, NOW, THEN, time, UF)[part]
     a, h, x = system(policy), 2.5e-4, response[0].copy()
-    # Just inside each interval: the forcing jumps at T and at the deadbeat's end, which lie between two of them.
+    # Just inside each interval, because the forcing jumps at T and at the end of the re-centring.
     start = np.arange(3600) * h
     stages = np.stack([forcing(policy, start + inside, part) for inside in (1e-9, h / 2, h - 1e-9)], axis=1)
     worst = 0.0
@@ -170,14 +170,14 @@ def test_free_drift_is_the_twice_integrated_forcing(part: int):
 
 
 @pytest.mark.parametrize("bad", [(0.0, 1.0, 1.0), (1.0, -1.0, 1.0), (1.0, 1.0, float("nan"))])
-def test_refuses_gains_that_are_none(bad: tuple[float, float, float]):
+def test_invalid_gains_are_rejected(bad: tuple[float, float, float]):
     with pytest.raises(ValueError, match="positive and finite"):
         BackupPolicy(*bad)
     with pytest.raises(ValueError, match="torque_limit"):
         BackupPolicy(1.0, 1.0, 1.0, 0.0)
 
 
-def test_what_is_left_late_decays_like_the_slowest_mode():
+def test_late_error_decays_with_the_slowest_mode():
     late = np.array([0.5, 0.6])
     error = OVERDAMPED.transition(late)[:, 0, 0]
     slowest = -np.roots([OVERDAMPED.inertia, OVERDAMPED.kd, OVERDAMPED.kp]).max()

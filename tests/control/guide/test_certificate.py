@@ -1,4 +1,4 @@
-"""Guide certificate: its numbers against brute force, and what it says of guides that hold and that do not."""
+"""Guide certificate: its margins compared with brute force, and the reasons for guides that are not certified."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def scaled(factor: float, config: GuideConfig = CONFIG) -> GuideConfig:
 
 
 @pytest.mark.parametrize("shape", ["constant", "widening", "narrowing", "pinched", "asymmetric"])
-def test_the_five_guides_of_the_demonstration_are_certified(shape: str):
+def test_guides_of_the_demonstration_are_certified(shape: str):
     certificate = certify(guide(shape), 0.5, BOX)
     assert certificate.certified
     assert certificate.margin > 0.2
@@ -53,7 +53,7 @@ def test_the_five_guides_of_the_demonstration_are_certified(shape: str):
 
 
 def brute_force_margin(certificate: Certificate, f: GuideFilter, xi: float, box: HandOver) -> list[float]:
-    """The filter's own h at the first cycle, from the re-centred state, over the corners of the hand-over box."""
+    """Return the margin from h of the filter in the first cycle, over the corners of the hand-over box."""
     worst = [1.0, 1.0]
     for d in (-box.deviation, box.deviation):
         for r in (-box.rate, box.rate):
@@ -65,17 +65,19 @@ def brute_force_margin(certificate: Certificate, f: GuideFilter, xi: float, box:
 
 @pytest.mark.parametrize("shape", ["constant", "widening", "narrowing", "pinched", "asymmetric"])
 @pytest.mark.parametrize("xi", [0.0, 0.5, 0.8])
-def test_margin_is_the_filters_own_at_the_start_of_the_worst_step(shape: str, xi: float):
+def test_margin_matches_the_filter_at_the_worst_start(shape: str, xi: float):
     f = guide(shape, UNLIMITED)
     certificate = certify(f, xi, BOX)
     margins = brute_force_margin(certificate, f, xi, BOX)
     for joint, margin in zip(certificate.joints, margins, strict=True):
         assert joint.margin <= margin + 1e-9
-        assert joint.margin == pytest.approx(margin, abs=0.01)  # every cycle here, every eighth there
+        assert joint.margin == pytest.approx(
+            margin, abs=0.01
+        )  # the certificate checks every cycle, the filter every eighth
 
 
 @pytest.mark.parametrize("shape", ["constant", "pinched", "asymmetric", "snap"])
-def test_the_largest_disturbance_is_where_the_margin_ends(shape: str):
+def test_margin_is_zero_at_the_largest_disturbance(shape: str):
     for index, joint in enumerate(certify(guide(shape, UNLIMITED), 0.5, BOX).joints):
         factor = joint.u_ext_max[1] / joint.u_ext[1]
         if factor == 0.0:
@@ -90,7 +92,7 @@ def test_the_largest_disturbance_is_where_the_margin_ends(shape: str):
         assert inside.margin > 0.0 > outside.margin
 
 
-def test_the_largest_hand_over_is_where_the_margin_ends():
+def test_margin_is_zero_at_the_largest_hand_over():
     f = guide("widening", UNLIMITED)
     for index, joint in enumerate(certify(f, 0.5, BOX).joints):
         box = HandOver(BOX.deviation * joint.hand_over_max, BOX.rate * joint.hand_over_max)
@@ -106,7 +108,7 @@ def test_margin_falls_with_disturbance_assistance_and_hand_over():
         assert len(set(margins)) > 1
 
 
-def test_a_guide_that_snaps_shut_has_no_safe_state_and_says_where():
+def test_guide_that_snaps_shut_has_no_safe_state():
     certificate = certify(guide("snap"), 0.5, BOX)
     assert not certificate.certified
     assert "no state of SH is safe: at 0.40 T" in certificate.reason
@@ -114,15 +116,15 @@ def test_a_guide_that_snaps_shut_has_no_safe_state_and_says_where():
     assert certificate.joints[0].u_ext_max == (0.0, 0.0)
 
 
-def test_a_guide_narrower_than_the_stiffness_holds_is_told_with_what_it_holds():
+def test_guide_too_narrow_for_the_stiffness_is_not_certified():
     soft = replace(CONFIG, policies=(BackupPolicy(1500.0, 250.0, 8.0), POLICIES[1]))
     certificate = certify(guide("narrowing", soft), 0.75, BOX)
     assert not certificate.certified
     assert "SH may leave the guide by" in certificate.reason or "no state of SH is safe" in certificate.reason
-    assert "Nm" not in certificate.reason  # those of the separate inertias are not the joint's
+    assert "Nm" not in certificate.reason  # torques of the separate inertias are not joint torques
 
 
-def test_a_hand_over_that_is_too_rough_is_told():
+def test_too_large_hand_over_is_not_certified():
     certificate = certify(guide("widening", UNLIMITED), 0.5, HandOver(0.15, 4.0))
     assert not certificate.certified
     assert "may leave the guide by" in certificate.reason
@@ -130,14 +132,14 @@ def test_a_hand_over_that_is_too_rough_is_told():
     assert certificate.joints[0].hand_over_max < 1.0
 
 
-def test_a_drive_too_weak_is_told():
+def test_too_weak_drive_is_not_certified():
     weak = replace(CONFIG, policies=(replace(POLICIES[0], torque_limit=60.0), POLICIES[1]))
     certificate = certify(guide("constant", weak), 0.5, BOX)
     assert not certificate.certified
     assert "the backup policy of SH needs 215 % of its torque limit" in certificate.reason
 
 
-def test_an_underdamped_policy_pays_for_its_ringing():
+def test_underdamped_policy_has_a_smaller_margin():
     ringing = replace(CONFIG, policies=(BackupPolicy(6300.0, 60.0, 8.0), POLICIES[1]))
     assert (
         certify(guide("constant", ringing), 0.5, BOX).joints[0].margin
@@ -145,8 +147,8 @@ def test_an_underdamped_policy_pays_for_its_ringing():
     )
 
 
-def test_the_overlap_takes_speed_out_of_the_end_of_a_step():
-    """Without it a joint about to leave the guide is admitted at T; with it, it is not."""
+def test_overlap_makes_high_speed_at_the_step_end_unsafe():
+    """Without overlap, a joint that is about to leave the guide counts as safe at T; with overlap it is unsafe."""
     short, long = (guide("constant", replace(CONFIG, overlap=o)) for o in (0.0, 0.1))
     about_to_leave = (0.9 * half_width(0.5), 1.5, 0.0, 0.0)
     for f in (short, long):
@@ -155,8 +157,8 @@ def test_the_overlap_takes_speed_out_of_the_end_of_a_step():
     assert short.h[0] > 0.0 > long.h[0]
 
 
-def test_the_image_is_not_empty_along_a_certified_step():
-    """The state the backup policy itself reaches from the re-centred start is safe at every cycle, with the margin."""
+def test_safe_image_is_not_empty_along_a_certified_step():
+    """The state that the backup policy reaches from the re-centred start is safe in every cycle, with the margin."""
     for shape in ("constant", "pinched"):
         f = guide(shape)
         margin = certify(f, 0.5, HandOver(0.0, 0.0)).margin
@@ -176,14 +178,14 @@ INERTIA = AssistedInertia(pinocchio_model(urdf(ExoskeletonParameters(), load_rob
 
 
 def ideal(knee: float, push: tuple[float, float]) -> np.ndarray:
-    """J M^-1 d of a real push, from the entries of the mass matrix [Nm]."""
+    """Return J M^-1 d of a real push, from the entries of the mass matrix [Nm]."""
     m11, m12, m22 = INERTIA.block(knee)
     return np.array(INERTIA.inertias) * np.linalg.solve([[m11, m12], [m12, m22]], push)
 
 
 @pytest.mark.parametrize("shape", ["constant", "widening", "narrowing", "pinched", "asymmetric"])
 @pytest.mark.parametrize("xi", [0.0, 0.5])
-def test_the_real_pair_is_inside_the_filters_bounds_in_every_pose_and_no_smaller_than_need_be(shape: str, xi: float):
+def test_real_torque_pair_is_tight_within_the_filter_bounds(shape: str, xi: float):
     f = guide(shape)
     bound = certify(f, xi, BOX, INERTIA).joint_torque
     assert bound is not None
@@ -203,13 +205,13 @@ def test_the_real_pair_is_inside_the_filters_bounds_in_every_pose_and_no_smaller
     assert worst.max() == pytest.approx(1.0, abs=0.01)
 
 
-def test_at_a_straight_knee_a_real_torque_counts_several_times():
+def test_real_torque_is_amplified_at_a_straight_knee():
     np.testing.assert_allclose(ideal(0.0, (1.0, 0.0)), (7.6, -3.4), atol=0.1)
     np.testing.assert_allclose(ideal(0.0, (0.0, 1.0)), (-14.7, 7.7), atol=0.1)
 
 
-def test_the_real_pair_follows_the_bounds_the_filter_is_built_for():
-    """A filter built for twice as much promises twice as much; what its margin leaves does not count."""
+def test_real_torque_pair_scales_with_the_filter_bounds():
+    """A filter with twice the bounds has twice the torque pair; its margin has no effect."""
     one, two = (certify(guide("pinched", scaled(s)), 0.5, BOX, INERTIA).joint_torque for s in (0.5, 1.0))
     assert one is not None
     assert two is not None
@@ -218,20 +220,20 @@ def test_the_real_pair_follows_the_bounds_the_filter_is_built_for():
     assert certify(guide("pinched", lopsided), 0.5, BOX, INERTIA).joint_torque == two
 
 
-def test_one_sided_bounds_admit_nothing_in_every_direction():
+def test_one_sided_bounds_give_a_real_torque_pair_of_zero():
     one_sided = replace(CONFIG, disturbance=((0.0, 30.0), (-20.0, 20.0)))
     bound = certify(guide("constant", one_sided), 0.5, BOX, INERTIA).joint_torque
     assert bound is not None
     assert (str(bound.hip), str(bound.knee)) == ("0.0", "0.0")
 
 
-def test_there_is_no_real_pair_without_a_certificate_or_a_mass_matrix():
+def test_no_real_torque_pair_without_certificate_or_mass_matrix():
     assert certify(guide("snap"), 0.5, BOX, INERTIA).joint_torque is None
     assert certify(guide("constant"), 0.5, BOX).joint_torque is None
 
 
 @pytest.mark.parametrize("bad", [-1e-9, math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("name", ["deviation", "rate"])
-def test_a_hand_over_must_be_finite_and_not_negative(name: str, bad: float):
+def test_invalid_hand_over_is_rejected(name: str, bad: float):
     with pytest.raises(ValueError, match=rf"{name} of the hand-over must be finite and at least 0, got"):
         HandOver(**{name: bad})

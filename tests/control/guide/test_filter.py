@@ -1,4 +1,4 @@
-"""Virtual guide filter: exact flow against integration, the gate's laws, and invariance under every kind of push.
+"""Guide filter: exact flow compared with integration, properties of the gate, and invariance under disturbances.
 
 The plant here is the one the filter assumes: two separate inertias, torque held over a cycle. What the coupled
 exoskeleton does is the controller's test.
@@ -61,7 +61,7 @@ def integrated(
     uf: bool = False,
     substeps: int = 2,
 ) -> np.ndarray:
-    """Runge-Kutta rollouts of both joints under both extremes, drive limits in. Shape (end - cycle + 1, 2, 2) of e."""
+    """Return Runge-Kutta rollouts of e, with drive limits: shape (end - cycle + 1, joint, lower or upper extreme)."""
     j, kp, kd = (np.array([getattr(p, name) for p in config.policies])[:, None] for name in ("inertia", "kp", "kd"))
     limit = np.array([(1.0 - config.reserve) * p.torque_limit for p in config.policies])[:, None]
     push = np.array(config.disturbance)[:, ::-1]  # upper extreme first
@@ -114,7 +114,7 @@ def test_rollouts_agree_with_runge_kutta(cycle: int, uf: bool):
 
 
 def ratios(f: GuideFilter, cycle: int, errors: np.ndarray) -> np.ndarray:
-    """Largest |e| / q_bound of each joint over the grid, and now. `errors` shape (n, joint, extreme) on the cycle grid."""
+    """Return the largest |e| / q_bound of each joint over the grid; `errors` has shape (cycles, joint, extreme)."""
     points = np.concatenate([[cycle], f.grid[f.grid >= cycle]])
     bounds = f.shape.bounds(f.time[points] / GAIT.duration, 0.5)
     at = errors[points - cycle]
@@ -131,7 +131,7 @@ def test_h_is_one_minus_the_largest_ratio_squared(shape: str, cycle: int):
     assert f.stepped == 0
 
 
-def test_h_where_the_drive_saturates_is_that_of_the_limited_loop():
+def test_h_of_a_saturating_drive_matches_the_limited_loop():
     rng = np.random.default_rng(12)
     worst_excess = 0.0
     for cycle in (0, 210, 333, 600):
@@ -142,7 +142,7 @@ def test_h_where_the_drive_saturates_is_that_of_the_limited_loop():
             stepped = 1.0 - ratios(f, cycle, integrated(LIMITED, cycle, f.horizon, state, substeps=1)) ** 2
             for joint in (0, 1):
                 if stepped[joint] > -1.0:
-                    # Never more sure than the limited loop; at most a little less (the grid, the linear bound).
+                    # h is at most that of the limited loop, and slightly smaller because of grid and linear bound.
                     assert f.h[joint] <= stepped[joint] + 0.01
                     worst_excess = max(worst_excess, stepped[joint] - f.h[joint])
                 else:
@@ -151,8 +151,8 @@ def test_h_where_the_drive_saturates_is_that_of_the_limited_loop():
     assert worst_excess < 0.05
 
 
-def test_saturation_matters():
-    """The same state is safe with an ideal drive and unsafe with a weak one."""
+def test_weak_drive_makes_a_safe_state_unsafe():
+    """The same state is safe with an ideal drive and unsafe with a weak drive."""
     state = (200, 0.045, 0.9, 0.0, 0.0)
     ideal, weak = guide(), guide(replace(LIMITED, policies=(policy(8.0, 28.0, limit=80.0), KNEE)))
     ideal.tick(*state)
@@ -160,8 +160,8 @@ def test_saturation_matters():
     assert ideal.h[0] > 0.0 > weak.h[0]
 
 
-def test_feedforward_in_the_rollout_opens_the_filter():
-    """With u_f meant for the nominal motion, P vanishes: h is not falsely small."""
+def test_feedforward_in_the_rollout_increases_h():
+    """With the feedforward of the nominal motion, P vanishes, so h is not too small."""
     needed = bezier(derivative(derivative(NOMINAL)), np.linspace(0, 1, 801)) / GAIT.duration**2 * [8.0, 1.9]
     basis = bezier(np.eye(8), np.linspace(0, 1, 801))
     f = guide(uf=np.linalg.lstsq(basis, needed, rcond=None)[0].T)
@@ -179,26 +179,26 @@ H, XI = st.floats(-1e6, 1.0), st.floats(0.0, 1.0)
 
 
 @given(H, XI, st.floats(-1e9, 1e9), st.floats(0.0, 1.0))
-def test_gates_stay_between_nothing_and_the_whole_backup_policy(h: float, xi: float, rate: float, zeta: float):
+def test_gates_are_between_zero_and_one(h: float, xi: float, rate: float, zeta: float):
     weight = gate(h, xi)
     assert 0.0 <= weight <= 1.0
     assert weight <= damped_gate(weight, rate, zeta) <= 1.0
 
 
 @given(XI)
-def test_gate_is_the_papers_inside_and_shut_outside(xi: float):
+def test_gate_follows_the_paper_inside_and_is_one_outside(xi: float):
     for h in (0.1, 0.5, 0.9, 1.0):
         assert gate(h, xi) == pytest.approx((1.0 + (xi**10 - 1.0) * h) ** 3)
     assert gate(0.0, xi) == gate(-3.0, xi) == gate(-1e9, xi) == 1.0
 
 
 @given(H)
-def test_full_assistance_is_the_whole_backup_policy(h: float):
+def test_full_assistance_applies_the_full_backup_policy(h: float):
     assert gate(h, 1.0) == 1.0
 
 
 @given(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), XI)
-def test_gate_closes_as_h_falls(a: float, b: float, xi: float):
+def test_gate_increases_as_h_falls(a: float, b: float, xi: float):
     assert gate(min(a, b), xi) >= gate(max(a, b), xi)
 
 
@@ -225,7 +225,7 @@ def test_derivative_term_acts_when_h_falls_and_not_across_a_step_change():
 
 @given(st.integers(0, 800), *[st.floats(-0.2, 0.2), st.floats(-4.0, 4.0)] * 2)
 @settings(max_examples=60)
-def test_torque_is_a_part_of_the_backup_policys(cycle: int, e1: float, ed1: float, e2: float, ed2: float):
+def test_torque_is_the_gated_backup_torque(cycle: int, e1: float, ed1: float, e2: float, ed2: float):
     f = SHARED
     u = f.tick(cycle, e1, ed1, e2, ed2)
     for joint, (e, ed) in enumerate(((e1, ed1), (e2, ed2))):
@@ -239,7 +239,7 @@ def test_torque_is_a_part_of_the_backup_policys(cycle: int, e1: float, ed1: floa
 SHARED = guide(LIMITED)
 
 
-def test_the_middle_of_the_guide_is_left_alone():
+def test_middle_of_the_guide_gets_almost_no_torque():
     f = guide(replace(CONFIG, disturbance=((-5.0, 5.0), (-2.0, 2.0))))
     for cycle in (300, 790):
         u = f.tick(cycle, 0.0, 0.0, 0.0, 0.0)
@@ -247,7 +247,7 @@ def test_the_middle_of_the_guide_is_left_alone():
         assert max(map(abs, u)) < 0.1
 
 
-def test_who_ticks_the_tables_themselves_gets_the_filters_own_torque():
+def test_tick_on_the_tables_gives_the_torque_of_the_filter():
     asked, ticked = guide(), guide()
     errors = 0.03, 0.4, -0.02, -0.3
     torque = asked.tick(100, *errors)
@@ -255,7 +255,7 @@ def test_who_ticks_the_tables_themselves_gets_the_filters_own_torque():
     assert (ticked.h, ticked.gates, ticked.bounds) == (asked.h, asked.gates, asked.bounds)
 
 
-def test_past_its_end_a_step_stays_at_its_end():
+def test_tick_after_the_end_of_a_step_uses_its_last_cycle():
     f = guide()
     f.tick(800, 0.01, 0.1, 0.0, 0.0)
     end = list(f.h)
@@ -263,7 +263,7 @@ def test_past_its_end_a_step_stays_at_its_end():
     assert f.h == end
 
 
-def test_one_sided_disturbances_and_guides_count_on_their_side():
+def test_one_sided_disturbances_affect_only_their_side():
     both, up, down = (
         guide(replace(CONFIG, disturbance=((low, high), (low, high))))
         for low, high in ((-300.0, 300.0), (0.0, 300.0), (-300.0, 0.0))
@@ -280,7 +280,7 @@ def test_one_sided_disturbances_and_guides_count_on_their_side():
     assert f.h[0] < above
 
 
-def test_a_ringing_loop_counts_the_worst_signal_not_the_two_extremes():
+def test_ringing_loop_includes_the_worst_switching_disturbance():
     f = guide(RINGING)
     f.tick(0, 0.0, 0.0, 0.0, 0.0)
     extremes = ratios(f, 0, integrated(RINGING, 0, f.horizon, np.zeros((2, 2))))
@@ -308,15 +308,15 @@ def test_a_ringing_loop_counts_the_worst_signal_not_the_two_extremes():
         {"reserve": float("nan")},
     ],
 )
-def test_refuses_a_configuration_that_is_none(bad: dict[str, object]):
+def test_invalid_configuration_is_rejected(bad: dict[str, object]):
     (name,) = bad
     with pytest.raises(ValueError, match=rf"{name}.* got "):
         replace(CONFIG, **bad)
 
 
 @pytest.mark.parametrize("value", [-1.0, 0.0, math.nan])
-def test_a_shape_with_a_bad_bound_at_a_cycle_of_the_step_is_refused_when_the_filter_is_made(value: float):
-    """At phase 333 / 800, which lies between those a shape is checked at when it is made, and not at Xi = 0."""
+def test_filter_rejects_a_shape_with_an_invalid_bound_in_a_cycle(value: float):
+    """The bound is invalid only at phase 333 / 800, between the phases checked by GuideShape, and not at Xi = 0."""
 
     def fractions(phase: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
         bad = (np.abs(phase - 0.41625) < 1e-5) & (width < half_width(0.4))
@@ -327,7 +327,7 @@ def test_a_shape_with_a_bad_bound_at_a_cycle_of_the_step_is_refused_when_the_fil
         GuideFilter(CONFIG, shape, DEADBEAT, NOMINAL, FOLLOWING)
 
 
-def test_a_shape_with_a_bad_bound_at_one_factor_is_refused_before_a_step_takes_it():
+def test_start_step_rejects_a_shape_with_an_invalid_bound():
     shape = GuideShape(
         "factor", "", lambda p, w: (np.full_like(p, 0.0 if abs(w - half_width(0.512)) < 1e-9 else 1.0), np.ones_like(p))
     )
@@ -349,7 +349,7 @@ def test_a_shape_with_a_bad_bound_at_one_factor_is_refused_before_a_step_takes_i
         {"reserve": 0.0},
     ],
 )
-def test_accepts_what_is_just_valid(good: dict[str, object]):
+def test_limits_of_the_configuration_are_accepted(good: dict[str, object]):
     (name,) = good
     assert getattr(replace(CONFIG, **good), name) == good[name]
 
@@ -384,7 +384,7 @@ def pushes(seed: int) -> dict[str, Push]:
 
 
 def walk(config: GuideConfig, shape: GuideShape, push: Push, hand_over: HandOver, steps: int, seed: int = 0) -> float:
-    """Largest |e| / q_bound over steps that start anywhere in the hand-over box."""
+    """Return the largest |e| / q_bound over steps that start at random corners of the hand-over box."""
     f = GuideFilter(config, shape, DEADBEAT, NOMINAL, FOLLOWING)
     inertia = np.array([p.inertia for p in config.policies])
     time = np.arange(801) * PERIOD
@@ -417,20 +417,20 @@ BOX = HandOver()
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", list(pushes(0)))
 @pytest.mark.parametrize("shape", CERTIFIED)
-def test_a_certified_guide_is_never_left(shape: str, kind: str):
+def test_certified_guide_is_never_left(shape: str, kind: str):
     assert certify(guide(LIMITED, shape), 0.5, BOX).certified
     assert walk(LIMITED, SHAPES[shape], pushes(3)[kind], BOX, 3) <= 1.0
 
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", ["swing", "random", "with the motion"])
-def test_a_certified_ringing_guide_is_never_left(kind: str):
+def test_certified_guide_of_a_ringing_loop_is_never_left(kind: str):
     assert certify(guide(RINGING), 0.5, BOX).certified
     assert walk(RINGING, SHAPES["constant"], pushes(4)[kind], BOX, 2) <= 1.0
 
 
 @pytest.mark.exhaustive
-def test_an_uncertified_guide_is_left():
+def test_uncertified_guide_is_left():
     weak = replace(CONFIG, policies=(policy(8.0, 14.0), policy(1.9, 14.0)))
     for config, shape in ((weak, "pinched"), (LIMITED, "snap")):
         assert not certify(guide(config, shape), 0.5, BOX).certified

@@ -1,4 +1,4 @@
-"""Rollouts at the torque limit against the same loop integrated finely, and the machine code against its source."""
+"""Guide kernel: rollouts at the torque limit compared with fine integration, and compiled code with its source."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ POLICIES = (
 RINGING = (BackupPolicy(6300.0, 150.0, 8.0, POLICIES[0].torque_limit), POLICIES[1])
 DISTURBANCE = ((-30.0, 25.0), (-20.0, 15.0))
 XI = 0.5
-#: Closes from 0.07 to 0.03 rad above, 0.05 rad below.
+#: Upper bound closes from 0.07 to 0.03 rad; lower bound is 0.05 rad.
 SHAPE = GuideShape(
     "closing", "", lambda phase, width: ((0.07 - 0.04 * phase) / width, np.full_like(phase, 0.05 / width))
 )
@@ -61,7 +61,7 @@ DRIFT = table([free_drift(p, DEADBEAT, q, after, GUIDE.time) for p, q, after in 
 def march(
     joint: int, side: int, cycle: int, e: float, ed: float, limit: float, substeps: int = 4
 ) -> tuple[float, float]:
-    """Largest ratio and torque by small steps; the known drift is added exactly."""
+    """Return the largest ratio and torque, integrated in small steps; the drift is added exactly."""
     policy, external, sign = POLICIES[joint], DISTURBANCE[joint][1 - side], -1.0 if side else 1.0
     drift, h = DRIFT[:, 2 * joint : 2 * joint + 2], PERIOD / substeps
     ratio, torque = -math.inf, 0.0
@@ -71,7 +71,7 @@ def march(
             asked = -policy.kp * e - policy.kd * ed
             torque = max(torque, -sign * asked)
             a = (max(-limit, min(limit, asked)) + external) / policy.inertia + pushed
-            # second order: the torque of the middle of the step
+            # midpoint method: torque at the middle of the step
             middle, middle_rate = e + 0.5 * h * ed, ed + 0.5 * h * a
             asked = -policy.kp * middle - policy.kd * middle_rate
             a = (max(-limit, min(limit, asked)) + external) / policy.inertia + pushed
@@ -86,10 +86,10 @@ def found(joint: int, side: int, cycle: int, e: float, ed: float) -> float:
 
 @given(st.integers(0, 1), st.integers(0, 1), st.integers(0, 800), st.floats(0.0, 0.08), st.floats(-1.5, 1.5))
 @settings(max_examples=40, deadline=None)
-def test_ratio_is_that_of_the_loop_with_its_limit(joint: int, side: int, cycle: int, away: float, rate: float):
-    """From any state on the side that is asked for: that is where the guide asks."""
+def test_ratio_matches_the_integrated_loop_with_its_limit(joint: int, side: int, cycle: int, away: float, rate: float):
+    """The state is on the checked side, as in the guide filter."""
     e, ed = (-away, -rate) if side else (away, rate)
-    now = away / BOUNDS[cycle, side]  # the guide's to add
+    now = away / BOUNDS[cycle, side]  # ratio of the present state; the guide filter adds it
     expected = max(march(joint, side, cycle, e, ed, LIMITS[joint])[0], now)
     ratio = max(found(joint, side, cycle, e, ed), now)
     if expected > 1.9:
@@ -98,18 +98,18 @@ def test_ratio_is_that_of_the_loop_with_its_limit(joint: int, side: int, cycle: 
         assert ratio == pytest.approx(expected, abs=0.02)
 
 
-def test_the_limit_matters_and_the_linear_flow_would_not_see_it():
+def test_torque_limit_increases_the_ratio():
     state = (0, 0, 100, 0.06, 0.5)
     linear, torque = march(*state, math.inf)
     assert torque > LIMITS[0]
     assert found(*state) > linear + 0.05
 
 
-def test_a_hopeless_rollout_is_left_early_and_told_as_such():
+def test_rollout_far_outside_the_guide_has_a_large_ratio():
     assert found(0, 0, 0, 0.3, 4.0) > 2.0
 
 
-def test_rollouts_that_saturate_are_counted():
+def test_saturated_rollouts_are_counted():
     f = guide()
     f.tick(400, 0.0, 0.0, 0.0, 0.0)
     assert f.joints["stepped"].tolist() == [0, 0]
@@ -124,7 +124,7 @@ def test_p_and_drift_are_linear_in_the_deviations():
     np.testing.assert_allclose(np.hstack(list(GUIDE.step[:, :, 2:4])), DRIFT, atol=1e-12)
 
 
-def test_at_first_the_step_is_one_without_assistance_and_without_a_deviation():
+def test_new_filter_has_a_step_without_assistance_and_deviation():
     f, started = (
         GuideFilter(GuideConfig(POLICIES, DISTURBANCE), SHAPE, DEADBEAT, *(GAIT.coefficients[2:4],) * 2) for _ in "ab"
     )
@@ -134,7 +134,7 @@ def test_at_first_the_step_is_one_without_assistance_and_without_a_deviation():
     assert f.joints["xi"].tolist() == [0.0, 0.0]
 
 
-def test_p_and_drift_count_on_the_feedforward():
+def test_p_and_drift_include_the_feedforward():
     uf = np.random.default_rng(6).normal(size=(2, 8)) * 10.0
     f = GuideFilter(
         GuideConfig(POLICIES, DISTURBANCE),
@@ -155,7 +155,7 @@ def test_p_and_drift_count_on_the_feedforward():
     ("points", "stride", "first", "horizon"),
     [(100, 8, 0, 904), (300, 3, 2, 902), (800, 1, 0, 900), (5000, 1, 0, 900), (2, 400, 0, 1200)],
 )
-def test_the_grid_ends_where_the_step_does_and_goes_on_beyond(points: int, stride: int, first: int, horizon: int):
+def test_grid_extends_beyond_the_end_of_the_step(points: int, stride: int, first: int, horizon: int):
     f = tube(points=points)
     assert (f.cycles, f.stride, f.horizon) == (800, stride, horizon)
     assert f.grid.tolist() == list(range(first, horizon + 1, stride))
@@ -164,7 +164,7 @@ def test_the_grid_ends_where_the_step_does_and_goes_on_beyond(points: int, strid
     assert f.joints["stride"].tolist() == [stride] * 2
 
 
-def test_the_width_is_that_of_the_assistance_factor():
+def test_width_follows_the_assistance_factor():
     assert SHAPE.bounds(np.zeros(1), XI)[0] == pytest.approx((0.07, 0.05))
     f = guide()
     f.start_step(0.9, DEVIATION, RATE)
@@ -179,7 +179,7 @@ def test_the_width_is_that_of_the_assistance_factor():
 
 
 @pytest.mark.parametrize("policies", [POLICIES, RINGING], ids=["monotone", "ringing"])
-def test_the_machine_code_does_what_its_source_does(policies: tuple[BackupPolicy, BackupPolicy]):
+def test_compiled_filter_matches_its_source(policies: tuple[BackupPolicy, BackupPolicy]):
     rng = np.random.default_rng(4)
     machine, source = guide(policies), guide(policies)
     for cycle in np.sort(rng.integers(0, 801, 40)).tolist():
@@ -191,8 +191,8 @@ def test_the_machine_code_does_what_its_source_does(policies: tuple[BackupPolicy
     assert machine.stepped == source.stepped > 0
 
 
-def test_a_state_that_is_no_number_gives_a_torque_that_is_none():
-    """The limiter turns it into HOLD; a limit that swallowed it would not."""
+def test_state_of_nan_gives_a_torque_of_nan():
+    """NaN must reach the torque limiter, which changes to HOLD."""
     f = guide()
     assert all(math.isnan(u) for u in f.tick(100, math.nan, 0.0, 0.0, math.nan))
 
@@ -200,7 +200,7 @@ def test_a_state_that_is_no_number_gives_a_torque_that_is_none():
 # -- a rollout cycle by cycle ------------------------------------------------------------------------------------------
 
 
-#: 0.06 rad above and 0.05 below, whatever the assistance factor.
+#: Upper bound 0.06 rad and lower bound 0.05 rad, for every assistance factor.
 TUBE = GuideShape(
     "tube", "", lambda phase, width: (np.full_like(phase, 0.06 / width), np.full_like(phase, 0.05 / width))
 )
@@ -225,7 +225,7 @@ def of(f: GuideFilter, joint: int) -> tuple[np.void, np.ndarray, np.ndarray]:
 def cycle_by_cycle(
     f: GuideFilter, joint: int, side: int, cycle: int, e: float, ed: float
 ) -> tuple[list[float], list[bool]]:
-    """Error towards the side, and whether the drive saturates, of every cycle from `cycle` to the horizon."""
+    """Return the error towards the side and whether the drive saturates, for each cycle from `cycle` to the horizon."""
     policy, (low, high) = f.config.policies[joint], f.config.disturbance[joint]
     (external, sign), limit = ((low, -1.0) if side else (high, 1.0)), (1.0 - RESERVE) * policy.torque_limit
     (phi,), (s,) = policy.transition(np.array([PERIOD])), policy.step_response(np.array([PERIOD]))
@@ -250,8 +250,8 @@ STATES = np.random.default_rng(8).uniform(-1.0, 1.0, (60, 2)) * [0.06, 1.2]
 @pytest.mark.parametrize("joint", [0, 1])
 @pytest.mark.parametrize("side", [0, 1])
 @pytest.mark.parametrize("limits", [LIMITS, (60.0, 40.0)], ids=["strong", "weak"])
-def test_a_limited_rollout_is_that_of_the_loop_cycle_by_cycle(limits: tuple[float, float], joint: int, side: int):
-    """Weak drives saturate, come off their limit and saturate again."""
+def test_limited_rollout_matches_the_loop_cycle_by_cycle(limits: tuple[float, float], joint: int, side: int):
+    """Weak drives saturate, leave their limit and saturate again."""
     hip, knee = (replace(p, torque_limit=limit / (1.0 - RESERVE)) for p, limit in zip(POLICIES, limits, strict=True))
     f, bound, again = tube((hip, knee), points=800), (0.06, 0.05)[side], 0
     for cycle in (0, 350, 600, f.horizon - 1):
@@ -270,7 +270,7 @@ def test_a_limited_rollout_is_that_of_the_loop_cycle_by_cycle(limits: tuple[floa
 
 
 @pytest.mark.parametrize("side", [0, 1])
-def test_where_the_loop_rings_what_the_worst_disturbance_adds_counts_from_the_start(side: int):
+def test_ringing_loop_includes_the_worst_disturbance_from_the_start(side: int):
     weak = replace(RINGING[0], torque_limit=15.0)
     f, sign, bound, (low, high) = tube((weak, POLICIES[1])), (1.0, -1.0)[side], (0.06, 0.05)[side], DISTURBANCE[0]
     state = sign * 0.02, 0.0
@@ -290,7 +290,7 @@ WEAK = tuple(replace(p, torque_limit=limit) for p, limit in zip(POLICIES, (75.0,
 
 
 def expected_tick(f: GuideFilter, joint: int, cycle: int, e: float, ed: float) -> tuple[float, int]:
-    """Ratio of one joint, and the rollouts that are stepped."""
+    """Return the ratio of one joint, and the number of rollouts that are integrated step by step."""
     policy, (low, high) = f.config.policies[joint], f.config.disturbance[joint]
     limit = (1.0 - RESERVE) * policy.torque_limit
     points = f.grid[f.grid >= cycle]
@@ -319,7 +319,7 @@ def expected_tick(f: GuideFilter, joint: int, cycle: int, e: float, ed: float) -
 
 
 @pytest.mark.parametrize("policies", [POLICIES, WEAK, RINGING], ids=["monotone", "weak", "ringing"])
-def test_a_tick_is_the_papers_law_of_the_largest_ratio(policies):
+def test_tick_applies_the_law_of_the_paper_to_the_largest_ratio(policies):
     f = tube(policies, zeta=0.02, derivative_time=0.004)
     h, rate, fresh, steps = [1.0, 1.0], [0.0, 0.0], True, [0, 0]
     for i, states in enumerate(np.random.default_rng(2).uniform(-1.0, 1.0, (24, 4)) * [0.03, 0.7, 0.03, 0.7]):
@@ -365,7 +365,7 @@ def test_a_tick_is_the_papers_law_of_the_largest_ratio(policies):
         (0.25, -4.0, 0.0, 0.25),
     ],
 )
-def test_a_falling_h_takes_the_rest_of_the_weight_in_proportion(weight: float, rate: float, zeta: float, damped: float):
+def test_falling_h_increases_the_gate_in_proportion(weight: float, rate: float, zeta: float, damped: float):
     assert damped_gate(weight, rate, zeta) == damped
 
 
@@ -373,5 +373,5 @@ def test_a_falling_h_takes_the_rest_of_the_weight_in_proportion(weight: float, r
     ("h", "xi", "weight"),
     [(-1.0, 0.0, 1.0), (0.0, 0.0, 1.0), (0.5, 0.0, 0.125), (1.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1.5, 0.0, 0.0)],
 )
-def test_the_gate_of_the_paper(h: float, xi: float, weight: float):
+def test_gate_has_the_values_of_the_paper(h: float, xi: float, weight: float):
     assert gate(h, xi) == weight

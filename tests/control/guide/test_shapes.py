@@ -1,4 +1,4 @@
-"""Guide shapes: what each is along a step, and the width the assistance factor gives it."""
+"""Guide shapes: their bounds along a step, and their width at each assistance factor."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NAMES = list(SHAPES)
 
 
 @given(st.floats(0.0, 1.0))
-def test_half_width_is_the_papers(xi: float):
+def test_half_width_follows_the_paper(xi: float):
     assert half_width(xi) == pytest.approx(math.radians(0.5 + 7.0 * (1.0 - xi)))
 
 
@@ -28,14 +28,14 @@ def test_half_width_at_half_assistance_is_four_degrees():
 
 
 @pytest.mark.parametrize("bad", [-0.01, 1.01, float("nan")])
-def test_half_width_refuses_what_is_no_factor(bad: float):
+def test_half_width_rejects_an_invalid_factor(bad: float):
     with pytest.raises(ValueError, match="between 0 and 1"):
         half_width(bad)
 
 
 @pytest.mark.parametrize("shape", ALL, ids=NAMES)
 @given(xi=st.floats(0.0, 1.0))
-def test_every_shape_is_open_and_no_wider_than_the_factor_allows(shape: GuideShape, xi: float):
+def test_every_shape_is_positive_and_at_most_the_half_width(shape: GuideShape, xi: float):
     bounds = shape.bounds(PHASE, xi)
     assert bounds.shape == (len(PHASE), 2)
     assert (bounds > 0.0).all()
@@ -43,7 +43,7 @@ def test_every_shape_is_open_and_no_wider_than_the_factor_allows(shape: GuideSha
 
 
 @pytest.mark.parametrize("shape", ALL, ids=NAMES)
-def test_every_shape_shrinks_with_the_factor_and_keeps_its_last_width(shape: GuideShape):
+def test_every_shape_shrinks_with_the_assistance_factor(shape: GuideShape):
     widths = np.stack([shape.bounds(PHASE, xi) for xi in (0.0, 0.25, 0.5, 0.75, 1.0)])
     assert (np.diff(widths, axis=0) <= 1e-12).all()
     np.testing.assert_array_equal(
@@ -52,12 +52,12 @@ def test_every_shape_shrinks_with_the_factor_and_keeps_its_last_width(shape: Gui
 
 
 @pytest.mark.parametrize("name", ["constant", "widening", "narrowing", "pinched", "asymmetric"])
-def test_certifiable_shapes_have_no_step(name: str):
+def test_certifiable_shapes_are_continuous(name: str):
     bounds = SHAPES[name].bounds(PHASE, 0.5)
     assert np.abs(np.diff(bounds, axis=0)).max() < 0.02 * half_width(0.5)
 
 
-def test_shapes_do_what_their_names_say():
+def test_shapes_have_the_widths_of_their_names():
     def at(name: str, phase: float) -> np.ndarray:
         return np.degrees(SHAPES[name].bounds(np.array([phase]), 0.5)[0])
 
@@ -76,12 +76,12 @@ def test_shapes_do_what_their_names_say():
     np.testing.assert_allclose(at("snap", 0.5), [0.1, 0.1])
 
 
-def test_a_guide_already_narrower_than_the_pinch_stays_as_it_is():
+def test_pinch_does_not_narrow_an_already_narrow_guide():
     np.testing.assert_allclose(SHAPES["pinched"].bounds(PHASE, 1.0), half_width(1.0))
 
 
 def at(value: float, side: int = 0, where: Callable[[np.ndarray, float], np.ndarray] | None = None):
-    """Fractions of 1, but of `value` on a side, where `where(phase, half_width)` is true."""
+    """Return fractions of 1, and of `value` on one side where `where(phase, half_width)` is true."""
 
     def fractions(phase: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
         sides = [np.ones_like(phase), np.ones_like(phase)]
@@ -93,14 +93,14 @@ def at(value: float, side: int = 0, where: Callable[[np.ndarray, float], np.ndar
 
 @pytest.mark.parametrize("side", [0, 1])
 @pytest.mark.parametrize("value", [-1.0, 0.0, -0.0, math.nan, math.inf, -math.inf, 1e-300, 1e-6])
-def test_a_shape_with_a_bound_that_is_none_is_refused_when_it_is_made(value: float, side: int):
+def test_shape_with_an_invalid_bound_is_rejected(value: float, side: int):
     with pytest.raises(ValueError, match=rf"bounds of the guide shape 'own' must be .*{('upper', 'lower')[side]}"):
         GuideShape("own", "", at(value, side))
     with pytest.raises(ValueError, match="'constant' must be finite"):
         replace(CONSTANT, fractions=at(value, side))
 
 
-def test_a_refusal_names_shape_phase_factor_and_value():
+def test_error_names_shape_phase_factor_and_value():
     negative = at(-0.5, 1, lambda phase, width: np.abs(phase - 0.43) < 3e-4)
     with pytest.raises(ValueError) as refused:  # noqa: PT011
         GuideShape("notched", "", negative)
@@ -110,13 +110,13 @@ def test_a_refusal_names_shape_phase_factor_and_value():
     )
 
 
-def test_a_shape_that_closes_after_scaling_is_refused_when_it_is_made():
-    """Its fractions fall below zero in narrow guides alone."""
+def test_shape_that_closes_in_narrow_guides_is_rejected():
+    """Its fractions are negative only in narrow guides."""
     with pytest.raises(ValueError, match=r"'narrow' must be .* and Xi 0\.85"):
         GuideShape("narrow", "", lambda phase, width: ((width - 0.03) * np.ones_like(phase), np.ones_like(phase)))
 
 
-def test_bounds_that_were_not_looked_at_when_it_was_made_are_refused_when_asked_for():
+def test_invalid_bound_between_the_checked_phases_is_rejected_on_use():
     between = GuideShape("between", "", at(-1.0, 0, lambda phase, width: np.abs(phase - 0.41625) < 1e-5))
     with pytest.raises(ValueError, match=r"'between' must be .* at phase 0\.4163"):
         between.bounds(PHASE, 0.5)
@@ -130,12 +130,12 @@ def test_bounds_that_were_not_looked_at_when_it_was_made_are_refused_when_asked_
         lambda phase, width: [phase + 1.0],
     ],
 )
-def test_fractions_of_other_shapes_are_refused(fractions):
+def test_fractions_of_another_array_shape_are_rejected(fractions):
     with pytest.raises(
         ValueError, match=r"fractions of the guide shape 'own' must return 2 arrays of shape \(2001,\), got"
     ):
         GuideShape("own", "", fractions)
 
 
-def test_the_narrowest_shape_is_accepted():
+def test_very_narrow_shape_is_accepted():
     assert GuideShape("thin", "", at(2e-4)).bounds(PHASE, 1.0).min() > 0.0

@@ -47,7 +47,7 @@ def test_text_is_deterministic() -> None:
     assert text != urdf(PARAMETERS[1], ROBOT)
 
 
-def test_joints_and_limits_are_the_robot_s() -> None:
+def test_urdf_has_the_joints_and_limits_of_the_robot() -> None:
     joints = [
         j for j in ET.fromstring(urdf(ExoskeletonParameters(), ROBOT)).iter("joint") if j.get("type") == "revolute"
     ]
@@ -66,9 +66,7 @@ def test_joints_and_limits_are_the_robot_s() -> None:
 
 @pytest.mark.parametrize("patient", PATIENTS)
 @pytest.mark.parametrize("parameters", PARAMETERS)
-def test_links_are_their_own_mirror_image_to_the_bit(
-    parameters: ExoskeletonParameters, patient: Patient | None
-) -> None:
+def test_links_are_exact_mirror_images(parameters: ExoskeletonParameters, patient: Patient | None) -> None:
     bodies = {link.name: link for link in links(parameters, patient) if not link.name.startswith("imu_")}
     for name, link in bodies.items():
         image = link.mirrored()
@@ -80,7 +78,7 @@ def test_links_are_their_own_mirror_image_to_the_bit(
 
 @pytest.mark.parametrize("patient", PATIENTS)
 @pytest.mark.parametrize("seed", range(3))
-def test_motion_of_the_mirrored_robot_takes_the_mirrored_torques(patient: Patient | None, seed: int) -> None:
+def test_mirrored_motion_needs_mirrored_torques(patient: Patient | None, seed: int) -> None:
     model, q_index, v_index = pinocchio_model(urdf(ExoskeletonParameters(), ROBOT, patient))
     data = model.createData()
     q, v, a = random_state(np.random.default_rng(seed))
@@ -115,7 +113,7 @@ def test_floating_exoskeleton_is_symmetric_about_the_sagittal_plane() -> None:
     assert pinocchio.computeTotalMass(model) == pytest.approx(82.5)
 
 
-def test_sensor_places() -> None:
+def test_sensor_frames_have_the_documented_positions() -> None:
     p = ExoskeletonParameters()
     model, _, _ = pinocchio_model(urdf(p, ROBOT))
     data = model.createData()
@@ -144,12 +142,12 @@ def test_sensor_places() -> None:
 @pytest.mark.parametrize(
     ("field", "value"), [("thigh_length", 0.0), ("shank_length", 1.2), ("pad_mass", 0.2), ("pad_mass", 0.0)]
 )
-def test_impossible_parameters_are_refused(field: str, value: float) -> None:
+def test_invalid_parameters_are_rejected(field: str, value: float) -> None:
     with pytest.raises(ValueError, match=field):
         ExoskeletonParameters(**{field: value})
 
 
-def test_urdf_without_a_joint_is_refused() -> None:
+def test_urdf_without_a_joint_is_rejected() -> None:
     text = urdf(ExoskeletonParameters(), ROBOT).replace('"right_HA"', '"spare"')
     with pytest.raises(ValueError, match="right_HA is missing"):
         pinocchio_model(text)

@@ -43,7 +43,7 @@ def patients() -> Iterator[Patient]:
 
 
 def only(worn: Inertia, empty: Inertia) -> Inertia:
-    """What fusion added to a link, from masses and moments about the link's origin: no code shared with the model."""
+    """Return the inertia that the patient adds to a link, computed from masses and moments about the origin of the link."""
     mass = worn.mass - empty.mass
     centre = (worn.mass * np.array(worn.centre) - empty.mass * np.array(empty.centre)) / mass
 
@@ -55,14 +55,14 @@ def only(worn: Inertia, empty: Inertia) -> Inertia:
     return Inertia(mass, tuple(centre), (m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2]))
 
 
-def test_fractions_are_winter_s_and_make_a_whole() -> None:
+def test_segment_fractions_are_those_of_winter_and_sum_to_one() -> None:
     assert {name: (s.mass, s.centre, s.gyration, s.length) for name, s in SEGMENTS.items()} == WINTER
     both_legs = 2 * sum(WINTER[name][0] for name in ("thigh", "shank", "foot"))
     assert WINTER["HAT"][0] + both_legs == pytest.approx(1.0, abs=1e-15)
 
 
 @pytest.mark.parametrize("patient", [Patient(75.0, 1.75), Patient(58.0, 1.93, 0.41, 0.45)])
-def test_what_fusion_adds_to_a_link_is_the_segment_of_the_table(patient: Patient) -> None:
+def test_link_with_patient_includes_the_segment_of_the_table(patient: Patient) -> None:
     worn = {link.name: link.inertia for link in links(EMPTY, patient)}
     empty = {link.name: link.inertia for link in links(EMPTY.fitted(patient))}
     for name, segment in WORN.items():
@@ -80,7 +80,7 @@ def test_what_fusion_adds_to_a_link_is_the_segment_of_the_table(patient: Patient
     assert all(worn[name] == empty[name] for name in unchanged)
 
 
-def test_lengths_left_out_are_winter_s_and_lengths_given_are_kept() -> None:
+def test_default_lengths_follow_winter_and_given_lengths_are_kept() -> None:
     by_height = Patient(70.0, 1.80)
     assert by_height.length("thigh") == 0.245 * 1.80
     assert by_height.length("shank") == 0.246 * 1.80
@@ -91,8 +91,8 @@ def test_lengths_left_out_are_winter_s_and_lengths_given_are_kept() -> None:
     assert origins["left_ankle"][2] == -0.40
 
 
-def test_hips_knees_and_ankles_of_patient_and_machine_coincide() -> None:
-    """The patient's hip is where FH and SH cross: turning either leaves the upper end of the thigh where it is."""
+def test_joints_of_patient_and_exoskeleton_coincide() -> None:
+    """FH and SH intersect at the hip of the patient, so neither of them moves the upper end of the thigh."""
     patient = Patient(80.0, 1.70)
     model, q_index, _ = pinocchio_model(urdf(EMPTY, ROBOT, patient))
     data = model.createData()
@@ -106,7 +106,7 @@ def test_hips_knees_and_ankles_of_patient_and_machine_coincide() -> None:
         np.testing.assert_allclose(place, [0.0, EMPTY.fh_offset[1], 0.0], atol=1e-15)
 
 
-def test_total_mass_and_every_inertia_over_the_whole_range() -> None:
+def test_mass_and_inertias_are_valid_over_the_whole_range() -> None:
     empty = math.fsum(link.inertia.mass for link in links(EMPTY))
     for patient in patients():
         bodies = links(EMPTY, patient)
@@ -118,7 +118,7 @@ def test_total_mass_and_every_inertia_over_the_whole_range() -> None:
             assert moments[0] + moments[1] >= moments[2] * (1 - 1e-12)
 
 
-def test_the_text_has_every_digit() -> None:
+def test_urdf_keeps_the_full_precision() -> None:
     patient = Patient(71.3, 1.777)
     model = pinocchio_model(urdf(EMPTY, ROBOT, patient), fixed_base=False).model
     assert pinocchio.computeTotalMass(model) == pytest.approx(82.5 + 71.3, abs=1e-12)
@@ -128,7 +128,7 @@ def test_the_text_has_every_digit() -> None:
     np.testing.assert_allclose(root.lever, pelvis.centre, rtol=1e-15, atol=1e-15)
 
 
-def test_a_number_of_numpy_is_written_as_a_number() -> None:
+def test_numpy_numbers_are_written_as_plain_numbers() -> None:
     numpy = Patient(np.float64(71.3), np.float64(1.777))
     assert urdf(EMPTY, ROBOT, numpy) == urdf(EMPTY, ROBOT, Patient(71.3, 1.777))
 
@@ -144,6 +144,6 @@ def test_a_number_of_numpy_is_written_as_a_number() -> None:
         ((math.nan, 1.75), "mass of the patient must be 45 to 110 kg, got nan kg"),
     ],
 )
-def test_a_patient_out_of_range_is_refused(arguments: tuple[float, ...], sentence: str) -> None:
+def test_patient_out_of_range_is_rejected(arguments: tuple[float, ...], sentence: str) -> None:
     with pytest.raises(ValueError, match=f"^{re.escape(sentence)}$"):
         Patient(*arguments)

@@ -1,4 +1,4 @@
-"""Impact: debounced foot force, and the change by time."""
+"""Impact detection: debounced foot force, and the end of a step by time."""
 
 from __future__ import annotations
 
@@ -11,41 +11,41 @@ CONFIG = ImpactConfig(impact_force=80.0, release_force=30.0, debounce=5, earlies
 
 
 def run(detector: ImpactDetector, forces: list[float], phase: float = 0.8) -> int | None:
-    """Cycle on which the step ends."""
+    """Return the cycle in which the step ends, or None."""
     return next((i for i, force in enumerate(forces) if detector.update(force, phase)), None)
 
 
-def test_an_impact_counts_after_the_debounce():
+def test_impact_counts_after_the_debounce_time():
     assert run(ImpactDetector(CONFIG), [0.0] + [100.0] * 10) == 5
 
 
-def test_a_shorter_touch_does_not_count_and_does_not_add_up():
+def test_short_touches_do_not_count():
     assert run(ImpactDetector(CONFIG), [0.0] + ([100.0] * 4 + [50.0]) * 10) is None
 
 
-def test_the_foot_has_to_leave_the_ground_first():
+def test_foot_must_leave_the_ground_before_an_impact():
     assert run(ImpactDetector(CONFIG), [100.0] * 50) is None
     assert run(ImpactDetector(CONFIG), [100.0] * 20 + [10.0] + [100.0] * 10) == 25
 
 
-def test_nothing_counts_early_in_the_step():
+def test_impact_early_in_the_step_does_not_count():
     detector = ImpactDetector(CONFIG)
     assert run(detector, [0.0] + [100.0] * 50, phase=0.49) is None
     assert run(detector, [100.0] * 10, phase=0.51) == 4
 
 
-def test_a_new_step_starts_from_nothing():
+def test_new_step_resets_the_debounce():
     detector = ImpactDetector(CONFIG)
     assert run(detector, [0.0] + [100.0] * 4) is None
     detector.start_step()
     assert run(detector, [100.0] * 50) is None
 
 
-def test_a_force_that_is_no_number_is_no_impact():
+def test_force_of_nan_is_no_impact():
     assert run(ImpactDetector(CONFIG), [0.0, *[float("nan")] * 50]) is None
 
 
-def test_step_over_by_time():
+def test_step_is_over_after_its_duration():
     assert [step_over(k, 800) for k in (0, 799, 800, 801)] == [False, False, True, True]
 
 
@@ -59,6 +59,6 @@ def test_step_over_by_time():
         {"impact_force": float("inf")},
     ],
 )
-def test_refuses_a_configuration_that_is_none(bad: dict[str, float]):
+def test_invalid_configuration_is_rejected(bad: dict[str, float]):
     with pytest.raises(ValueError, match=r"got "):
         ImpactConfig(**bad)  # type: ignore[arg-type]
