@@ -37,7 +37,7 @@ SURVIVORS = HERE / "SURVIVORS.md"
 REQUIRED = 0.95
 
 PACKAGES = ("atalante_hal", "dbc/atalante_dbc", "control/atalante_control", "emulator/atalante_emulator")
-#: Exit codes of mutmut for a survivor: all tests passed, and no test reaches the mutant.
+#: Exit codes of mutmut for a survivor: 0 if all tests passed, 33 if no test reaches the mutant.
 SURVIVED = (0, 33)
 #: Exit codes of mutmut for a mutant that was not tested.
 NOT_TESTED = (None, 2, 37)
@@ -159,7 +159,7 @@ class PartTest:
         return self._work / "mutants" / f"{file}.meta"
 
     def _mutant(self, file: str, name: str) -> Mutant:
-        """Return the mutant with a name of mutmut."""
+        """Return the mutant that has the given name in mutmut."""
         with chdir(self._work):
             shown = get_diff_for_mutant(name, path=file).splitlines()
         changed = [line for line in shown if line[:1] in "+-" and not line.startswith(("+++", "---"))]

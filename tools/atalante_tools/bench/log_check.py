@@ -1,7 +1,7 @@
-"""Benchmarks of `atalante bench`: time to check a log, with other decoders as baselines.
+"""Benchmarks of the check of a CAN log, with other decoders as baselines.
 
-The log is a run of the emulated robot in ACTIVE, repeated to 1.3 million frames. The repeated frames get new alive counters and
-CRCs, because the rules would report the repetition otherwise.
+The log contains a recorded run of the emulated robot in ACTIVE, repeated to 1.3 million frames. The repeated frames have new
+alive counters and CRCs, because otherwise the rules would report repeated frames.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from atalante_tools.canlog.column_codec import crc_differences, crc_of_zeros
 from atalante_tools.canlog.plan import Plan
 from atalante_tools.canlog.validate.project import Project
 
-#: Recorded cycles, and number of repetitions. The log has 50,000 cycles with 1.3 million frames.
-#: The recording has a whole number of periods of every message, and the joints come to rest in it.
-_CYCLES, _REPEATED = 2000, 25
-_QUICK_CYCLES, _QUICK_REPEATED = 300, 2
+#: Length of the recording [cycles], a multiple of the period of every message.
+_CYCLES, _QUICK_CYCLES = 2000, 300
+#: Number of repetitions of the recording in the log.
+_REPEATED, _QUICK_REPEATED = 25, 2
 #: Number of frames that the slow baseline of python-can and cantools decodes per block.
 _SLICE = 30_000
 _MS = 1_000_000  # ns
@@ -123,9 +123,6 @@ def _dbc() -> Path:
     return DBC_FILE
 
 
-# -- recorded log ----------------------------------------------------------------------------------------------------------
-
-
 @contextmanager
 def _log(effort: Effort) -> Iterator[tuple[Path, Frames]]:
     """Yield the path of a temporary candump log, and its frames."""
@@ -138,7 +135,7 @@ def _log(effort: Effort) -> Iterator[tuple[Path, Frames]]:
 
 
 class _Tap:
-    """Recorder of every frame that the HAL sends or receives, with cycle and direction."""
+    """`FrameTap` that records all frames of the HAL with their cycles and directions."""
 
     def __init__(self) -> None:
         self.cycle = 0
@@ -242,7 +239,7 @@ def _write(path: Path, frames: Frames, stamps: npt.NDArray[np.int64], sent: npt.
 
 
 def _write_mdf(path: Path, frames: Frames) -> None:
-    """Write frames as MF4 bus logging, in the layout of python-can."""
+    """Write frames to an MF4 file of the type bus logging, as python-can does."""
     from asammdf import MDF, Signal
     from asammdf.blocks.v4_blocks import SourceInformation
     from asammdf.blocks.v4_constants import BUS_TYPE_CAN, SOURCE_BUS

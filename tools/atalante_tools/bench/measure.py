@@ -46,13 +46,13 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Effort:
-    """Number of rounds of a benchmark, and `progress(done, total)`, which is called after each round."""
+    """Settings of a measurement: normal or quick, and `progress(done, total)`, which is called after each round."""
 
     quick: bool = False
     progress: Callable[[int, int], None] = field(default=lambda _done, _total: None)
 
     def rounds(self, share: float = 1.0) -> int:
-        """Return the number of rounds, at least `QUICK_ROUNDS`.
+        """Return the number of rounds of the measurement, at least `QUICK_ROUNDS`.
 
         Args:
             share: fraction of the usual number; below 1 for benchmarks with long blocks.

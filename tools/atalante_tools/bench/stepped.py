@@ -28,7 +28,7 @@ class SteppedRollouts:
         lengths = np.arange(guide.stride + 1, dtype=np.float64) * PERIOD
         joints = [0, 0, 1, 1]
         self._phi = np.stack([config.policies[j].transition(lengths) for j in joints], axis=3)
-        # Column of each rollout: largest, then smallest disturbance of the hip, then both of the knee.
+        # The columns are the rollouts of the hip with its largest and its smallest disturbance, then the same for the knee.
         extremes = [config.disturbance[j][side] for j, side in zip(joints, (1, 0, 1, 0), strict=True)]
         self._push = np.stack(
             [config.policies[j].step_response(lengths) * u for j, u in zip(joints, extremes, strict=True)], axis=2

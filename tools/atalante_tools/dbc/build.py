@@ -14,12 +14,12 @@ from atalante_tools.console.names import find
 
 @dataclass(frozen=True)
 class Build:
-    """Input of the C code generators: a network, and the node whose messages are generated."""
+    """Input of the C code generators: a network, and the node for which code is generated."""
 
     network: Network
     text: str  # content of the DBC file
     name: str  # prefix of every C identifier
-    node: str | None  # node whose messages are generated; None: all messages
+    node: str | None  # node for which code is generated; None: all nodes
 
     @classmethod
     def of(cls, path: Path, node: str | None) -> Build:

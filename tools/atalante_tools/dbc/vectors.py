@@ -57,7 +57,7 @@ class Vectors:
         self._order = self._stream_order()
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return the index of each byte of the stream in the concatenated arrays of `images`, shape (bytes of an image,)."""
+        """Return the byte order of an image: index of each byte of the stream in the concatenated arrays; see `images`."""
         build, codec = self._build, self._codec
         rows = len(build.messages)
         parts = (FRAME_BYTES * rows, FRAME_BYTES * rows, 8 * codec.size, 8 * codec.size, rows)

@@ -15,7 +15,7 @@ from atalante_hal.types import PERIOD, Command, Controller, State, Vector
 from atalante_hal.wire.frame import Frames
 from atalante_tools.faults.scenario import HostFault
 
-#: Mask of the joint of the fault `shake`, shape (12,). The left hip hardly moves, because its inertia is large.
+#: 1 for the joint that the fault `shake` disturbs, the left hip, and 0 for all others, shape (12,).
 _HIP: Final = np.array([joint == "left_SH" for joint in JOINTS], np.float64)
 
 

@@ -95,7 +95,7 @@ SCENARIOS: Final = (
                     node=_KNEE,
                     reacted=reacted,
                     recovers=False,
-                    observed=40,  # short, because force cells without noise are detected after 100 cycles
+                    observed=40,  # below 100 cycles, after which force cells without noise are detected
                 )
                 for frames, state, dtc, reacted in (
                     (5, SupervisorState.FINISH_STEP, "SWING_TIMEOUT", 5),
@@ -238,7 +238,7 @@ SCENARIOS: Final = (
         ),
         permanent=Case("permanent", (Fault("inject", _COMMAND, SK_TargetTorque=200.0),)),
     ),
-    # `ahead` 1 sends the counter of the next true frame, before this frame. `ahead` 0 repeats the counter of the last true frame.
+    # The counter of the second sender is that of the last genuine frame plus `ahead`.
     Scenario(
         "F58",
         (

@@ -19,7 +19,7 @@ _IMUS: Final = tuple(f"IMU_{name.upper()}" for name in IMUS)
 _FEET: Final = tuple(f"FOOT_{name.upper()}" for name in FEET)
 #: Vertical forces of the cells of a foot on the ground [N].
 _ON_GROUND: Final = {f"{cell}_ForceZ": 150.0 for cell in CELLS}
-#: Permanent faults of other messages, which must not impede the checks. The checks use the last two messages.
+#: Permanent faults that the sensor checks must tolerate. The last two affect messages that the checks use.
 _TOLERATED: Final = {
     "FOOT_LEFT doubled": Fault("duplicate", "FOOT_LEFT_STATE"),
     "FOOT_LEFT a cycle late": Fault("delay", "FOOT_LEFT_STATE"),
@@ -135,7 +135,7 @@ SCENARIOS: Final = (
             for cell, force in zip(CELLS, (400.0, 0.0, -50.0, 61.0), strict=True)
         ),
     ),
-    # The feet report contact for 60 cycles, then none. After 1 s without contact the robot counts as lifted, and the fault ends.
+    # The feet report contact for 60 cycles, then none. After 100 cycles the robot counts as lifted, and the fault ends.
     Scenario(
         "F34",
         tuple(

@@ -52,11 +52,11 @@ REPRESENTATIVES: Final = (
 
 @dataclass(frozen=True)
 class Endurance:
-    """Result of an endurance run: the longest duration of a fault during which the walk continues."""
+    """Result of an endurance run: longest duration of a fault during which the walk continues."""
 
     id: str
     case: str
-    survived: int | None  # [cycles]; None: at least `HORIZON`
+    survived: int | None  # duration [cycles]; None: at least `HORIZON`
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class EnduranceTask:
     id: str
 
     def __call__(self) -> Endurance:
-        """Shorten the fault until the walk continues, and return this duration."""
+        """Shorten the fault until the walk continues; return the duration of the fault in cycles."""
         case = SCENARIOS[self.id].permanent
         assert case is not None
         cycles = HORIZON

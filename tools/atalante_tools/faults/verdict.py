@@ -78,7 +78,7 @@ class Verdict:
     state: str  # state of the HAL just before the operator's START
     cycles: (
         int | None
-    )  # cycles until the reaction, or until the diagnostic if there was no reaction; None: nothing happened
+    )  # cycles until the reaction, or until the diagnostic if there was no reaction; None: neither occurred
     bound: int  # largest accepted value of `cycles`
     dtc: str  # first reported code that matches the expected code
     failures: tuple[str, ...]  # one sentence each

@@ -94,7 +94,7 @@ def library(
     say(f"{points} gaits in {out}, {points - todo} of them already solved")
     progress, start = Progress(), time.monotonic()
     solve = solve_compiled if machine_code else solve_subject
-    # The optimiser would report the exception of a signal as a failed gait, so a signal takes effect after the gait.
+    # A signal such as Ctrl-C takes effect after the gait, because the optimiser would report its exception as a failed gait.
     with stop_requested() as stop, closing(collection.generate(solve, jobs=jobs, cluster=cluster)) as outcomes:
         for done, (_, solved) in enumerate(outcomes, 1):
             if as_json:

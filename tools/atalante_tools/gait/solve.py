@@ -68,7 +68,7 @@ def solve(
         if progress.due():
             progress.show(f"{subject}: iteration {iteration}, constraints violated by up to {violation:.1e}")
 
-    # The optimiser would report the exception of a signal as a missing gait, so a signal takes effect after the gait.
+    # A signal such as Ctrl-C takes effect after the gait, because the optimiser would report its exception as a failed gait.
     with stop_requested() as stop:
         solved = optimise(subject, kind=kind, progress=show)
     progress.clear()

@@ -198,7 +198,7 @@ class FrameFilter(WrappedBus):
         return count
 
     def _apply_faults(self, frames: Frames, delayed: list[tuple[int, Frames]]) -> Frames:
-        """Apply the faults and return the frames to pass on: first the delayed frames that are due, then those of this batch."""
+        """Apply the faults to a batch. Return the delayed frames that are due, then the remaining frames of the batch."""
         due = [frame for cycle, frame in delayed if cycle <= self._cycle][:_BATCH]
         delayed[:] = [(cycle, frame) for cycle, frame in delayed if cycle > self._cycle]
         arriving = due

@@ -117,7 +117,7 @@ class Stepper:
 
     @property
     def state(self) -> State:
-        """State of the last cycle."""
+        """Return the state of the last cycle."""
         return self.hal.state
 
     @property
