@@ -31,7 +31,7 @@ INPUTS = {"mass": "kg", "height": "m", "step_length": "m", "step_duration": "s"}
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # largest number of neurons of a layer
-#: Largest jump of a joint angle at the step change that one unit of an input of the last layer may cause [rad].
+#: Tolerance of the check that the last layer gives joint angles that are continuous at the step change [rad].
 _PERIODICITY_DEFECT = 1e-9
 _ANGLE_MAX = 2.0 * np.pi  # rad, largest absolute value of a control point
 #: Largest difference of thigh and shank from the lengths in Winter's table, with which the network was fitted [m].

@@ -138,7 +138,7 @@ def _array(name: str, content: bytes) -> Array:
 
 
 def _checksum(arrays: Mapping[str, Array | None]) -> str:
-    """Return the SHA-256 over name, type, shape and bytes of each array that is not None, in hexadecimal digits."""
+    """Return the SHA-256 of names, types, shapes and bytes of the arrays, in hexadecimal digits; skip entries of None."""
     digest = hashlib.sha256()
     for name, array in sorted(arrays.items()):
         if array is not None:

@@ -27,8 +27,8 @@ class Rows(NamedTuple):
     unit: str  # SI unit
     size: float  # [unit] scale; the program divides values and bounds by it
     values: Symbol  # SX, shape (m,) [unit]
-    lower: Vector  # [unit] shape (m,), or (repetitions, m) if the bounds differ between repetitions
-    upper: Vector  # as `lower`
+    lower: Vector  # [unit] lower bounds, shape (m,), or (repetitions, m) if they differ between repetitions
+    upper: Vector  # [unit] upper bounds, same shapes as `lower`
 
 
 class Group(NamedTuple):

@@ -22,7 +22,7 @@ _OPTIONS: dict[str, Any] = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_ti
 
 
 class Reach:
-    """Search for a landing pose, built once for a program."""
+    """Search for a landing pose. Its solver is built once per nonlinear program."""
 
     def __init__(self, problem: StepProblem) -> None:
         """Build the solver of the search.

@@ -31,7 +31,8 @@ class SolvedGait:
     solve_s: float  # s, computing time
     iterations: int  # iterations of the optimiser
     residuals: Mapping[str, Residual] = field(default_factory=dict)  # largest violation of each group of constraints
-    peak_torque: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # (12,) Nm, largest at the nodes
+    #: Largest absolute joint torques at the nodes, shape (12,) [Nm].
+    peak_torque: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     @property
     def solved(self) -> bool:

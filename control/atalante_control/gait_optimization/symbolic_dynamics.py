@@ -157,7 +157,7 @@ class Chain:
         unused = np.delete(numbers, self._used)
         if not same or unused.any():
             raise ValueError(
-                "topology, axes and zero masses and lengths of the robot must be those of the reference robot, got others"
+                "the robot must have the bodies, joint axes and zero numbers of the reference robot, got different ones"
             )
         return np.asarray(numbers[self._used])
 

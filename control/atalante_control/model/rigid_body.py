@@ -36,7 +36,8 @@ class Inertia:
 
     mass: float  # kg
     centre: Vector3  # m, centre of mass
-    tensor: tuple[float, float, float, float, float, float]  # kg m2 about the centre of mass: xx, xy, xz, yy, yz, zz
+    #: Inertia about the centre of mass: xx, xy, xz, yy, yz, zz [kg m2].
+    tensor: tuple[float, float, float, float, float, float]
 
     def matrix(self) -> npt.NDArray[np.float64]:
         """Return the inertia tensor as a symmetric matrix, shape (3, 3) [kg m2]."""
