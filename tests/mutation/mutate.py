@@ -91,7 +91,7 @@ class PartTest:
         for old in mutants.rglob("*"):
             if old.is_file() and not str(old.relative_to(mutants)).startswith(kept):
                 old.unlink()
-        # The tests read the DBC file in its folder of the project, so it is copied twice.
+        # Copy the folder `dbc`, too, because some tests read the DBC file there.
         for package in (*PACKAGES, "dbc", "tests"):
             target = self._work / Path(package).name
             if target.exists():

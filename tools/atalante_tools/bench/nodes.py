@@ -99,7 +99,7 @@ class Recording:
         error = rng.uniform(-ERROR, ERROR, len(JOINTS))
         self.values[:, codec.slice("Position")] = (walk.tables.q[0] + error + swing) * motor
         self.values[:, codec.slice("Velocity")] = ERROR_RATE * np.cos(phase) * motor
-        turn = np.where(np.arange(POSES) % 2, 1.0, -1.0)[:, None]  # sign, which makes consecutive sensor values differ
+        turn = np.where(np.arange(POSES) % 2, 1.0, -1.0)[:, None]  # alternating sign, because consecutive sensor values must differ
         for name, noise in (("Torque", 0.05), ("Gyro", 0.01), ("Accel", 0.05), ("Force", 1.0)):
             columns = codec.slice(name)
             self.values[:, columns] += turn * rng.uniform(0.5 * noise, noise, (POSES, columns.stop - columns.start))

@@ -12,7 +12,7 @@ from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_tools.faults.observation import Observation
 
 _KNEE: Final = JOINTS.index("left_SK")
-#: Cycles without a command after which a drive must hold. The constant of the drive is not used, for an independent check.
+#: Cycles without a command after which a drive must hold. It is not imported from the drive, so the check is independent.
 _WATCHDOG: Final = 5
 _LEFT_LEG: Final = slice(0, len(LEG_JOINTS))
 

@@ -95,7 +95,7 @@ SCENARIOS: Final = (
                     node=_KNEE,
                     reacted=reacted,
                     recovers=False,
-                    observed=40,  # below 100 cycles, after which force cells without noise are detected
+                    observed=40,  # short, because after 100 cycles the constant force values are detected as a fault
                 )
                 for frames, state, dtc, reacted in (
                     (5, SupervisorState.FINISH_STEP, "SWING_TIMEOUT", 5),

@@ -33,7 +33,7 @@ class Row:
     id: str
     fault: str  # description of the fault
     noticed_by: str  # check that detects it
-    cycles: str  # bounds as text; `detected` and `reacted` are the numbers
+    cycles: str  # text of the bounds, such as 1 / 5; see `detected` and `reacted`
     behaviour: str  # reaction in words
     state: SupervisorState  # final state of the HAL
     dtc: str  # diagnostic code; empty: none

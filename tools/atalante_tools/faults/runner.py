@@ -131,7 +131,7 @@ class _Run:
         )
         self._sent = SentFrames()
         self._samples: list[_Sample] = []
-        self._events: list[Event] = []  # events of the HAL, without the HOLD at the end of the loop
+        self._events: list[Event] = []  # events of the HAL, without the events of the shutdown
         self._copied = 0  # number of events of the HAL that were copied or dropped
 
     def execute(self, until: Callable[[State], bool]) -> None:
