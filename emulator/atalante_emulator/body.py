@@ -21,7 +21,7 @@ from atalante_hal.types import PERIOD, Vector
 Vector3 = tuple[float, float, float]
 
 GRAVITY = 9.81  # m/s2
-#: Number of solver iterations in each time step. It changes the computed motion.
+#: Number of PyBullet solver iterations in each time step. Another number changes the computed motion.
 SOLVER_ITERATIONS = 50
 #: Length of a link state in world axes: quaternion xyzw (4), velocity [m/s] (3), angular velocity [rad/s] (3).
 LINK_STATE: Final = 10
@@ -150,7 +150,7 @@ class PyBulletBody:
         self._feet = find([f"{foot}_foot" for foot in FEET], links, "link")
         pads = find([f"{foot}_foot_{cell}" for foot in FEET for cell in CELLS], links, "link")
         self._cell_of = {pad: divmod(index, len(CELLS)) for index, pad in enumerate(pads)}
-        #: Rows of the IMUs on moving links. The other IMUs are fixed to the pelvis.
+        #: Indices of the IMUs on moving links. The other IMUs are fixed to the pelvis.
         self._moving = [row for row, link in enumerate(self._imus) if _is_movable(link, set(self._joints), infos)]
         self._moving_links = [self._imus[row] for row in self._moving]
 
@@ -249,7 +249,7 @@ def load_urdf(urdf: str, client: int, *, fixed: bool = True) -> int:
         path = Path(folder, "exoskeleton.urdf")
         path.write_text(urdf)
         try:
-            # No flag to merge fixed links: IMU links and contact pads must keep their names.
+            # Fixed links are not merged, because IMU links and contact pads must keep their names.
             return int(
                 pybullet.loadURDF(
                     str(path), useFixedBase=fixed, flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client

@@ -114,7 +114,7 @@ class Drives:
         self._within(self._target, self._limit, self._own_limit, self.motors.wanted)
         self._states_changed()
 
-    # -- every cycle -------------------------------------------------------------------------------------------------
+    # -- called in every cycle ---------------------------------------------------------------------------------------
 
     def sample(self, position: Vector) -> None:
         """Read the encoders and update the position and velocity signals.
@@ -183,7 +183,7 @@ class Drives:
         np.clip(hold, -limit, limit, out=hold)
         wanted[:] = np.where(self._is_enabled, wanted, np.where(self._is_holding, hold, 0.0))
 
-    # -- errors ------------------------------------------------------------------------------------------------------
+    # -- errors and local reactions ----------------------------------------------------------------------------------
 
     def hold(self, leg: int, code: int) -> None:
         """Start a latched local hold in every enabled drive of a leg.
@@ -218,7 +218,7 @@ class Drives:
         self._unsynced[leg] = 0
 
     def warn(self, leg: int, code: int) -> None:
-        """Report a command error of a leg to which its drives do not react.
+        """Report an error in the command of a leg. The drives of the leg do not react to it.
 
         Args:
             leg: index of the leg, 0 is left.
@@ -307,7 +307,7 @@ class Drives:
             elif self.errors.has(drive, code):
                 self.recover(drive, code)
 
-    # -- state -------------------------------------------------------------------------------------------------------
+    # -- state machine -----------------------------------------------------------------------------------------------
 
     def _run_state_machines(self, fresh: tuple[bool, bool], controlword: Vector, words: bytes) -> None:
         changed = False
@@ -349,7 +349,7 @@ class Drives:
         self._is_holding = state == DriveState.QUICK_STOP_ACTIVE
         self.motors.power(self._is_enabled | self._is_holding)
 
-    # -- slow quantities ---------------------------------------------------------------------------------------------
+    # -- temperature and standstill ----------------------------------------------------------------------------------
 
     def _update_slow(self) -> None:
         self._slow_phase = 0
@@ -371,7 +371,7 @@ class Drives:
                 self.recover(drive, emergency.OVER_TEMPERATURE)
 
     def _check_rest(self) -> None:
-        """Enter FAULT in each drive in FAULT REACTION ACTIVE with a joint at rest."""
+        """Change each drive from FAULT REACTION ACTIVE to FAULT when its joint is at rest."""
         speed = np.abs(self.encoders.speed)
         for drive in np.flatnonzero(speed < self.parameters.rest_speed).tolist():
             if self.state[drive] is DriveState.FAULT_REACTION_ACTIVE:

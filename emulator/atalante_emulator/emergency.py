@@ -26,7 +26,7 @@ COMMAND_TIMEOUT: Final = 0x8250  # command timed out
 _REGISTER: Final = {0x2: 0x03, 0x3: 0x05, 0x4: 0x09, 0x7: 0x21, 0x8: 0x11}
 _GENERIC: Final = 0x01
 
-#: Age at which a warning ends, and age from which it may be sent again [calls of `Errors.advance` since its last occurrence].
+#: Age at which a warning ends, and age from which it may be sent again [calls of `Errors.advance`].
 _ENDED, _REPEATABLE = 2, 3
 
 

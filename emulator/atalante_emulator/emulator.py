@@ -207,7 +207,7 @@ class Emulator:
         self._haptics_cycles = self._haptics_tx.codec.messages[0].cycle_ms
         self._pendant = None if self.operator is None else PendantNode(self.operator, codec, truth)
 
-    # -- bus ---------------------------------------------------------------------------------------------------------
+    # -- receive and send --------------------------------------------------------------------------------------------
 
     def poll(self, timeout: float = 0.0) -> bool:
         """Receive frames and, if they contain SYNC, run one cycle.
@@ -326,7 +326,7 @@ class Emulator:
         self._batch[: len(octets)] = octets
         return self._batch_up_to[len(octets) // FRAME_BYTES]
 
-    # -- one cycle ---------------------------------------------------------------------------------------------------
+    # -- steps of one cycle ------------------------------------------------------------------------------------------
 
     def _sample_next(self) -> None:
         """Sample the sensors for the next cycle, and prepare its frames in advance if `before_send` is empty."""
@@ -400,7 +400,7 @@ class Emulator:
         self._emergencies.clear()
         return parts
 
-    # -- wall clock --------------------------------------------------------------------------------------------------
+    # -- real time ---------------------------------------------------------------------------------------------------
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Run the robot for a HAL in another process.

@@ -262,7 +262,7 @@ class Fault:
 
 
 def _checked(kind: str, given: Mapping[str, Value]) -> tuple[tuple[str, Value], ...]:
-    """Check the parameters of a fault. Return them together with the defaults of the others."""
+    """Check the parameters of a fault. Return them together with the defaults of omitted parameters."""
     rule = KINDS[kind]
     known = rule.parameters
     for name, value in given.items():

@@ -99,7 +99,7 @@ class _Disturbance:
                 return self._injected()
         return ()
 
-    # -- effects -----------------------------------------------------------------------------------------------------
+    # -- effects of the fault kinds ----------------------------------------------------------------------------------
 
     def _lose(self, frame: Frames, message: Message, cycle: int) -> Sequence[Frames]:
         return ()
@@ -155,7 +155,7 @@ class _Disturbance:
         self._last = frame.copy()
         return (frame,)
 
-    # -- frames ------------------------------------------------------------------------------------------------------
+    # -- contents of frames ------------------------------------------------------------------------------------------
 
     def _set_signals(self, frame: Frames, message: Message) -> None:
         payload = int.from_bytes(frame["data"][0].tobytes(), "little")

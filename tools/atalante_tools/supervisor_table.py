@@ -17,7 +17,7 @@ from atalante_hal.types import SupervisorState
 
 #: Conditions without a fault, with a pressed dead-man switch and without a request of the operator.
 WELL: Final = Conditions(nodes_well=True, drives_enabled=True, dead_man=True)
-#: Rows of the first table: description and conditions. No row has a diagnostic.
+#: Rows of the first table: description and conditions, without a diagnostic.
 FACTS: Final = (
     ("nothing", WELL),
     ("a node is missing or not trusted", replace(WELL, nodes_well=False)),

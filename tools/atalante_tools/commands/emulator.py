@@ -33,7 +33,8 @@ POLL_TIMEOUT: Final = 0.1
     "--operator/--no-operator",
     default=True,
     show_default=True,
-    help="Emulate a pendant and its operator, who presses START in READY. With --no-operator, use `atalante pendant`.",
+    help="Emulate a pendant and its operator, who presses START when the HAL is in READY. "
+    "With --no-operator, `atalante pendant` must act as the pendant.",
 )
 @click.option(
     "--xi",

@@ -31,7 +31,7 @@ class Interface:
 
 
 class Machine(Protocol):
-    """Interface of the computer that `atalante doctor` checks. The tests replace it."""
+    """Interface between `atalante doctor` and the checked computer. Tests use an implementation with fixed values."""
 
     def can_socket(self) -> str | None:
         """Open an AF_CAN socket. Return the error message, or None on success."""

@@ -9,7 +9,7 @@ import click
 
 
 def find(typed: str, names: Sequence[str], kind: str) -> int:
-    """Return the index of a typed name in `names`. Upper and lower case are equal.
+    """Return the index of a typed name in `names`, ignoring case.
 
     Args:
         typed: Name as the user typed it.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 EMBEDDED: Final = "embedded"
-#: Interface of python-can that cannot connect HAL and robot -> reason.
+#: Interfaces of python-can that cannot connect HAL and robot, each with the reason.
 NO_WIRE: Final = {
     "virtual": "works inside one process only",
     "udp_multicast": "returns every sent frame to its sender, which a HAL mistakes for a second HAL",
@@ -71,7 +71,7 @@ class OutputFile(click.Path):
         return path
 
 
-#: Smallest length in centimetres. A smaller number is a length in metres. All valid lengths are from 5 cm to 5 m.
+#: A typed number of at least 5 is a length in centimetres. A smaller number is a length in metres.
 _CENTIMETRES: Final = 5.0
 
 #: Default step length [m] and default step duration [s] of a patient.

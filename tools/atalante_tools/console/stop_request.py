@@ -18,7 +18,7 @@ TYPE_CHECKING = False  # replaces `typing.TYPE_CHECKING`, because the import of 
 if TYPE_CHECKING:
     from types import FrameType
 
-#: Exit code after a signal, minus the signal number (shell convention).
+#: Difference between the exit code after a signal and the signal number (shell convention).
 SIGNALLED = 128
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 

@@ -69,7 +69,7 @@ class Progress:
     def __init__(
         self, *, period: float | None = None, stream: TextIO | None = None, now: Callable[[], float] = time.monotonic
     ) -> None:
-        """Start the first period.
+        """Set up the progress line and start its first period.
 
         Args:
             period: Time between two lines [s]. None: `LIVE` on a terminal, `LOGGED` otherwise.

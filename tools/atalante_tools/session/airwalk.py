@@ -448,7 +448,7 @@ def _close(telemetry: TelemetryProcess, walked: Walked) -> None:
     summary = telemetry.close()
     walked.recording = summary.recording
     for notice in summary.notices:
-        if notice not in telemetry.notices:  # the messages of the start are already printed
+        if notice not in telemetry.notices:  # messages from the start of the telemetry are already printed
             say(notice)
     if not summary.complete and not summary.notices:
         say("the telemetry process ended unexpectedly: the recording may be truncated")

@@ -131,7 +131,7 @@ def open_hal(
         Failed: If the embedded robot needs PyBullet and it is not installed.
         Stopped: If a signal arrived before or during the start.
     """
-    check_stop()  # an import may have discarded the exception of a signal
+    check_stop()  # an import may have discarded the exception of a stop signal
     network = network or atalante_dbc.load()
     robot = robot or load_robot()
     with ExitStack() as stack:

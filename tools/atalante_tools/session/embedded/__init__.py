@@ -75,7 +75,7 @@ class EmbeddedRobot(Closing):
             process_group=0,
         )
         self._begun = False
-        os.close(child_bell)  # an open copy in the parent would prevent the detection of the end of the child
+        os.close(child_bell)  # while the parent has a copy open, it cannot detect the end of the child
         self.bus = SharedBus("embedded", memory, parent_bell, 0)
         self.bus.patience = _PATIENCE
         self._part_from_child()
