@@ -320,7 +320,7 @@ def _check_limits(
             raise GaitError(
                 f"{where}: {quantity} of joints.{JOINTS[joint]} must be {least:.5g} to {most:.5g} {unit}, got "
                 f"{found:.5g} {unit} at phase {phase[row]:.3f} of the {stance}-stance step, "
-                f"{scale * beyond[row, joint]:.2g} {unit} beyond"
+                f"{scale * beyond[row, joint]:.2g} {unit} beyond the limit"
             )
 
 

@@ -31,18 +31,18 @@ class Reach:
             problem: nonlinear program of the step.
         """
         self._low, self._high = problem.joint_range()
-        q, give = casadi.SX.sym("q", len(JOINTS)), casadi.SX.sym("give", len(JOINTS))
+        q, slack = casadi.SX.sym("q", len(JOINTS)), casadi.SX.sym("slack", len(JOINTS))
         rows = [*problem.landing(q), *problem.attitude(q)]
-        inside = casadi.vertcat(q - self._low + give, self._high + give - q)
+        inside = casadi.vertcat(q - self._low + slack, self._high + slack - q)
         free = np.full(2 * len(JOINTS), np.inf)
         self._bounds = (
             np.concatenate([*(row.lower for row in rows), np.zeros(len(free))]),
             np.concatenate([*(row.upper for row in rows), free]),
         )
         program = {
-            "x": casadi.vertcat(q, give),
+            "x": casadi.vertcat(q, slack),
             "p": problem.symbols,
-            "f": casadi.sumsqr(give) + _CENTRE_WEIGHT * casadi.sumsqr(q - (self._low + self._high) / 2.0),
+            "f": casadi.sumsqr(slack) + _CENTRE_WEIGHT * casadi.sumsqr(q - (self._low + self._high) / 2.0),
             "g": casadi.vertcat(*(row.values for row in rows), inside),
         }
         self._solver: Any = casadi.nlpsol("reach", "ipopt", program, _OPTIONS)
@@ -58,12 +58,12 @@ class Reach:
         start = np.concatenate([middle, np.zeros(len(JOINTS))])
         low = np.concatenate([np.full(len(JOINTS), -np.pi), np.zeros(len(JOINTS))])
         found = self._solver(x0=start, p=parameters, lbx=low, lbg=self._bounds[0], ubg=self._bounds[1])
-        apart = f"with both feet flat on the ground and {step_length:g} m apart"
+        condition = f"with both feet flat on the ground and {step_length:g} m apart"
         if not self._solver.stats()["success"]:
-            return f"{apart} no pose was found"
-        pose, give = np.split(np.array(found["x"]).ravel(), 2)
-        worst = int(give.argmax())
-        if give[worst] < _TOLERANCE:
+            return f"{condition} no pose was found"
+        pose, slack = np.split(np.array(found["x"]).ravel(), 2)
+        worst = int(slack.argmax())
+        if slack[worst] < _TOLERANCE:
             return None
         angle, end = np.degrees([pose[worst], np.clip(pose[worst], self._low, self._high)[worst]])
-        return f"{apart} {JOINTS[worst]} would be at {angle:.1f} degrees; the limit for gaits is {end:.1f} degrees"
+        return f"{condition} {JOINTS[worst]} would be at {angle:.1f} degrees; the limit for gaits is {end:.1f} degrees"

@@ -90,7 +90,7 @@ def solve(
     low, high = problem.constraint_bounds(None if around is None else around.gait)
     coefficients = guess(problem, parameters, subject) if warm_start is None else warm_start.coefficients
     refusal = _reach().refusal(parameters, subject.step_length) if kind == "periodic" else None
-    ending, iterations = "not begun", 0
+    ending, iterations = "not started", 0
     started = time.perf_counter()
     if refusal is None:
         if progress is None:
