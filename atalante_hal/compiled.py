@@ -1,4 +1,4 @@
-"""Compilation of numeric kernels: `compiled(function)` is the same function, compiled by numba at its first call.
+"""Compilation of numeric functions to machine code with numba, at their first call.
 
 The source stays plain Python. With NUMBA_DISABLE_JIT=1 it runs uncompiled and gives the same results, for debuggers, profilers,
 coverage and mutation tests. Functions it calls are compiled, too. The machine code is cached in the user's cache directory. The
@@ -58,7 +58,7 @@ def _compiled(function: FunctionType) -> Any:
 
 
 def _twin(function: FunctionType) -> FunctionType:
-    """Return a copy of the function that calls compiled callees."""
+    """Return a copy of the function in which each called function is compiled."""
     names = {name: value for name, value in function.__globals__.items() if name != function.__name__}
     for name, callee in _callees(function):
         names[name] = _callee(callee)
@@ -69,7 +69,7 @@ def _twin(function: FunctionType) -> FunctionType:
 
 @cache
 def _callee(function: FunctionType) -> Any:
-    """Return a compiled callee, which all its callers share."""
+    """Compile a called function once for all its callers."""
     import numba
 
     return numba.njit(boundscheck=True)(_twin(function))
@@ -90,19 +90,21 @@ def _callees(function: FunctionType) -> Iterator[tuple[str, FunctionType]]:
             yield name, value
 
 
-def _made_from(function: FunctionType) -> Iterator[bytes]:
-    """Yield the bytes on which the machine code of a function depends: code, constants, records, globals and callees."""
+def _compile_inputs(function: FunctionType) -> Iterator[bytes]:
+    """Yield the bytes that determine the machine code: code, constants, records, globals and called functions."""
     yield function.__qualname__.encode()
     for name, annotation in function.__annotations__.items():
         record = function.__globals__.get(annotation, annotation) if isinstance(annotation, str) else annotation
-        if fields := getattr(record, "_fields", None):  # a NamedTuple: the machine code finds its fields by position
+        if fields := getattr(
+            record, "_fields", None
+        ):  # a NamedTuple: the machine code depends on the order of its fields
             yield f"{name}: {fields!r}".encode()
     yield function.__code__.co_code + repr(_constants(function.__code__)).encode()
     yield from _records(function.__annotations__, function.__globals__)
     for name in dict.fromkeys(_names(function.__code__)):
         value = function.__globals__.get(name)
         if isinstance(value, FunctionType):
-            yield from _made_from(value)
+            yield from _compile_inputs(value)
         elif isinstance(value, np.ndarray):
             yield value.tobytes()
         elif name in function.__globals__ and not isinstance(value, ModuleType | type):
@@ -110,7 +112,7 @@ def _made_from(function: FunctionType) -> Iterator[bytes]:
 
 
 def _records(annotations: Mapping[str, Any], names: Mapping[str, Any]) -> Iterator[bytes]:
-    """Yield the fields of every `NamedTuple` in the annotations; numba's cache compares its name and types only."""
+    """Yield the fields of every `NamedTuple` in the annotations, because numba's cache does not compare them."""
     for name in dict.fromkeys(re.findall(r"\w+", " ".join(map(str, annotations.values())))):
         record = names.get(name)
         if isinstance(record, type) and issubclass(record, tuple) and hasattr(record, "_fields"):
@@ -123,11 +125,11 @@ def _constants(code: CodeType) -> tuple[Any, ...]:
 
 
 def _folder(function: FunctionType) -> Path | None:
-    """Return the cache folder of the machine code of a function; None if the user's cache is not writable."""
+    """Return the cache folder for the machine code of a function; None if the user's cache is not writable."""
     import numba
 
     digest = hashlib.sha256(f"{numba.__version__} {sys.version}".encode())
-    for part in _made_from(function):
+    for part in _compile_inputs(function):
         digest.update(part + b"\0")
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "atalante", "compiled")
     folder = base / f"{function.__name__.strip('_')}-{digest.hexdigest()[:16]}"

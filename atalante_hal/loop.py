@@ -1,4 +1,4 @@
-"""The 1 kHz control loop, on the wall clock or in lock-step: wait, read, update the controller, write, record."""
+"""Control loop at 1 kHz, on the wall clock or in lock-step: wait, read, update the controller, write, record."""
 
 from __future__ import annotations
 
@@ -17,16 +17,15 @@ from atalante_hal.hal import Hal
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.types import PERIOD, Controller, State
 
-#: Consecutive late cycles that lead to HOLD.
+#: Number of consecutive late cycles after which the robot goes to HOLD.
 OVERRUNS_TO_HOLD = 3
-#: Longest gap between two cycles [s]; a longer one leads to HOLD. The drives' own watchdog has the same timeout.
+#: Longest gap between two cycles before the robot goes to HOLD [s]. The watchdog of the drives has the same timeout.
 GAP_TO_HOLD = 5e-3
-#: Time [s] the loop may lose against the monotonic clock within `DRIFT_CYCLES` cycles. More leads to HOLD, because every limit
-#: and timeout counted in cycles would be too long.
+#: Largest delay against the monotonic clock within `DRIFT_CYCLES` cycles before the robot goes to HOLD [s].
 DRIFT_TO_HOLD = 5e-3
-#: Window of the drift check [cycles].
+#: Length of the window in which the delay is measured [cycles].
 DRIFT_CYCLES = 50
-#: Bins of the histogram of cycle costs, 1 us each.
+#: Number of bins of the histogram of computing times. Each bin is 1 us wide.
 COST_BINS = 10_000
 
 
@@ -43,10 +42,10 @@ class Clock(Protocol):
 
 
 class LockStep:
-    """Clock without waiting: the next SYNC is sent as soon as the nodes have answered the last one."""
+    """Clock for lock-step: a cycle begins as soon as the nodes have answered the SYNC of the last cycle."""
 
     def wait(self) -> float:
-        """Return immediately with a lateness of 0 s."""
+        """Return a lateness of 0 s without waiting."""
         return 0.0
 
 
@@ -85,21 +84,21 @@ class WallClock:
 
 
 class Drift:
-    """Time lost against the monotonic clock over the last `DRIFT_CYCLES` cycles."""
+    """Measurement of the delay against the monotonic clock over the last `DRIFT_CYCLES` cycles."""
 
     def __init__(self) -> None:
         self._lost = 0.0
         self._behind = deque([0.0] * DRIFT_CYCLES, maxlen=DRIFT_CYCLES)
 
     def add(self, late: float) -> float:
-        """Add a cycle and return the time lost within the window.
+        """Add the lateness of one cycle, and return the delay within the window [s].
 
         Args:
             late: Lateness of the cycle [s], as `Clock.wait` returns it. A gap longer than `GAP_TO_HOLD` does not count,
                 because it has a diagnostic of its own.
 
         Returns:
-            Time lost within the window [s].
+            Delay within the window [s].
         """
         if PERIOD < late <= GAP_TO_HOLD:
             self._lost += late
@@ -111,7 +110,7 @@ class Drift:
 
 @dataclass
 class Statistics:
-    """Timing of a run.
+    """Timing statistics of a run.
 
     The cost of a cycle is its computing time without the wait. On an embedded bus it includes the emulator.
     """
@@ -120,20 +119,19 @@ class Statistics:
     overruns: int = 0  # cycles that began more than a period late
     lateness_max: float = 0.0  # s
     wall: float = 0.0  # s, first to last cycle
-    #: Number of cycles for each cost of 0, 1, 2, ... us; the last entry counts all longer cycles. Its size does not grow with
-    #: the run.
+    #: Histogram: number of cycles for each cost of 0, 1, 2, ... us. The last entry counts all longer cycles.
     costs: list[int] = field(default_factory=lambda: [0] * (COST_BINS + 1))
 
     @property
     def real_time_factor(self) -> float:
-        """Return the ratio of simulated to elapsed time; 1 on the wall clock."""
+        """Return the simulated time divided by the elapsed time. It is 1 on the wall clock."""
         return self.cycles * PERIOD / self.wall if self.wall else 0.0
 
     def cost(self, percentile: float) -> float:
-        """Return the cycle cost that a share of the cycles did not exceed.
+        """Return a percentile of the cycle costs.
 
         Args:
-            percentile: Share of the cycles, 0 to 100 [%].
+            percentile: Share of the cycles that did not exceed the returned cost, 0 to 100 [%].
 
         Returns:
             Cost [s] with a resolution of 1 us. 10 ms means 10 ms or more.
@@ -150,7 +148,7 @@ def run(
     until: Callable[[State], bool],
     record: Callable[[], None] = lambda: None,
 ) -> Statistics:
-    """Run the controller on the robot until `until(state)` is true, then leave the robot in HOLD.
+    """Run the controller on the robot until `until(state)` is true, then bring the robot to HOLD.
 
     Args:
         hal: Hardware abstraction layer of the robot.
@@ -175,7 +173,7 @@ def run(
             f"controller.telemetry must have the length that the HAL records ({len(controller_record)}), got "
             f"{len(telemetry)}: construct the HAL with `controller_fields=controller.telemetry_fields`"
         )
-    # All present objects last as long as the run, so the garbage collector need not scan them. A caller's freeze is kept.
+    # Objects created before the run exist until its end, so the garbage collector need not scan them.
     frozen = gc.get_freeze_count() > 0
     if not frozen:
         gc.collect()
@@ -184,7 +182,7 @@ def run(
     try:
         while True:
             late = clock.wait()
-            begun = time.perf_counter()
+            began = time.perf_counter()
             lost = drift.add(late)
             if late:
                 late_in_row = _judge_lateness(hal, statistics, late, late_in_row, lost)
@@ -201,7 +199,7 @@ def run(
             else:
                 hal.hold()
                 active = False
-            cost = time.perf_counter() - begun
+            cost = time.perf_counter() - began
             costs[min(int(cost * 1e6), COST_BINS)] += 1
             statistics.cycles += 1
             header[4], header[5], header[6] = cost * 1e6, late * 1e6, statistics.overruns
@@ -217,16 +215,16 @@ def run(
 
 
 def _judge_lateness(hal: Hal, statistics: Statistics, late: float, in_row: int, drift: float) -> int:
-    """Report a late cycle and a drifting loop; return the number of consecutive late cycles."""
+    """Report a late cycle or a delayed loop, and return the number of consecutive late cycles."""
     statistics.lateness_max = max(statistics.lateness_max, late)
     if drift > DRIFT_TO_HOLD:
-        slow = f"the loop lost {drift * 1e3:.1f} ms within {DRIFT_CYCLES} cycles"
+        slow = f"the loop fell behind the clock by {drift * 1e3:.1f} ms within {DRIFT_CYCLES} cycles"
         hal.report(Dtc.OVERRUN, slow, value=drift)
     if late <= PERIOD:
         return 0
     in_row += 1
     statistics.overruns += 1
-    gap = f"no cycle began for {late * 1e3:.1f} ms"
+    gap = f"a cycle began {late * 1e3:.1f} ms late"
     hal.report(Dtc.CYCLE_GAP, gap, confirmed=late > GAP_TO_HOLD, value=late)
     if drift <= DRIFT_TO_HOLD:
         many = f"{in_row} consecutive cycles were more than {PERIOD * 1e3:.0f} ms late"
@@ -248,9 +246,9 @@ def realtime(priority: int = 50) -> list[str]:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except PermissionError:
         refused.append(
-            f"no real-time priority: run as root, or `ulimit -r {priority}` allowed by /etc/security/limits.conf"
+            f"real-time priority was refused: run as root, or allow `ulimit -r {priority}` in /etc/security/limits.conf"
         )
     lock_current_and_future = 3  # MCL_CURRENT | MCL_FUTURE
     if ctypes.CDLL(None, use_errno=True).mlockall(lock_current_and_future) != 0:
-        refused.append("memory is not locked: run as root, or allow `ulimit -l unlimited`")
+        refused.append("memory is not locked: run as root, or allow `ulimit -l unlimited` in /etc/security/limits.conf")
     return refused

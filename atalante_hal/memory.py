@@ -1,4 +1,4 @@
-"""Memory shared by two processes: an anonymous file, whose descriptor one process passes to the other."""
+"""Memory that two processes share: one process creates an anonymous file and passes its descriptor to the other."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Requests of the operator, which the pendant node sends every cycle: dead-man switch, buttons, assistance factor.
+"""Inputs of the operator, which the pendant node sends every cycle: dead-man switch, buttons, assistance factor.
 
-`process image -> pendant -> state machine`: the only command path into the robot.
+`process image -> pendant -> state machine` is the only path for commands to the robot.
 
 START is edge-triggered: a press is a change of `RequestCounter` between two accepted frames. The first frame is never a press. A
 press that arrives while the pendant is not qualified yet is stored until it is. It is dropped if the dead-man switch or START is
@@ -21,14 +21,14 @@ _SIGNALS = ("DeadMan", "Request", "RequestCounter", "AssistanceFactor", "Assista
 
 
 class Demand(NamedTuple):
-    """Part of a pendant frame that can end a motion."""
+    """Signals of a pendant frame that can end a motion."""
 
     dead_man: bool  # the dead-man switch is pressed
     stop: bool  # the request is STOP, HOLD or an invalid value
 
 
 def demand_of(signals: Sequence[float]) -> Demand:
-    """Return the demand of a frame.
+    """Return the dead-man switch and the stop request of a frame.
 
     Args:
         signals: Signal values in the order of the message, DeadMan and Request first.
@@ -40,7 +40,7 @@ def demand_of(signals: Sequence[float]) -> Demand:
 
 
 def safest(demands: Iterable[Demand]) -> Demand:
-    """Combine the demands of several frames to the safest one.
+    """Combine the demands of several frames into the safest demand.
 
     The dead-man switch counts as pressed only if it is pressed in every frame. One frame with STOP is sufficient for STOP.
 
@@ -55,7 +55,7 @@ def safest(demands: Iterable[Demand]) -> Demand:
 
 
 class Pendant:
-    """Requests of the operator in the present cycle.
+    """Inputs of the operator in the present cycle.
 
     Args:
         image: Process image with the message PENDANT_STATE.
@@ -73,15 +73,15 @@ class Pendant:
         self.heard = b""
         self.dead_man = False
         self.stop_requested = False
-        #: True in the cycle in which START counts.
+        #: True in the cycle in which a START is accepted.
         self.started = False
-        #: Assistance factor Xi in [0, 1]; None: the pendant sets none.
+        #: Assistance factor Xi in [0, 1]; None if the pendant sets no factor.
         self.assistance_factor: float | None = None
         self._press: float | None = None  # RequestCounter of the last cycle
-        self._pressed = False  # True: a START is stored until the pendant is qualified
+        self._pressed = False  # True while a START is stored until the pendant is qualified
 
     def hear(self, present: bool, *, qualifying: bool = False, beside: Sequence[Vector] = ()) -> None:
-        """Evaluate the requests of one cycle.
+        """Evaluate the inputs of one cycle.
 
         Args:
             present: True if the pendant is in time and qualified. Otherwise dead-man switch, STOP and factor do not count.
@@ -111,5 +111,5 @@ class Pendant:
             self.assistance_factor = factor if factor_set else None
 
     def forget_press(self) -> None:
-        """Drop a stored START; called when the state of the state machine has changed."""
+        """Drop a stored START. The safety monitor calls this after each change of the state."""
         self._pressed = False

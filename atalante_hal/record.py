@@ -1,4 +1,4 @@
-"""Record of a cycle: all its values in one contiguous vector, and the controller's `State` as views of it.
+"""Record of one cycle: a contiguous vector of all its values. The controller's `State` consists of views of it.
 
 The process image of the 1 ms messages decodes directly into the record. One copy moves the record into a telemetry ring.
 """
@@ -16,7 +16,7 @@ from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, MOTORS
 from atalante_hal.types import State, SupervisorState
 from atalante_hal.wire.codec import Codec, group_of
 
-#: Fields at the start of the record, one number each; "diagnostics" has one bit for each active `diagnostics.Dtc`.
+#: Names of the first fields of the record, one number each. "diagnostics" has one bit for each active `Dtc`.
 HEADER_FIELDS = (
     "cycle", "time", "supervisor", "assistance_factor", "cost_us", "lateness_us",
     "overruns", "frames", "crc_errors", "dropped", "diagnostics",
@@ -35,7 +35,7 @@ class Record:
         self.layout = Layout(_fields(codec, controller_fields))
         self._imu_rows = tuple(codec.rows[f"IMU_{imu.upper()}_STATE"] for imu in IMUS)
         self.values = np.zeros(self.layout.size)
-        # A memoryview accesses a single number in half the time of an array.
+        # A memoryview, because access to a single number takes half as long as with an array.
         self.header = memoryview(self.values.data).cast("B").cast("d")[: len(HEADER_FIELDS)]
         first = self.layout["motor_position"].start
         self.signals = self.values[first : first + codec.size]
@@ -43,7 +43,7 @@ class Record:
         self.motor_side = self.values[self.layout["motor_position"].start : self.layout["motor_torque"].stop]
         #: Position [rad] and velocity [rad/s] of the joints, shape (2, 12).
         self.motion = self.joint_side[: 2 * len(JOINTS)].reshape(2, len(JOINTS))
-        #: State and temperature of the drives, shape (24,): they change seldom, so one comparison finds a change.
+        #: State and temperature of the drives, shape (24,), in one view. One comparison detects a change.
         self.drive_side = self.values[self.layout["drive_state"].start : self.layout["temperature"].stop]
         assert self.drive_side.size == 2 * len(JOINTS)
         self.torque_command = self.values[self.layout["torque_command"]]
@@ -84,7 +84,7 @@ class Record:
 
 
 def _fields(codec: Codec, controller_fields: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
-    """Return (name, length) of all fields: header, joint side, received signals, commands, controller fields."""
+    """Return (name, length) of each record field: header, joint side, received signals, commands, controller fields."""
     signals: dict[str, int] = {}
     for message, signal in codec.signals:
         name = _field_name(message, group_of(signal.name))
@@ -100,7 +100,7 @@ def _fields(codec: Codec, controller_fields: Sequence[tuple[str, int]]) -> list[
     ]
 
 
-#: Signal group of the DBC -> field of the record, for groups whose plain name would be ambiguous.
+#: Signal group of the DBC -> record field, for groups whose name would be ambiguous.
 _FIELD_NAMES = {
     "Position": "motor_position",
     "Velocity": "motor_velocity",

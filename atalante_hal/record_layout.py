@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator
 
-#: Controller fields carry this prefix in the record.
+#: Prefix of the controller's field names in a record.
 CONTROLLER = "controller."
 
 
 class Layout:
-    """Ordered fields of a vector, each with a name and a slice.
+    """Names and slices of the fields of a record, in order.
 
     Args:
         fields: (name, length) of each field, in order.

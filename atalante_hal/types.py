@@ -1,4 +1,4 @@
-"""Data exchanged between the HAL and a controller: `State`, `Command` and the `Controller` protocol."""
+"""Interface between the HAL and a controller: `State`, `Command` and the protocol `Controller`."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ PERIOD = 1e-3
 
 
 class SupervisorState(IntEnum):
-    """State of the supervisory state machine; a larger value is a worse state.
+    """State of the supervisory state machine, ordered from the best to the worst state.
 
     The values are those of the signal `HalState` on the bus.
     """
 
-    OFF = 0  # no node is expected to answer
-    READY = 1  # every node answers without a fault; the operator may enable the drives
+    OFF = 0  # nodes need not answer
+    READY = 1  # every node answers without a fault; the operator may press START
     ACTIVE = 2  # the controller drives the joints
-    FULL_ASSIST = 3  # as ACTIVE, while the assistance factor is ramped to 1
-    FINISH_STEP = 4  # the present step is finished, then HOLD follows
-    HOLD = 5  # every drive holds its position with its own control loop
-    LOWER = 6  # a joint that cannot hold is lowered slowly
-    FAULT = 7  # latched; only the operator can end it
+    FULL_ASSIST = 3  # as in ACTIVE, but the assistance factor is ramped to 1
+    FINISH_STEP = 4  # the controller finishes the present step, then HOLD follows
+    HOLD = 5  # every drive holds its position with its internal control loop
+    LOWER = 6  # a joint that cannot hold its position is lowered slowly
+    FAULT = 7  # latched until the operator presses START
 
 
 @dataclass(slots=True)
@@ -54,11 +54,11 @@ class State:
     imu_accel: Vector  # (4, 3) m/s2, specific force
     foot_force: Vector  # (2, 4, 3) N, on the foot, in the foot frame
     vibration: Vector  # (8,) measured level, 0 to 1
-    valid: npt.NDArray[np.bool_]  # (messages,) True: fresh, intact, plausible, and its sender is qualified
-    age: npt.NDArray[np.int64]  # (messages,) cycles since the SYNC that the data answers
-    joints_valid: bool  # all twelve joint states are fresh
-    imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty: their age is unknown
-    torque_sent: Vector | None = None  # (12,) Nm, last command after the limits, set by `read`; None: unknown
+    valid: npt.NDArray[np.bool_]  # (messages,) True if the data is new and plausible and its sender is trusted
+    age: npt.NDArray[np.int64]  # (messages,) age of the data [cycles], from the SYNC that the sender answered
+    joints_valid: bool  # True if all twelve joint states are valid
+    imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown
+    torque_sent: Vector | None = None  # (12,) Nm, torques that were sent last, after the limits; None if unknown
 
 
 @dataclass(slots=True)
@@ -70,30 +70,30 @@ class Command:
 
     torque: Vector  # (12,) Nm at the joint
     vibration: Vector  # (8,) level, 0 to 1
-    step: int | None = None  # number of the present step; None: this controller does not walk
-    outside: bool = False  # a joint is outside its safe backward image; reported as an event without any other effect
+    step: int | None = None  # number of the present step; None for a controller that does not walk
+    outside: bool = False  # True if a joint is outside its safe backward image; this only logs an event
 
 
 class Controller(Protocol):
-    """Controller that the loop runs: any object with these members."""
+    """Interface of a controller that the control loop runs."""
 
     @property
     def telemetry(self) -> Vector:
-        """Return the values to record: always the same array, rewritten at every update."""
+        """Return the values to record. It is the same array in every cycle, and `update` overwrites it."""
 
     @property
     def telemetry_fields(self) -> Sequence[tuple[str, int]]:
         """Return (name, length) of each field of `telemetry`, in order."""
 
     def reset(self, state: State) -> None:
-        """Prepare for a motion; called when the controller takes over, before the first `update`.
+        """Prepare for a motion. The loop calls this before the first `update` of each motion.
 
         Args:
             state: State of the present cycle.
         """
 
     def update(self, state: State) -> Command:
-        """Compute the command of one cycle; any exception puts the robot into HOLD.
+        """Compute the command of one cycle. Any exception brings the robot to HOLD.
 
         Args:
             state: State of the present cycle.

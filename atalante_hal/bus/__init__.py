@@ -1,4 +1,4 @@
-"""CAN buses: first and last stage of the flow, `bus -> process image -> ... -> process image -> bus`.
+"""CAN transports: the first and the last stage of each control cycle.
 
 The protocol `Bus` has several transports. The HAL and the emulator run on any of them without change:
 
@@ -26,15 +26,15 @@ class BusError(Exception):
 
 
 class BusAbsent(BusError):  # noqa: N818
-    """Error on opening: no such interface, interface down, no CAN FD or no driver."""
+    """Error of a bus that cannot be opened: the interface is missing, down, without CAN FD or without a driver."""
 
 
 class BusDown(BusError):  # noqa: N818
-    """Error on an open bus that can no longer be used: interface down, adapter unplugged, or bus closed."""
+    """Error of an open bus that can no longer be used: interface down, adapter unplugged, or bus closed."""
 
 
 class BusFull(BusError):  # noqa: N818
-    """Error of a full transmit queue, which accepted only the first `sent` frames of the batch."""
+    """Error of a full transmit queue: only the first `sent` frames of the batch were accepted."""
 
     def __init__(self, message: str, sent: int = 0) -> None:
         super().__init__(message)
@@ -54,12 +54,12 @@ class Bus(Protocol):
 
     @property
     def stamps(self) -> Stamps:
-        """Return the receive times of the frames of the last `receive()`, in the same order. Shape (capacity,) int64 [ns]."""
+        """Return the receive time of each frame of the last `receive()`. Shape (capacity,), int64 [ns]."""
         ...
 
     @property
     def dropped(self) -> int:
-        """Return the number of frames lost at this end before `receive()`, since the bus was opened."""
+        """Return the number of received frames that were lost since the bus was opened."""
         ...
 
     def send(self, frames: Frames) -> None:
@@ -104,7 +104,7 @@ def open_bus(interface: str, channel: str, **options: Any) -> Bus:
     Args:
         interface: Name of the interface in python-can. `socketcan` uses `SocketCanBus`; all others use python-can.
         channel: Name of the channel, such as `can0`.
-        **options: Keyword arguments of the chosen bus class. python-can receives those it defines without change.
+        **options: Keyword arguments of the bus class. `PythonCanBus` passes its options to python-can.
 
     Returns:
         The open bus.

@@ -1,4 +1,4 @@
-"""Assignment of the robot's buses to CAN channels: parsed from the option `-c`, then opened."""
+"""Assignment of the robot's buses to CAN channels, as given with the option `-c`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Several channels joined to one bus, for a robot whose buses are on more than one CAN interface.
+"""Bus that joins several channels, for a robot whose buses are on more than one CAN interface.
 
 Identifiers are unique in the whole network. So the identifier of a frame determines its channel, and frames received on different
 channels can be mixed: the process image finds its rows by identifier.
@@ -18,8 +18,8 @@ from atalante_hal.bus import Bus, BusDown, BusError, BusFull, Stamps
 from atalante_hal.bus.batch import REMEMBERED, Batches
 from atalante_hal.wire.frame import Frames, as_words, new_frames
 
-#: Polling period of channels without a file descriptor [s].
-LOOK_AGAIN: Final = 100e-6
+#: Polling period of channels that have no file descriptor [s].
+POLLING_PERIOD: Final = 100e-6
 
 
 class Share(NamedTuple):
@@ -27,11 +27,11 @@ class Share(NamedTuple):
 
     link: Bus
     indices: list[int]  # of the frames in the batch
-    frames: Frames  # always the same array, because a bus caches its views
+    frames: Frames  # reused for each batch, because a bus caches memory views
 
 
 class JoinedBus:
-    """Buses of the robot joined to one `Bus`.
+    """Bus that joins all buses of the robot.
 
     Each frame goes to the bus of its message. The order of frames is kept on each channel, but not between channels. If one
     channel cannot send its frames, the others still send theirs.
@@ -58,7 +58,9 @@ class JoinedBus:
         self._batches = Batches()
         self._shares: dict[bytes, list[Share]] = {}
         self._tails: dict[int, list[Frames]] = {}
-        self._turn = 0  # index of the channel read first: it rotates, so that a busy channel cannot block the others
+        self._turn = (
+            0  # index of the channel that is read first; it rotates, because a busy channel could block the others
+        )
         self._closed = False
         files = [_file_of(link) for link in self._links]
         self._files = [file for file in files if file is not None]
@@ -126,7 +128,7 @@ class JoinedBus:
             if self._all_have_files:
                 select.select(self._files, (), (), left)
             else:
-                time.sleep(min(left, LOOK_AGAIN))
+                time.sleep(min(left, POLLING_PERIOD))
             count = self._gather(tails)
         return count
 
@@ -152,10 +154,10 @@ class JoinedBus:
         return count
 
     def _tails_of(self, frames: Frames) -> list[Frames]:
-        """Return the slices `frames[i:]` for all i; they are cached, because a bus caches views by array object."""
+        """Return the slices `frames[i:]` for all i, cached for the next call."""
         tails = self._tails.get(id(frames))
         if tails is None:
-            self._batches.to_fill(frames)  # raises TypeError if it is not an array of frames
+            self._batches.to_fill(frames)  # raises TypeError if the argument is not an array of frames
             if len(self._tails) >= REMEMBERED:
                 self._tails.clear()
             tails = [frames, *(frames[offset:] for offset in range(1, len(frames)))]
@@ -163,7 +165,7 @@ class JoinedBus:
         return tails
 
     def _divide(self, headers: bytes, frames: Frames) -> list[Share]:
-        """Return the share of each channel in a batch with these headers, and cache it."""
+        """Divide a batch among the channels, and cache the result for batches with the same headers."""
         rows: dict[int, list[int]] = {}
         for index, frame_id in enumerate(frames["can_id"].tolist()):
             link = self._link_of.get(frame_id)

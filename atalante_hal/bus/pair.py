@@ -1,4 +1,4 @@
-"""Embedded bus: two ends in one process, in lock-step.
+"""Embedded bus with two ends in one process, in lock-step.
 
 The HAL has one end and the emulator the other. If the HAL calls `receive()` and its queue is empty, its end calls `step`. In this
 call the emulator receives the HAL's frames and sends its answers. Both sides run the same code as on a real bus.
@@ -16,14 +16,14 @@ from atalante_hal.wire.frame import FRAME_BYTES, Frames, new_frames
 
 
 class PairBus:
-    """One end of an embedded bus; `lockstep_pair()` creates both. It never waits.
+    """One end of an embedded bus within one process. Its calls never wait.
 
     Args:
         name: Name of this end.
         capacity: Number of frames that can be queued for this end. More raise `BusFull` at the peer.
 
     Attributes:
-        step: Function that `receive()` calls when no frame is queued; None: none.
+        step: Function that `receive()` calls when no frame is queued; None: no function is called.
         now_ns: Virtual time of received frames [ns], set by the owner of this end.
         dropped: Always 0, because no frame is lost here.
     """
@@ -51,7 +51,7 @@ class PairBus:
         self.dropped = 0
         self._peer = self
         self._closed = False
-        self._queue = new_frames(capacity).view(np.uint8).data  # frames for this end, in bytes [head, tail)
+        self._queue = new_frames(capacity).view(np.uint8).data  # queued frames, from byte `_head` to byte `_tail`
         self._head = 0
         self._tail = 0
         self._limit = capacity * FRAME_BYTES
@@ -61,7 +61,7 @@ class PairBus:
 
     @property
     def stamps(self) -> Stamps:
-        """Return the value of `now_ns` at the last `receive()`, for each frame. Shape (capacity,) int64 [ns]."""
+        """Return the virtual time of the last `receive()`, repeated for each frame. Shape (capacity,), int64 [ns]."""
         self._stamps.fill(self._received_at)
         return self._stamps
 
@@ -85,7 +85,7 @@ class PairBus:
         tail = peer._tail
         end = tail + memory.nbytes
         if end > peer._limit:
-            tail = peer._close_ranks()
+            tail = peer._move_to_start()
             end = tail + memory.nbytes
             if end > peer._limit:
                 raise BusFull(
@@ -134,13 +134,13 @@ class PairBus:
         self.step = None
         self._head = self._tail = 0
 
-    def _close_ranks(self) -> int:
-        """Move the queued frames to the start of the queue and return the offset of their end [bytes]."""
-        waiting = self._tail - self._head
-        self._queue[:waiting] = self._queue[self._head : self._tail]
+    def _move_to_start(self) -> int:
+        """Move the queued frames to the start of the queue, and return the offset of their end [bytes]."""
+        size = self._tail - self._head
+        self._queue[:size] = self._queue[self._head : self._tail]
         self._head = 0
-        self._tail = waiting
-        return waiting
+        self._tail = size
+        return size
 
 
 def lockstep_pair(

@@ -1,4 +1,4 @@
-"""Bus on any interface of python-can: adapters without SocketCAN, and `virtual` in tests.
+"""Bus on any python-can interface, for adapters without SocketCAN and for tests.
 
 It takes about 6 us for each frame. Use `socketcan.SocketCanBus` for interfaces that the kernel supports, because it is faster.
 """
@@ -26,7 +26,7 @@ from atalante_hal.wire.frame import (
     Frames,
 )
 
-#: Packed form of one `FRAME`: identifier, length, flags, payload.
+#: Memory layout of one `FRAME`: identifier, length, flags, payload.
 RECORD = struct.Struct("<IBB2x64s")
 ID_NUMBER = 0x1FFF_FFFF
 LINK_LOST = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF)
@@ -161,7 +161,7 @@ def pack(message: can.Message, memory: memoryview, offset: int) -> bool:
     can_id = message.arbitration_id
     if message.is_extended_id and not message.is_error_frame:
         can_id |= ID_EXTENDED
-    remote = message.is_remote_frame and not message.is_fd  # the .asc reader calls an empty FD frame remote
+    remote = message.is_remote_frame and not message.is_fd  # the .asc reader marks an empty CAN FD frame as remote
     if remote:
         can_id |= ID_REMOTE
     if message.is_error_frame:

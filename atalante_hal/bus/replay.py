@@ -23,19 +23,19 @@ from atalante_hal.bus.batch import Batches
 from atalante_hal.bus.python_can import pack
 from atalante_hal.wire.frame import FRAME_BYTES, Frames
 
-#: Formats whose python-can writers lose the FD flag, or lose frames (.db).
+#: Log formats that python-can writes incompletely: .csv loses the CAN FD flag, .db loses frames.
 WITHOUT_FD = (".csv", ".db")
-#: Text formats with one frame in each line: a complete log ends with a newline.
+#: Text log formats with one frame per line. A complete log ends with a newline.
 LINE_LOGS = (".log", ".asc", ".trc")
 BLF_HEADER_BYTES = 144
-#: Exceptions that python-can's readers raise for an invalid file.
+#: Exceptions that python-can raises when it reads an invalid log.
 UNREADABLE = (
     ValueError,
     IndexError,
     KeyError,
     EOFError,
     OSError,
-    NotImplementedError,  # a reader whose package is not installed
+    NotImplementedError,  # if the package for this log format is not installed
     struct.error,
     zlib.error,
     sqlite3.Error,
@@ -45,11 +45,11 @@ UNREADABLE = (
 
 
 class LogUnreadable(BusError):  # noqa: N818
-    """Error of a log that is missing, empty or truncated, or whose format cannot store CAN FD frames."""
+    """Error of a log that cannot be read: it is missing, empty or truncated, or its format cannot store CAN FD frames."""
 
 
 class ReplayBus:
-    """Replay of a log in a format of python-can's LogReader: .log (candump -L), .asc, .blf, .mf4, .trc, each also as .gz.
+    """Bus that replays a log file: .log (candump -L), .asc, .blf, .mf4 or .trc, also compressed as .gz.
 
     Args:
         path: Log file.
@@ -81,7 +81,7 @@ class ReplayBus:
 
     @property
     def ended(self) -> bool:
-        """Return whether every frame of the log was returned."""
+        """Return whether `receive` has returned every frame of the log."""
         return self._next is None
 
     def send(self, frames: Frames) -> None:
@@ -93,7 +93,7 @@ class ReplayBus:
         Raises:
             BusError: Always.
         """
-        raise BusError(f"{self.name} is a recording: nothing can be sent to it; open a real or an emulated bus to send")
+        raise BusError(f"{self.name} is a recording: nothing can be sent to it; use a real or an emulated bus to send")
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
         """Write the next frames of the log to `frames[:n]` and return n, without waiting.
@@ -171,7 +171,7 @@ def _open(path: Path) -> can.io.generic.MessageReader:
 
 
 def _bytes(path: Path, count: int, whence: int) -> bytes:
-    """Return the first `count` bytes of a file, or its last `-count` bytes if `count` is negative."""
+    """Return the first `count` bytes of a file; the last `-count` bytes if `count` is negative."""
     with path.open("rb") as file:
         file.seek(min(count, 0), whence)
         return file.read(abs(count))

@@ -1,4 +1,4 @@
-"""Embedded bus between two processes, in shared memory, so that both ends run in parallel; `pair` is the one-process variant.
+"""Embedded bus between two processes, in shared memory. The module `pair` is the variant within one process.
 
 Each end has a queue that only it writes and only the other end reads. After the frames it stores a frame counter, which makes
 them visible to the reader. This requires that stores become visible in program order, as on x86-64. A waiting end polls the
@@ -29,19 +29,20 @@ from atalante_hal.bus.batch import Batches
 from atalante_hal.memory import anonymous_file
 from atalante_hal.wire.frame import FRAME_BYTES, Frames
 
-#: 64-bit words of each end in the header, one cache line: frames sent and received so far, steps requested and completed so far,
-#: and three flags (serving, sleeping, closed).
-_SENT, _TAKEN, _ASKED, _MADE, _SERVES, _ASLEEP, _CLOSED = range(7)
-_LINE = 8
+#: Header words of each end that count: frames sent, frames received, steps requested, steps completed.
+_SENT, _RECEIVED, _REQUESTED, _COMPLETED = range(4)
+#: Header words of each end that are flags: the end serves steps, sleeps, or is closed.
+_SERVING, _SLEEPING, _CLOSED = range(4, 7)
+#: Number of 64-bit header words of each end: one cache line.
+_END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
-#: Time an end polls before it sleeps [s]; longer than the computing time of either end in a cycle.
+#: Time for which a waiting end polls before it sleeps [s]. It is longer than the computing time of a cycle.
 _POLL_TIME = 500e-6
-#: Number of waits without polling after one in which polling failed. On a busy machine, or if the other end runs in real time,
-#: polling only takes computing time from other processes.
+#: Number of waits that sleep without polling, after a wait in which polling failed. This saves computing time.
 _WAITS_WITHOUT_POLLING = 32
-#: Longest sleep before the next poll [ms]: a wake-up can arrive before the store it announces is visible.
+#: Longest sleep before the shared memory is read again [ms]. A new value can become visible after its wake-up.
 _SLEEP = 20
-_BELL = b"\0"
+_WAKE_UP = b"\0"
 _REASON_BYTES = 4096
 
 
@@ -55,42 +56,42 @@ class SharedBus:
         dropped: Always 0, because no frame is lost here.
     """
 
-    def __init__(self, name: str, memory: int, bell: int, end: int) -> None:
+    def __init__(self, name: str, memory: int, wake_socket: int, end: int) -> None:
         """Attach to one end of the bus.
 
         Args:
             name: Name of this end.
             memory: Descriptor of the shared memory. The bus takes it over and closes it.
-            bell: Descriptor of the socket that wakes this end. The bus takes it over and closes it.
+            wake_socket: Descriptor of the socket that wakes this end. The bus takes it over and closes it.
             end: Number of this end, 0 or 1.
         """
         self.name = name
         self.patience = 0.0
         self.dropped = 0
-        self._bell = socket.socket(fileno=bell)
-        self._bell.setblocking(False)
-        self._ringing = select.poll()
-        self._ringing.register(bell, select.POLLIN)
+        self._wake_socket = socket.socket(fileno=wake_socket)
+        self._wake_socket.setblocking(False)
+        self._wake_poll = select.poll()
+        self._wake_poll.register(wake_socket, select.POLLIN)
         self._map = mmap.mmap(memory, 0)
         os.close(memory)
         octets = memoryview(self._map)
         size = (len(octets) - _HEADER_BYTES) // 2
         queues = [octets[_HEADER_BYTES + index * size :][:size] for index in (0, 1)]
-        lines = [octets[index * _LINE * 8 :][: _LINE * 8].cast("q") for index in (0, 1)]
+        lines = [octets[index * _END_WORDS * 8 :][: _END_WORDS * 8].cast("q") for index in (0, 1)]
         self._own, self._peers = lines[end], lines[1 - end]
         self._outgoing, self._incoming = queues[end], queues[1 - end]
         self._size = size
-        self._sent = self._taken = 0
-        self._waits_without_polling = 0  # number of further waits that sleep immediately
+        self._sent = self._received = 0
+        self._waits_without_polling = 0  # remaining waits that sleep without polling
         self._closed = False
-        self._close_reason = ""  # received from the other end
+        self._close_reason = ""  # sent by the other end when it closed
         self._stamps: Stamps = np.zeros(size // FRAME_BYTES, np.int64)
         self._received_at = 0
         self._batches = Batches()
 
     @property
     def stamps(self) -> Stamps:
-        """Return the time of the last `receive()` that returned frames, for each frame. Shape (capacity,) int64 [ns]."""
+        """Return the time of the last `receive()` with frames, repeated for each frame. Shape (capacity,), int64 [ns]."""
         self._stamps.fill(self._received_at)
         return self._stamps
 
@@ -112,9 +113,9 @@ class SharedBus:
             return
         size, offset = self._size, self._sent * FRAME_BYTES % self._size
         sent = self._sent + len(frames)
-        if (sent - self._peers[_TAKEN]) * FRAME_BYTES > size:
+        if (sent - self._peers[_RECEIVED]) * FRAME_BYTES > size:
             raise BusFull(
-                f"{self.name}: the queue of the other end is full, {self._sent - self._peers[_TAKEN]} frames were not "
+                f"{self.name}: the queue of the other end is full, {self._sent - self._peers[_RECEIVED]} frames were not "
                 "received"
             )
         end = offset + memory.nbytes
@@ -126,8 +127,8 @@ class SharedBus:
         self._sent = sent
         if not self.patience:
             self._own[_SENT] = sent
-            if self._peers[_ASLEEP]:
-                self._ring()
+            if self._peers[_SLEEPING]:
+                self._wake_peer()
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
         """Move received frames to `frames[:n]` and return n, see `Bus.receive`.
@@ -144,11 +145,13 @@ class SharedBus:
         """
         if self._closed:
             raise BusDown(f"{self.name} is closed")
-        if self._peers[_SENT] == self._taken and not (self._request_step() if self.patience else self._wait(timeout)):
+        if self._peers[_SENT] == self._received and not (
+            self._request_step() if self.patience else self._wait(timeout)
+        ):
             return 0
         memory = self._batches.to_fill(frames)
-        offset = self._taken * FRAME_BYTES % self._size
-        size = min((self._peers[_SENT] - self._taken) * FRAME_BYTES, memory.nbytes)
+        offset = self._received * FRAME_BYTES % self._size
+        size = min((self._peers[_SENT] - self._received) * FRAME_BYTES, memory.nbytes)
         before_end = self._size - offset
         if size <= before_end:
             memory[:size] = self._incoming[offset : offset + size]
@@ -156,8 +159,8 @@ class SharedBus:
             memory[:before_end] = self._incoming[offset:]
             memory[before_end:size] = self._incoming[: size - before_end]
         count = size // FRAME_BYTES
-        self._taken += count
-        self._own[_TAKEN] = self._taken
+        self._received += count
+        self._own[_RECEIVED] = self._received
         self._received_at = time.time_ns()
         return count
 
@@ -171,65 +174,65 @@ class SharedBus:
             BusDown: If the other end is closed or its process has ended.
         """
         own, peers = self._own, self._peers
-        own[_SERVES] = 1
+        own[_SERVING] = 1
         while True:
-            made = own[_MADE]
-            self._until(lambda: peers[_ASKED] != made, math.inf)  # noqa: B023 - called only in this iteration
+            completed = own[_COMPLETED]
+            self._until(lambda: peers[_REQUESTED] != completed, math.inf)  # noqa: B023 - called in this iteration
             step()
-            own[_MADE] = made + 1
-            if peers[_ASLEEP]:
-                self._ring()
+            own[_COMPLETED] = completed + 1
+            if peers[_SLEEPING]:
+                self._wake_peer()
 
-    def meet(self, timeout: float) -> None:
-        """Wait until the other end serves.
+    def wait_until_served(self, timeout: float) -> None:
+        """Wait until the other end has called `serve`.
 
         Args:
             timeout: Longest wait [s].
 
         Raises:
-            BusDown: If the other end does not serve within `timeout`, or is closed.
+            BusDown: If the other end does not call `serve` within `timeout`, or is closed.
         """
         peers = self._peers
-        if not self._until(lambda: peers[_SERVES], timeout):
+        if not self._until(lambda: peers[_SERVING], timeout):
             raise BusDown(f"{self.name}: the other end did not start to serve within {timeout:.0f} s")
 
-    def close(self, last_words: str = "") -> None:
+    def close(self, reason: str = "") -> None:
         """Close this end. The other end can still receive the frames that were sent.
 
         Args:
-            last_words: Reason, which the other end adds to its `BusDown`; empty: none.
+            reason: Reason for closing, which the other end adds to its `BusDown`; empty: none.
         """
         if self._closed:
             return
         self._closed = True
         self._own[_CLOSED] = 1
         with contextlib.suppress(OSError):
-            self._bell.send(last_words.encode()[:_REASON_BYTES] or _BELL)
-        self._bell.close()
+            self._wake_socket.send(reason.encode()[:_REASON_BYTES] or _WAKE_UP)
+        self._wake_socket.close()
         for view in (self._own, self._peers, self._outgoing, self._incoming):
             view.release()
         self._map.close()
 
-    def _ring(self) -> None:
-        # A full socket already contains a wake-up. The next `receive` detects a closed peer.
+    def _wake_peer(self) -> None:
+        # If the socket is full, it already contains a wake-up. The next `receive` detects a closed peer.
         with contextlib.suppress(OSError):
-            self._bell.send(_BELL)
+            self._wake_socket.send(_WAKE_UP)
 
     def _request_step(self) -> bool:
-        """Request a step of the other end and return whether it sent frames."""
-        peers, taken = self._peers, self._taken
+        """Request a step from the other end and return whether it sent frames."""
+        peers, received = self._peers, self._received
         self._own[_SENT] = self._sent
-        self._own[_ASKED] = asked = self._own[_ASKED] + 1
-        if peers[_ASLEEP]:
-            self._ring()
-        # The server stores the frames of a step before it stores the end of the step.
-        self._until(lambda: peers[_SENT] != taken or peers[_MADE] == asked, self.patience)
-        return peers[_SENT] != taken
+        self._own[_REQUESTED] = requested = self._own[_REQUESTED] + 1
+        if peers[_SLEEPING]:
+            self._wake_peer()
+        # The server publishes the frames of a step before it marks the step as completed.
+        self._until(lambda: peers[_SENT] != received or peers[_COMPLETED] == requested, self.patience)
+        return peers[_SENT] != received
 
     def _wait(self, timeout: float) -> bool:
-        """Wait for frames for at most `timeout` [s] and return whether some arrived; a server does not wait."""
-        peers, taken = self._peers, self._taken
-        return timeout > 0.0 and not self._own[_SERVES] and self._until(lambda: peers[_SENT] != taken, timeout)
+        """Wait for frames for at most `timeout` [s] and return whether any arrived. A server does not wait."""
+        peers, received = self._peers, self._received
+        return timeout > 0.0 and not self._own[_SERVING] and self._until(lambda: peers[_SENT] != received, timeout)
 
     def _until(self, ready: Callable[[], object], limit: float) -> bool:
         """Wait until `ready()` is true and return True; return False after `limit` [s].
@@ -244,21 +247,21 @@ class SharedBus:
         Raises:
             BusDown: If the other end is closed.
         """
-        now = begun = time.monotonic()
+        now = start = time.monotonic()
         poll_time = 0.0 if self._waits_without_polling else _POLL_TIME
         slept = False
         while not ready():
-            waited = now - begun
+            waited = now - start
             if waited >= limit:
                 return False
             if self._peers[_CLOSED]:
-                self._read_bell()
+                self._read_wake_ups()
             if waited >= poll_time:
                 slept = True
-                self._own[_ASLEEP] = 1
+                self._own[_SLEEPING] = 1
                 if not ready():
                     self._sleep(min(_SLEEP, 1e3 * (limit - waited)))
-                self._own[_ASLEEP] = 0
+                self._own[_SLEEPING] = 0
             now = time.monotonic()
         if self._waits_without_polling:
             self._waits_without_polling -= 1
@@ -268,21 +271,21 @@ class SharedBus:
 
     def _sleep(self, longest: float) -> None:
         """Sleep until the other end wakes this one, at most `longest` [ms]; raise `BusDown` if the other end is closed."""
-        if self._ringing.poll(longest):
-            self._read_bell()
+        if self._wake_poll.poll(longest):
+            self._read_wake_ups()
 
-    def _read_bell(self) -> None:
+    def _read_wake_ups(self) -> None:
         """Read all wake-ups from the socket; raise `BusDown` if the other end is closed."""
         while True:
             try:
-                received = self._bell.recv(_REASON_BYTES)
+                received = self._wake_socket.recv(_REASON_BYTES)
             except BlockingIOError:
                 return
             except ConnectionResetError:
-                continue  # the other end closed with unread wake-ups; its reason can still be read
+                continue  # the other end closed before it read all wake-ups; its reason can still be read
             if not received:
                 raise BusDown(f"{self.name}: {self._close_reason or 'the other end is closed'}")
-            if received != _BELL:
+            if received != _WAKE_UP:
                 self._close_reason = received.decode(errors="replace")
 
 

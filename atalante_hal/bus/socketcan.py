@@ -25,19 +25,19 @@ from atalante_hal.wire.frame import FLAG_FDF, FRAME_BYTES, Frames, as_words, new
 CLASSIC_BYTES = 16  # struct can_frame
 CAN_RAW_ERR_FILTER: Final = 2
 SO_RCVBUFFORCE: Final = 33
-SO_TIMESTAMPNS: Final = 35  # also the type of its control message
+SO_TIMESTAMPNS: Final = 35  # option number, and type of its control message
 SO_RXQ_OVFL: Final = 40
 SIOCGIFFLAGS: Final = 0x8913
 SIOCGIFMTU: Final = 0x8921
 IFF_UP: Final = 1
-#: Classes of received error frames (linux/can/error.h): TX timeout, controller state, bus-off, restarted.
+#: Error frames to receive (linux/can/error.h): transmit timeout, controller problem, bus-off, controller restarted.
 ERROR_FRAMES = 0x0001 | 0x0004 | 0x0040 | 0x0100
 LINK_LOST = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
 NO_ROOM = (errno.ENOBUFS, errno.EAGAIN)
 
-#: Mask of the used fields of a received header word: some programs and drivers leave a DLC or garbage in the reserved bytes.
+#: Mask of the used fields of a received header word. The reserved bytes may contain garbage.
 HEADER_FIELDS = np.uint64(0x0000_FFFF_FFFF_FFFF)
-#: FDF flag in a header word, which must be set here because older kernels mark a CAN FD frame only by its size.
+#: FDF flag in a header word. Older kernels do not set it in received CAN FD frames.
 FDF_IN_HEADER = np.uint64(FLAG_FDF << 40)
 
 IOVEC = np.dtype([("base", "u8"), ("length", "u8")])
@@ -54,7 +54,7 @@ MMSGHDR = np.dtype(
         ("length", "u8"),
     ]
 )
-#: Control messages of one frame, in the order in which the kernel writes them. The drop counter follows only after a loss.
+#: Control messages of one received frame: its time stamp, then a drop counter if frames were lost.
 CONTROL = np.dtype(
     [
         ("stamp_length", "u8"),
@@ -69,11 +69,11 @@ CONTROL = np.dtype(
         ("padding", "u4"),
     ]
 )
-STAMP_ONLY = 32  # bytes of control data without the drop counter
+STAMP_ONLY = 32  # size of the control messages without drop counter [bytes]
 
 
 class SocketCanBus:
-    """Raw CAN FD socket bound to one interface.
+    """Bus on a raw CAN FD socket that is bound to one Linux interface.
 
     It does not receive its own frames. It receives error frames about the state of the CAN controller. Time stamps are
     CLOCK_REALTIME, taken by the kernel when the driver delivers the frame.
@@ -125,7 +125,7 @@ class SocketCanBus:
         self._patience = np.zeros(2, np.int64)  # struct timespec
         self._patience_address = _address(self._patience)
 
-        # Transmit buffers: frames and their headers. A classic frame uses the first 16 bytes of its record.
+        # Transmit buffers: frames and their headers. A classic CAN frame uses the first 16 bytes of its record.
         self._tx = new_frames(capacity)
         self._tx_memory = self._tx.view(np.uint8).data
         self._tx_flags = self._tx["flags"]
@@ -200,7 +200,7 @@ class SocketCanBus:
         return int(count)
 
     def fileno(self) -> int:
-        """Return the file descriptor of the socket, to wait for several buses together."""
+        """Return the file descriptor of the socket, for `select` or `poll`."""
         return self._file
 
     def close(self) -> None:
@@ -209,7 +209,7 @@ class SocketCanBus:
         self._socket.close()
 
     def _wait(self, room: int, timeout: float) -> int:
-        """Wait for a frame after an empty queue, then receive.
+        """Wait until a frame arrives, then receive.
 
         Args:
             room: Largest number of frames to receive.
@@ -240,7 +240,7 @@ class SocketCanBus:
         raise BusError(f"{self.name} cannot receive: {os.strerror(code)}")
 
     def _widen_classic(self, count: int) -> None:
-        """Clear old bytes in the records of classic frames (16 bytes instead of 72), and mark the others as CAN FD."""
+        """Clear the unused bytes of classic CAN frames, and set the FDF flag of CAN FD frames."""
         for frame, length in zip(self._rx[:count], self._rx_lengths[:count].tolist(), strict=True):
             frame["res"] = 0
             if length > CLASSIC_BYTES:
@@ -250,7 +250,7 @@ class SocketCanBus:
                 frame["data"][8:] = 0
 
     def _read_control(self, count: int) -> None:
-        """Read time stamps and drop counter of the received frames, and reset the control buffers for the next call."""
+        """Read time stamps and drop counter of the received frames, then reset the control buffers."""
         stamps = self.stamps[:count]
         np.multiply(self._seconds[:count], 1_000_000_000, out=stamps)
         np.add(stamps, self._nanoseconds[:count], out=stamps)
@@ -318,7 +318,7 @@ def require_channel(channel: str) -> None:
 
 
 def _ioctl(any_socket: socket.socket, request: int, channel: str) -> bytes:
-    """Return the value part of `struct ifreq` after an ioctl on an interface (netdevice(7))."""
+    """Call ioctl on an interface and return the value in its `struct ifreq` (netdevice(7))."""
     return fcntl.ioctl(any_socket, request, struct.pack("<16s24x", channel.encode()))[16:]
 
 
@@ -337,7 +337,7 @@ def _bound_socket(channel: str, receive_buffer: int) -> socket.socket:
 
 
 def _headers(frames: Frames, control: Frames | None) -> tuple[Frames, Frames]:
-    """Create one `iovec` and one `mmsghdr` for each frame. Keep both while the kernel uses the headers."""
+    """Create one `iovec` and one `mmsghdr` for each frame. The caller must keep both arrays."""
     index = np.arange(len(frames), dtype=np.uint64)
     vectors = np.zeros(len(frames), IOVEC)
     vectors["base"] = _address(frames) + index * FRAME_BYTES

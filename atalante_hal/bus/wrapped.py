@@ -1,4 +1,4 @@
-"""Base class of a bus that wraps another bus, to observe, change or delay its frames."""
+"""Base class for a bus that observes, changes or delays the frames of another bus."""
 
 from __future__ import annotations
 

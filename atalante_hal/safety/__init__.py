@@ -1,1 +1,1 @@
-"""Safety core: detects faults in each cycle, derives the robot state, and limits the commands sent to the drives."""
+"""Safety core, which detects faults in each cycle, sets the robot's state and limits the commands to the drives."""

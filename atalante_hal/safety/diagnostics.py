@@ -1,4 +1,4 @@
-"""Diagnostic trouble codes (DTCs): a table of all detectable faults, each with its reaction, severity and meaning.
+"""Table of the diagnostic trouble codes (DTCs), each with its reaction, severity and meaning.
 
 `message monitor and other checks -> fault memory -> state machine`: the checks raise codes, and the state machine acts on the
 worst reaction of the confirmed codes. A code is pending while the fault can be ridden through (a lost frame, a late cycle). It is
@@ -16,11 +16,11 @@ class Reaction(IntEnum):
     """Reaction to a confirmed diagnostic, ordered from the mildest to the most severe."""
 
     INFO = 0  # record only
-    NOT_READY = 1  # a moving robot keeps moving; START is refused while the diagnostic is active
+    NOT_READY = 1  # no reaction of a moving robot, but START is refused while the diagnostic is active
     FULL_ASSIST = 2  # ramp the assistance factor to 1
     FINISH_STEP = 3  # finish the current step, then HOLD
     HOLD = 4  # all drives hold their positions
-    LOWER = 5  # lower the affected joint, all other drives hold
+    LOWER = 5  # lower the affected joint; all other drives hold their positions
     FAULT = 6  # latched until the operator acknowledges the fault
 
 
@@ -42,7 +42,7 @@ class Dtc(StrEnum):
     severity: Severity
     #: Short description for the operator.
     meaning: str
-    #: Bit of this code in an integer bit set of codes.
+    #: Integer with only the bit of this code set, for bit sets of codes.
     bit: int
 
     def __new__(cls, code: str, reaction: Reaction, severity: Severity, meaning: str) -> Dtc:
@@ -53,23 +53,23 @@ class Dtc(StrEnum):
         member.bit = 1 << len(cls.__members__)
         return member
 
-    # Message faults, raised mostly by `message_monitor`.
+    # Faults of messages. Most of them are raised by `message_monitor`.
     E2E_SOME_LOST = "E2E_SOME_LOST", _R.INFO, _S.INFO, "1 to 4 frames before this frame are missing"
     E2E_REPEATED = "E2E_REPEATED", _R.INFO, _S.INFO, "a frame was received twice"
     E2E_SEQUENCE = "E2E_SEQUENCE", _R.HOLD, _S.ERROR, "the counter jumped: an old frame, or more than 4 frames lost"
     E2E_CRC = "E2E_CRC", _R.HOLD, _S.ERROR, "the CRC is wrong: a damaged frame, or a frame of another node"
     E2E_FROZEN = "E2E_FROZEN", _R.HOLD, _S.ERROR, "the alive counter of a sending node does not change"
     E2E_LOSS_RATE = "E2E_LOSS_RATE", _R.HOLD, _S.ERROR, "more than a fifth of a node's frames are lost"
-    NODE_TIMEOUT = "NODE_TIMEOUT", _R.HOLD, _S.ERROR, "a node is silent"
+    NODE_TIMEOUT = "NODE_TIMEOUT", _R.HOLD, _S.ERROR, "a node timed out"
     NODE_LATE = "NODE_LATE", _R.HOLD, _S.ERROR, "a node answers an earlier SYNC than the latest one"
     NODE_DUPLICATE = "NODE_DUPLICATE", _R.HOLD, _S.ERROR, "two senders of one message"
     FRAME_LENGTH = "FRAME_LENGTH", _R.HOLD, _S.ERROR, "length or format of a frame differs from the DBC"
     FRAME_UNKNOWN = "FRAME_UNKNOWN", _R.INFO, _S.WARNING, "a frame has an identifier that the DBC does not define"
-    SIGNAL_RANGE = "SIGNAL_RANGE", _R.HOLD, _S.ERROR, "a signal is outside its DBC range"
+    SIGNAL_RANGE = "SIGNAL_RANGE", _R.HOLD, _S.ERROR, "a signal is outside its range in the DBC"
     # Nodes.
     NODE_RESET = "NODE_RESET", _R.HOLD, _S.ERROR, "a node restarted or is not OPERATIONAL"
     HEARTBEAT_LOST = "HEARTBEAT_LOST", _R.NOT_READY, _S.WARNING, "the status message of a node timed out"
-    DBC_MISMATCH = "DBC_MISMATCH", _R.NOT_READY, _S.ERROR, "a node uses a different DBC"
+    DBC_MISMATCH = "DBC_MISMATCH", _R.NOT_READY, _S.ERROR, "a node uses a different DBC than the HAL"
     DRIVE_STATE = "DRIVE_STATE", _R.HOLD, _S.ERROR, "a drive left OPERATION ENABLED without a command"
     DRIVE_FAULT = "DRIVE_FAULT", _R.FAULT, _S.ERROR, "a drive is in FAULT and sent no emergency message"
     EMCY_CURRENT = "EMCY_2xxx", _R.FAULT, _S.ERROR, "emergency of a node: current"
@@ -80,8 +80,8 @@ class Dtc(StrEnum):
     OVER_TEMP = "OVER_TEMP", _R.LOWER, _S.ERROR, "a drive is too hot to hold"
     DERATED = "DERATED", _R.HOLD, _S.WARNING, "a hot drive has less torque; confirmed: far less than the other leg"
     UNDER_VOLTAGE = "UNDER_VOLTAGE", _R.HOLD, _S.ERROR, "the supply voltage is too low"
-    SUPPLY_LOW = "SUPPLY_LOW", _R.FINISH_STEP, _S.WARNING, "the supply voltage is getting low"
-    # Reported by drives, which hold their position without a command of the HAL.
+    SUPPLY_LOW = "SUPPLY_LOW", _R.FINISH_STEP, _S.WARNING, "the supply voltage is low"
+    # Faults that drives report. A drive then holds its position without a command of the HAL.
     SYNC_LOST = "SYNC_LOST", _R.HOLD, _S.ERROR, "a node receives no SYNC"
     CMD_SOME_LOST = "CMD_SOME_LOST", _R.INFO, _S.INFO, "a drive missed 1 to 4 commands"
     CMD_TIMEOUT = "CMD_TIMEOUT", _R.HOLD, _S.ERROR, "a drive receives no commands"
@@ -90,13 +90,13 @@ class Dtc(StrEnum):
     ENC_STUCK = "ENC_STUCK", _R.LOWER, _S.ERROR, "the reading of an encoder is constant while its joint must move"
     ENC_JUMP = "ENC_JUMP", _R.HOLD, _S.ERROR, "an encoder reading changed by more than its joint can move"
     ENC_DRIFT = "ENC_DRIFT", _R.FULL_ASSIST, _S.WARNING, "an encoder reading contradicts the IMUs of its leg"
-    ENC_VELOCITY = "ENC_VELOCITY", _R.HOLD, _S.ERROR, "a drive's velocity contradicts its encoder position"
+    ENC_VELOCITY = "ENC_VELOCITY", _R.HOLD, _S.ERROR, "the velocity of a drive contradicts its encoder position"
     POSITION_RANGE = "POSITION_RANGE", _R.HOLD, _S.ERROR, "a joint is outside its position range"
     IMU_INVALID = "IMU_INVALID", _R.FULL_ASSIST, _S.WARNING, "an IMU reports that it has no valid value"
     IMU_SATURATED = "IMU_SATURATED", _R.FULL_ASSIST, _S.WARNING, "an IMU reading is at the end of its measuring range"
     IMU_STUCK = "IMU_STUCK", _R.FULL_ASSIST, _S.WARNING, "the gyro reading of an IMU does not change"
     FOOT_CELL = "FOOT_CELL", _R.FULL_ASSIST, _S.WARNING, "a force cell contradicts the other cells of its foot"
-    CONTACT_IMPLAUSIBLE = "CONTACT_IMPLAUSIBLE", _R.HOLD, _S.ERROR, "both feet report swing on the ground"
+    CONTACT_IMPLAUSIBLE = "CONTACT_IMPLAUSIBLE", _R.HOLD, _S.ERROR, "both feet report no load on the ground"
     # Bus.
     BUS_FLOOD = "BUS_FLOOD", _R.HOLD, _S.ERROR, "more frames arrived than the HAL reads in a cycle"
     BUS_OFF = "BUS_OFF", _R.HOLD, _S.ERROR, "the CAN controller is bus-off"
@@ -109,8 +109,8 @@ class Dtc(StrEnum):
     TORQUE_SATURATED = "TORQUE_SATURATED", _R.FULL_ASSIST, _S.WARNING, "the limiter cuts the torque"
     GUIDE_OUTSIDE = "GUIDE_OUTSIDE", _R.INFO, _S.INFO, "a joint is outside the virtual guide"
     CYCLE_GAP = "CYCLE_GAP", _R.HOLD, _S.ERROR, "the time between two cycles is too long"
-    OVERRUN = "OVERRUN", _R.HOLD, _S.ERROR, "several late cycles in a row, or the loop falls behind the clock"
-    OPERATOR_STOP = "OPERATOR_STOP", _R.HOLD, _S.INFO, "STOP, dead-man released, or pendant timed out"
+    OVERRUN = "OVERRUN", _R.HOLD, _S.ERROR, "several consecutive cycles are late, or the loop falls behind the clock"
+    OPERATOR_STOP = "OPERATOR_STOP", _R.HOLD, _S.INFO, "STOP pressed, dead-man switch released, or pendant timed out"
     SWING_TIMEOUT = "SWING_TIMEOUT", _R.FINISH_STEP, _S.ERROR, "a joint of the swing leg timed out briefly"
     # Outside the loop.
     RECORD_STOPPED = "RECORD_STOPPED", _R.INFO, _S.WARNING, "the recording ended early"
@@ -133,7 +133,7 @@ class Finding:
 
 
 def number_of(bits: int) -> int:
-    """Return the number of the worst code in a bit set, to be sent in one CAN signal.
+    """Return the number of the worst code in a bit set. The number fits into one CAN signal.
 
     Args:
         bits: bit set of codes, see `Dtc.bit`.
@@ -146,7 +146,7 @@ def number_of(bits: int) -> int:
 
 
 def by_number(number: int) -> str | None:
-    """Return code and meaning as text for a number from `number_of`.
+    """Return code and meaning as text for the number of a code.
 
     Args:
         number: position of the code in `Dtc`, counted from 1.
@@ -173,8 +173,8 @@ _EMERGENCIES = {
     0x3120: Dtc.UNDER_VOLTAGE,  # mains too low
     0x3220: Dtc.UNDER_VOLTAGE,  # DC link too low
     0x8110: Dtc.CMD_SOME_LOST,  # CAN overrun: objects lost
-    0x8130: Dtc.SYNC_LOST,  # life guard: messages of the master timed out
-    0x8150: Dtc.HAL_DUPLICATE,  # transmit identifier collision: a second source of commands
+    0x8130: Dtc.SYNC_LOST,  # life guard: the messages of the HAL timed out
+    0x8150: Dtc.HAL_DUPLICATE,  # identifier collision: a second node sends commands
     0x8200: Dtc.CMD_E2E,  # protocol error
     0x8250: Dtc.CMD_TIMEOUT,  # RPDO timeout
     0x8700: Dtc.SYNC_LOST,  # SYNC controller
@@ -204,7 +204,7 @@ def emergency(error_code: int) -> Dtc | None:
 
 
 def event_code(dtc: Dtc, value: float) -> str:
-    """Return the code of a diagnostic in an event, with the error code instead of `xxx` for an emergency.
+    """Return the code of a diagnostic in an event. An emergency includes its error code, as in EMCY_8130.
 
     Args:
         dtc: diagnostic trouble code.

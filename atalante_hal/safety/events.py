@@ -1,4 +1,4 @@
-"""Events (diagnostics, state changes) packed as records of a separate ring buffer.
+"""Events, such as diagnostics and state changes, packed as records of a separate ring buffer.
 
 Events are rare and small. With their own ring they are not dropped when the telemetry stream is full.
 """
@@ -30,12 +30,12 @@ class Event:
     def __post_init__(self) -> None:
         if self.severity not in SEVERITIES:
             raise ValueError(
-                f"the severity of event {self.code} is {self.severity!r}; valid are {', '.join(SEVERITIES)}"
+                f"the severity of event {self.code} must be one of {', '.join(SEVERITIES)}, got {self.severity!r}"
             )
 
 
 def pack(event: Event, run: int) -> bytes:
-    """Return an event as bytes; texts that are too long are cut.
+    """Pack an event as bytes. Texts that are too long are cut.
 
     Args:
         event: event to pack.
@@ -53,7 +53,7 @@ def pack(event: Event, run: int) -> bytes:
 
 
 def unpack(packed: bytes) -> tuple[Event, int]:
-    """Return the event in packed bytes and its run number."""
+    """Unpack an event and the number of its run."""
     run, cycle, value, severity, code, node, text = _RECORD.unpack(packed)
     return Event(cycle, _text(code), _text(text), SEVERITIES[severity], _text(node), value), run
 

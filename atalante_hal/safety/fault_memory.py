@@ -1,4 +1,4 @@
-"""Fault memory: the active diagnostics, and one event for each new diagnostic.
+"""Fault memory, which contains the active diagnostics and logs an event for each new diagnostic.
 
 `monitors, transceiver, plausibility, loop -> fault memory -> state machine (confirmed codes), telemetry (events)`
 """
@@ -13,17 +13,16 @@ from itertools import islice
 from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction, Severity, event_code, worst
 from atalante_hal.safety.events import Event
 
-#: Shortest time between two events of the same diagnostic, pending and confirmed [cycles]. It keeps a poor connection from
-#: filling the log.
-QUIET_PENDING, QUIET_CONFIRMED = 1000, 20
-
-
-#: Number of newest events that are kept: about 2 MB of locked process memory.
+#: Shortest time between two events of the same pending diagnostic [cycles].
+QUIET_PENDING = 1000
+#: Shortest time between two events of the same confirmed diagnostic [cycles].
+QUIET_CONFIRMED = 20
+#: Number of events that the log keeps. They need about 2 MB of memory.
 EVENTS_KEPT = 4096
 
 
 class EventLog:
-    """Log of the newest events, with a count of all events.
+    """Log of the newest events, and number of all events.
 
     Events are numbered from 0 in the order they are appended. The number of an event never changes. Its index in the log
     changes when older events are dropped.
@@ -43,7 +42,7 @@ class EventLog:
         self.count += 1
 
     def since(self, number: int) -> list[Event]:
-        """Return the events from a given number on that are still in the log, oldest first.
+        """Return the logged events from a given event number on, oldest first.
 
         Args:
             number: number of the first event to return, such as an earlier `count`.
@@ -90,10 +89,10 @@ class FaultMemory:
         #: Logged events, in order of time.
         self.events = EventLog()
         self.active: dict[tuple[Dtc, str], Entry] = {}
-        #: Bit set of the active codes, pending and confirmed, as of the last `close_cycle`; see `diagnostics.dtcs_of`.
+        #: Bit set of the pending and confirmed codes, as of the last `close_cycle`, see `diagnostics.dtcs_of`.
         self.bits = 0
         self.confirmed: frozenset[Dtc] = frozenset()
-        self._noted: dict[tuple[Dtc, str, bool], int] = {}
+        self._logged_at: dict[tuple[Dtc, str, bool], int] = {}
 
     def raise_dtc(
         self, cycle: int, dtc: Dtc, node: str, *, value: float = 0.0, confirmed: bool = True, text: str = ""
@@ -116,7 +115,7 @@ class FaultMemory:
         entry.value, entry.cycle = value, cycle
         if not before or not entry.text:
             entry.text = text or f"{node}: {dtc.meaning}"
-            self._note(cycle, dtc, node, entry)
+            self._log(cycle, dtc, node, entry)
 
     def raise_finding(self, cycle: int, finding: Finding) -> None:
         """Mark the diagnostic of a finding as active in this cycle, see `raise_dtc`.
@@ -138,26 +137,26 @@ class FaultMemory:
         self.confirmed = frozenset(dtc for (dtc, _), entry in self.active.items() if entry.confirmed)
 
     def worst(self) -> frozenset[Dtc]:
-        """Return the confirmed codes with the most severe reaction; empty if that reaction is INFO."""
+        """Return the confirmed codes with the most severe reaction; empty if the reaction is INFO."""
         reaction = worst(self.confirmed)
         return frozenset(dtc for dtc in self.confirmed if dtc.reaction is reaction is not Reaction.INFO)
 
     def nodes_of(self, dtcs: frozenset[Dtc]) -> list[str]:
-        """Return the nodes for which one of these codes is confirmed."""
+        """Return the nodes for which one of the codes is confirmed."""
         return [node for (dtc, node), entry in self.active.items() if dtc in dtcs and entry.confirmed]
 
     def text_of(self, dtcs: frozenset[Dtc]) -> str:
-        """Return the text of the first active diagnostic among these codes; empty if none is active."""
+        """Return the text of the first active diagnostic with one of the codes; empty if none is active."""
         return next((entry.text for (dtc, _), entry in self.active.items() if dtc in dtcs), "")
 
-    def _note(self, cycle: int, dtc: Dtc, node: str, entry: Entry) -> None:
+    def _log(self, cycle: int, dtc: Dtc, node: str, entry: Entry) -> None:
         key = dtc, node, entry.confirmed
-        last = self._noted.get(key)
+        last = self._logged_at.get(key)
         if last is not None and cycle - last < (QUIET_CONFIRMED if entry.confirmed else QUIET_PENDING):
             return
-        self._noted[key] = cycle
-        severity = dtc.severity if entry.confirmed else min(dtc.severity, Severity.WARNING, key=_LOUDNESS.index)
+        self._logged_at[key] = cycle
+        severity = dtc.severity if entry.confirmed else min(dtc.severity, Severity.WARNING, key=_SEVERITY_ORDER.index)
         self.events.append(Event(cycle, event_code(dtc, entry.value), entry.text, severity.value, node, entry.value))
 
 
-_LOUDNESS = list(Severity)
+_SEVERITY_ORDER = list(Severity)

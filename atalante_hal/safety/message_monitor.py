@@ -1,4 +1,4 @@
-"""Message monitor: checks E2E result, age and trust of each cyclic message, and decides whether its data is valid.
+"""Message monitor, which decides from E2E result, age and trust of each cyclic message whether its data is valid.
 
     process image -> message monitor -> validity of each message; diagnostics -> fault memory -> state machine
 
@@ -32,14 +32,14 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 #: Check result of a rejected message -> diagnostic that becomes pending in the same cycle.
 PENDING = {
     Check.REPEATED: Dtc.E2E_REPEATED,
-    Check.CONFLICT: Dtc.E2E_REPEATED,  # if it is the only frame of its cycle; with another frame see `rivals_of`
+    Check.CONFLICT: Dtc.E2E_REPEATED,  # if no other frame arrived in the cycle, see `rivals_of`
     Check.WRONG_SEQUENCE: Dtc.E2E_SEQUENCE,
     Check.CRC: Dtc.E2E_CRC,
     Check.LENGTH: Dtc.FRAME_LENGTH,
     Check.RANGE: Dtc.SIGNAL_RANGE,
     Check.INVALID: Dtc.SIGNAL_RANGE,
 }
-#: Last check result of a message -> diagnostic that is confirmed when the data is too old.
+#: Last check result of a message -> diagnostic that is confirmed when the message times out.
 CONFIRMED = {
     **PENDING,
     Check.OK: Dtc.NODE_LATE,
@@ -48,17 +48,17 @@ CONFIRMED = {
     Check.REPEATED: Dtc.E2E_FROZEN,
     Check.CONFLICT: Dtc.E2E_FROZEN,
 }
-#: Check results that prove a second sender if the same cycle has another intact frame of the message.
+#: Check results that prove a second sender if another intact frame of the message arrived in the same cycle.
 _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
-#: Check results of rejected frames with correct format and CRC.
+#: Check results of rejected frames that have the correct format and CRC.
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)
 _FRESH = int(Check.SOME_LOST)
-#: Age of a swing leg joint's data at which the robot goes to HOLD, in multiples of the message timeout.
+#: Age of the data of a swing leg joint at which the robot goes to HOLD, in multiples of the message timeout.
 SWING_TIMEOUTS = 2
 
 
 class MessageMonitor:
-    """Monitor of the messages in the fast process image.
+    """Monitor of the cyclic messages in the 1 ms process image.
 
     The pendant message is monitored in the same way, but confirms no diagnostic here: its loss counts as a stop by the operator.
     """
@@ -76,19 +76,19 @@ class MessageMonitor:
         self._confirms = [kind != "pendant" for kind in kinds]
         self._needed = [row for row, kind in enumerate(kinds) if kind != "pendant"]
         self.qualification = [Qualification()] * len(messages)
-        #: Evidence of two senders for each row, 0 to `FULL`.
+        #: Evidence that each row has two senders, 0 to `FULL`.
         self._evidence = [0] * len(messages)
-        #: True for each row that has been trusted at least once. Other rows may belong to nodes that are not connected.
+        #: True for each row that was trusted before. The node of any other row may not be connected.
         self._known = [False] * len(messages)
-        #: True for each row with new, intact, trusted and plausible data in this cycle, shape (rows,).
+        #: True for each row with new, intact, trusted and plausible data, shape (rows,).
         self.valid: npt.NDArray[np.bool_] = np.zeros(len(messages), np.bool_)
         self.joints_valid = False
-        #: True if all rows are trusted and all buckets are empty, so that a perfect cycle would change nothing here.
+        #: True if all rows are trusted and all buckets are empty. A cycle with new data in all rows then changes nothing here.
         self.settled = False
 
     @property
     def nodes_well(self) -> bool:
-        """Return whether every message except that of the pendant is trusted, and so not too old."""
+        """Return whether every message is trusted, without regard to the pendant."""
         return all(self.qualification[row].trusted for row in self._needed)
 
     def trusts(self, row: int) -> bool:
@@ -96,11 +96,11 @@ class MessageMonitor:
         return self.qualification[row].trusted
 
     def hears(self, row: int) -> bool:
-        """Return whether the data of a row is younger than its timeout, trusted or not."""
+        """Return whether the data of a row is younger than the timeout of its message."""
         return bool(self._image.age[row] < self._timeouts[row])
 
     def judge(self, cycle: int, memory: FaultMemory, swing: int | None = None) -> None:
-        """Check all rows in one cycle; it may be skipped for a perfect cycle while `settled` is True.
+        """Check all rows in one cycle. A cycle with new data in all rows need not be checked while `settled` is True.
 
         Args:
             cycle: number of the current cycle.
@@ -110,10 +110,10 @@ class MessageMonitor:
         image = self._image
         checks, ages = image.check.tolist(), image.age.tolist()
         rivals = rivals_of(image.refused, checks) if image.refused else frozenset()
-        for row, why in image.refused:
-            if why is Check.CONFLICT and row in rivals:
-                continue  # `_judge_senders` raises it with its evidence
-            dtc = self._invalid[row] if why is Check.INVALID else PENDING[why]
+        for row, result in image.refused:
+            if result is Check.CONFLICT and row in rivals:
+                continue  # `_judge_senders` raises this diagnostic
+            dtc = self._invalid[row] if result is Check.INVALID else PENDING[result]
             value = ages[row] if ages[row] < NEVER else 0
             memory.raise_dtc(cycle, dtc, self._senders[row], value=value, confirmed=False)
         for row, check in enumerate(checks):
@@ -125,7 +125,7 @@ class MessageMonitor:
         self.settled = image.all_fresh and not any(self._evidence) and all(q is SETTLED for q in self.qualification)
 
     def _judge_senders(self, cycle: int, memory: FaultMemory, row: int, rival: bool) -> bool:
-        """Update the evidence of two senders of a row, raise a diagnostic for it, and return whether it is confirmed.
+        """Update the evidence that a row has two senders, and return whether two senders are confirmed.
 
         Args:
             cycle: number of the current cycle.
@@ -157,12 +157,12 @@ class MessageMonitor:
     ) -> None:
         sender, two_senders = self._senders[row], self._judge_senders(cycle, memory, row, rival)
         fresh, late = check <= Check.SOME_LOST, age >= self._timeouts[row]
-        # Impossible signal values do not reduce the trust, because the frame itself was transmitted correctly.
+        # Impossible signal values do not reduce the trust, because the frame was transmitted correctly.
         good = (fresh or check >= Check.RANGE) and not rival
         now = self.qualification[row] = qualify(self.qualification[row], good=good, timed_out=late or two_senders)
         self._known[row] |= now.trusted
         confirmed = late and self._known[row] and self._confirms[row]
-        if confirmed and check is not Check.IMPLAUSIBLE:  # `plausibility` raises that diagnostic
+        if confirmed and check is not Check.IMPLAUSIBLE:  # `plausibility` raises the diagnostic of this check result
             dtc = self._invalid[row] if check is Check.INVALID else CONFIRMED[check]
             text = f"{sender}: {dtc.meaning}; its data is {age} cycles old"
             in_swing = swing is not None and self._legs[row] == swing
@@ -177,23 +177,23 @@ class MessageMonitor:
             memory.raise_dtc(cycle, Dtc.E2E_LOSS_RATE, sender, value=now.bucket)
 
     def missing(self) -> set[str]:
-        """Return the required senders that timed out or are not trusted yet."""
+        """Return the required senders that are not trusted."""
         return {self._senders[row] for row in self._needed if not self.qualification[row].trusted}
 
 
 def rivals_of(refused: Sequence[tuple[int, Check]], checks: Sequence[int]) -> frozenset[int]:
     """Return the rows with evidence of a second sender in this cycle.
 
-    Such a row has at least two intact frames, one of which cannot come from the sender of the other.
+    The row has at least two intact frames in this cycle, and they cannot be from one sender.
 
     Args:
         refused: row and check result of each rejected frame.
         checks: `Check` of each row, shape (rows,).
     """
-    intact = Counter(row for row, why in refused if why in _INTACT)
+    intact = Counter(row for row, result in refused if result in _INTACT)
     for row in intact:
         intact[row] += checks[row] <= _FRESH or checks[row] == Check.IMPLAUSIBLE  # committed first
-    return frozenset(row for row, why in refused if why in _RIVAL and intact[row] > 1)
+    return frozenset(row for row, result in refused if result in _RIVAL and intact[row] > 1)
 
 
 def _leg(drive: str) -> int:

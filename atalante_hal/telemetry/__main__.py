@@ -1,6 +1,6 @@
-"""Telemetry process: `python -m atalante_hal.telemetry ORDER`, started only by `process.TelemetryProcess`.
+"""Telemetry process, started by `process.TelemetryProcess` as `python -m atalante_hal.telemetry ARGUMENTS`.
 
-ORDER is a JSON object with the configuration, the inherited descriptors of the rings, the number of telemetry processes that
+ARGUMENTS is a JSON object with the configuration, the inherited descriptors of the rings, the number of telemetry processes that
 this one replaces, and the endpoint of the last of them. The process prints one JSON line when everything is open or opening has
 failed, and another line with a summary at the end.
 """
@@ -30,13 +30,12 @@ if TYPE_CHECKING:
 _INSTALL = "install it with `pip install 'atalante-hal[telemetry]'`"
 
 
-#: Time limit for closing the Zenoh session [s]; SIGALRM ends the process after it. With a stopped subscriber Zenoh needs 10 s.
-#: The files are closed before.
+#: Time limit for closing the Zenoh session [s]. SIGALRM then ends the process. The files are closed before.
 _SESSION_END = 1.0
 
 
 class Outlets:
-    """Open sinks of a configuration: CAN log, recorder and publisher.
+    """Open sinks of the telemetry process: CAN log, recorder and publisher.
 
     The files are opened first, so that no socket is open if a file fails.
 
@@ -117,7 +116,7 @@ class Outlets:
                     self.notices.append(str(error))
 
     def summary(self) -> dict[str, int]:
-        """Return the numbers of published and recorded messages and logged frames, and whether the recording is complete."""
+        """Return the counts of messages and frames, and whether the recording is complete."""
         return {
             "published": self.publisher.messages if self.publisher is not None else 0,
             "recorded": self.recorder.messages if self.recorder is not None else 0,
@@ -153,22 +152,22 @@ def _open_publisher(config: TelemetryConfig, streams: list[tuple[str, str]], bef
 
 
 def _print_line(line: dict[str, Any]) -> None:
-    """Print one JSON line for the process that started this one, which may have ended."""
+    """Print one JSON line for the parent process. A parent process that has ended causes no error."""
     with contextlib.suppress(BrokenPipeError):
         os.write(sys.stdout.fileno(), json.dumps(line).encode() + b"\n")
 
 
 def _leave_realtime() -> None:
-    """Leave the real-time priority inherited from the loop, so that this process does not compete with it."""
+    """Leave the real-time scheduling that this process inherited from the control loop."""
     if os.sched_getscheduler(0) != os.SCHED_OTHER:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-def main(order: str) -> int:
-    """Run until the rings are closed or SIGTERM arrives.
+def main(text: str) -> int:
+    """Run the telemetry process until the rings are closed or SIGTERM arrives.
 
     Args:
-        order: JSON object, see above.
+        text: JSON object, see the module docstring.
 
     Returns:
         Exit code: 0, or 1 if a sink could not be opened.
@@ -178,7 +177,7 @@ def main(order: str) -> int:
     signal.signal(signal.SIGTERM, lambda number, _: stop.append(number))
     logging.basicConfig(level=logging.WARNING)
     _leave_realtime()
-    arguments = json.loads(order)
+    arguments = json.loads(text)
     config = TelemetryConfig.from_json(arguments["config"])
     fds: dict[str, int] = arguments["rings"]
     with contextlib.ExitStack() as stack:
@@ -209,7 +208,7 @@ def main(order: str) -> int:
             service.settle()
         losses = {"lost": records.lost, "frames_lost": frames.lost if frames is not None else 0}
         _print_line({**outlets.summary(), **losses, "notices": [*outlets.notices, *service.notices]})
-        signal.setitimer(signal.ITIMER_REAL, _SESSION_END)  # SIGALRM then ends the process, even inside Zenoh
+        signal.setitimer(signal.ITIMER_REAL, _SESSION_END)  # SIGALRM ends the process, even inside Zenoh
         if outlets.publisher is not None:
             outlets.publisher.close()
     return 0

@@ -1,4 +1,4 @@
-"""Access to the telemetry endpoint: TLS, certificates and users, and the telemetry file that configures them.
+"""Access control of the telemetry endpoint: TLS certificates and users, and the telemetry file with these settings.
 
 `telemetry file -> TelemetryConfig -> publisher`. Without these settings every client that reaches the endpoint may subscribe. On
 the default endpoint (loopback) these are the processes of this machine. A subscriber can only receive, see `publisher`.
@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-#: Keys of a telemetry file: texts, and paths relative to the file.
+#: Keys of a telemetry file: those with a text, and those with a path relative to the telemetry file.
 _TEXTS, _FILES = ("robot", "listen"), ("certificate", "private_key", "client_ca", "users")
 
 
-#: Protocols of an endpoint with a certificate, and of one without; the first of each is the default.
+#: Valid protocols of the endpoint with a certificate, and without a certificate. The first protocol is the default.
 _PROTECTED, _UNPROTECTED = ("tls", "quic"), ("tcp",)
-#: One endpoint: protocol, host, port. Zenoh's suffixes `?` and `#` are not allowed, because they override TLS settings.
+#: Valid endpoint: protocol, host, port. Zenoh's suffixes `?` and `#` are rejected, because they override TLS settings.
 _ENDPOINT = re.compile(r"(?P<protocol>[^/]+)/(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):(?P<port>[0-9]{1,5})", re.ASCII)
 _LARGEST_PORT = 65535
 
@@ -31,12 +31,12 @@ class AccessError(RuntimeError):
 
 @dataclass(frozen=True)
 class Access:
-    """Files that restrict access to the endpoint. Without any, every client that reaches it may subscribe."""
+    """Files that restrict the access to the endpoint. Without these files, every client may subscribe."""
 
-    certificate: Path | None = None  # PEM, certificate of the publisher: the endpoint uses TLS
-    private_key: Path | None = None  # PEM, key of that certificate; readable only by this user
-    client_ca: Path | None = None  # PEM, authority that must have signed the certificate of each subscriber
-    users: Path | None = None  # one line "name:password" for each user; readable only by this user
+    certificate: Path | None = None  # PEM certificate of the publisher; if it is given, the endpoint uses TLS
+    private_key: Path | None = None  # PEM private key of the publisher; only its owner may have access
+    client_ca: Path | None = None  # PEM certificate of the authority that signs the certificates of the subscribers
+    users: Path | None = None  # file with one line "name:password" per user; only its owner may have access
 
     def __post_init__(self) -> None:
         if (self.certificate is None) != (self.private_key is None):
@@ -58,7 +58,7 @@ class Access:
 
     @property
     def protocols(self) -> tuple[str, ...]:
-        """Return the allowed protocols of the endpoint (first part of a Zenoh locator); the first is the default."""
+        """Return the valid protocols of the endpoint. The first protocol is the default."""
         return _PROTECTED if self.certificate is not None else _UNPROTECTED
 
     def check_endpoint(self, listen: str) -> None:

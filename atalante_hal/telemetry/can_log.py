@@ -1,4 +1,4 @@
-"""CAN log: every frame the HAL sent and received, in the formats of python-can's Logger.
+"""CAN log with every frame that the HAL sent or received, in a file format of python-can.
 
 The suffix determines the format: `.log` (candump), `.asc`, `.blf`, `.log.gz` or `.asc.gz`. Each bus of the network is a channel:
 its name in `.log` (left_leg), its number in the order of the DBC, from 1, in the others. The same frames give identical files in
@@ -19,7 +19,7 @@ from atalante_hal.closing import Closing
 from atalante_hal.telemetry.sink import SinkError
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE, Frames
 
-#: Formats of python-can that keep CAN FD frames whole.
+#: File formats of python-can that store CAN FD frames completely.
 FORMATS = (".log", ".asc", ".blf", ".log.gz", ".asc.gz")
 #: Channel of frames whose identifier is not in the DBC.
 FOREIGN = "foreign"
@@ -128,6 +128,6 @@ class CanLog(Closing):
 
     def _failed(self, error: OSError) -> SinkError:
         self._open = False
-        with contextlib.suppress(OSError):  # the buffered rest cannot be written either
+        with contextlib.suppress(OSError):  # writing the buffered frames fails, too
             self._logger.stop()
         return SinkError("RECORD_STOPPED", f"the CAN log {self.path} stopped: {error.strerror}")

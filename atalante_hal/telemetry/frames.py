@@ -1,4 +1,4 @@
-"""CAN frames of the HAL as records of a separate ring, for a CAN log.
+"""Ring records with the CAN frames of the HAL, for a CAN log.
 
 The HAL passes its frame arrays to a `RingTap`. It copies them, one copy for each batch, into a record of up to 64 frames, and
 writes a full record to the ring every second or third cycle. The record does not contain the bus of a frame. The telemetry
@@ -17,7 +17,7 @@ from atalante_hal.telemetry.ring import RingWriter
 from atalante_hal.wire.frame import FRAME, FRAME_BYTES, Frames
 
 FRAMES_PER_RECORD = 64
-#: Record of the ring. The time of a frame is `base_ns` plus its stamp [ns]; `sent` is 1 for sent frames.
+#: Record of the ring. The time of a frame is `base_ns` plus its stamp [ns]. `sent` is 1 for a sent frame.
 FRAME_RECORD = np.dtype(
     [
         ("count", "<i8"),
@@ -53,7 +53,7 @@ class RingTap:
         self._used = 0
 
     def begin_run(self, base_ns: int) -> None:
-        """Set the time to which the stamps of all following frames are relative.
+        """Set the reference time of the stamps of all following frames.
 
         Args:
             base_ns: Time of stamp 0 [ns]: 0 on the wall clock, the start of the run in virtual time.

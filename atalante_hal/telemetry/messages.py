@@ -1,4 +1,4 @@
-"""Conversion of telemetry records to protobuf: one stream for each message type, with its own key.
+"""Encoder of telemetry records as protobuf messages, with one stream for each message type.
 
 ring -> record -> [streams] -> bytes -> publisher and recorder
 """
@@ -17,16 +17,16 @@ from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, MOTORS
 from atalante_hal.safety.events import SEVERITIES, Event
 from atalante_hal.telemetry.schema import message_class
 
-#: Assisted joints by stance: sagittal hip and knee of the swing leg. 0: left stance, 1: right stance.
+#: Assisted joints (sagittal hip and knee of the swing leg) in left stance and in right stance.
 ASSISTED = (("right_SH", "right_SK"), ("left_SH", "left_SK"))
-#: Field of the message `Guide` -> field of the controller.
+#: Field of the message `Guide` -> name of the controller's field.
 _GUIDE_FIELDS = {"error": "error", "bound": "q_bound", "h": "h", "lambda": "lambda", "desired_position": "q_des"}
 _GUIDE_OTHERS = ("filter_active", "step", "phase", "stance")
 
 
 @dataclass(slots=True)
 class Sample:
-    """Record of one cycle, with its time and run, from which messages are encoded."""
+    """Record of one cycle, with its time and its run."""
 
     values: list[float]  # values of the record, in the order of its layout
     cycle: int
@@ -37,7 +37,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Stream:
-    """Message type that is encoded from records: key, type name and encoder."""
+    """Key, message type and encoder of one stream."""
 
     key: str
     message: str
@@ -45,7 +45,7 @@ class Stream:
 
 
 class Encoder:
-    """Encoder of all messages for records of one layout.
+    """Encoder of all messages from records with a given layout.
 
     Args:
         layout: Layout of the records.
@@ -54,7 +54,7 @@ class Encoder:
 
     def __init__(self, layout: Layout, diagnostics: Sequence[str] = ()) -> None:
         self.cycle_at, self.time_at = layout["cycle"].start, layout["time"].start
-        #: Streams whose fields are in this layout.
+        #: Streams for which the layout has all fields.
         self.streams = _streams(layout, diagnostics)
         self.window = LoopWindow(layout)
 
@@ -105,7 +105,7 @@ def _streams(layout: Layout, diagnostics: Sequence[str]) -> tuple[Stream, ...]:
     guide = all(CONTROLLER + name in layout for name in (*_GUIDE_FIELDS.values(), *_GUIDE_OTHERS))
     used = {CONTROLLER + name for name in (*_GUIDE_FIELDS.values(), *_GUIDE_OTHERS)} if guide else set()
     others = [name for name in layout if name.startswith(CONTROLLER) and name not in used]
-    made = [
+    streams = [
         Stream("joint_states", "JointStates", _joint_states(layout)),
         Stream("imu", "ImuStates", _imu_states(layout)),
         Stream("foot_forces", "FootForces", _foot_forces(layout)),
@@ -113,10 +113,10 @@ def _streams(layout: Layout, diagnostics: Sequence[str]) -> tuple[Stream, ...]:
         Stream("system", "SystemState", _system_state(layout, diagnostics)),
     ]
     if guide:
-        made.append(Stream("guide", "Guide", _guide(layout)))
+        streams.append(Stream("guide", "Guide", _guide(layout)))
     if others:
-        made.append(Stream("controller", "Controller", _controller(layout, others)))
-    return tuple(made)
+        streams.append(Stream("controller", "Controller", _controller(layout, others)))
+    return tuple(streams)
 
 
 def _begin(message: Any, sample: Sample) -> None:
@@ -127,7 +127,7 @@ def _begin(message: Any, sample: Sample) -> None:
 
 def _joint_states(layout: Layout) -> Callable[[Sample], bytes]:
     message = message_class("JointStates")(name=JOINTS)
-    places = [
+    targets = [
         (getattr(message, field), layout[name])
         for field, name in (
             ("position", "position"),
@@ -137,14 +137,14 @@ def _joint_states(layout: Layout) -> Callable[[Sample], bytes]:
             ("temperature", "temperature"),
         )
     ]
-    states, state_place = message.drive_state, layout["drive_state"]
+    states, state_columns = message.drive_state, layout["drive_state"]
 
     def encode(sample: Sample) -> bytes:
         _begin(message, sample)
         values = sample.values
-        for field, place in places:
-            field[:] = values[place]
-        states[:] = map(int, values[state_place])
+        for field, columns in targets:
+            field[:] = values[columns]
+        states[:] = map(int, values[state_columns])
         return bytes(message.SerializeToString())
 
     return encode
@@ -158,10 +158,10 @@ def _imu_states(layout: Layout) -> Callable[[Sample], bytes]:
     def encode(sample: Sample) -> bytes:
         _begin(message, sample)
         w_x_y_z, rates, forces = sample.values[attitude], sample.values[gyro], sample.values[accel]
-        for place, (orientation, rate, force) in enumerate(sensors):
-            orientation.w, orientation.x, orientation.y, orientation.z = w_x_y_z[4 * place : 4 * place + 4]
-            rate.x, rate.y, rate.z = rates[3 * place : 3 * place + 3]
-            force.x, force.y, force.z = forces[3 * place : 3 * place + 3]
+        for index, (orientation, rate, force) in enumerate(sensors):
+            orientation.w, orientation.x, orientation.y, orientation.z = w_x_y_z[4 * index : 4 * index + 4]
+            rate.x, rate.y, rate.z = rates[3 * index : 3 * index + 3]
+            force.x, force.y, force.z = forces[3 * index : 3 * index + 3]
         return bytes(message.SerializeToString())
 
     return encode
@@ -173,11 +173,11 @@ def _foot_forces(layout: Layout) -> Callable[[Sample], bytes]:
     for foot in _named(message.foot, FEET):
         foot.cell.extend(CELLS)
         cells += [foot.force.add() for _ in CELLS]
-    place = layout["foot_force"]
+    columns = layout["foot_force"]
 
     def encode(sample: Sample) -> bytes:
         _begin(message, sample)
-        forces = iter(sample.values[place])
+        forces = iter(sample.values[columns])
         for cell in cells:
             cell.x, cell.y, cell.z = next(forces), next(forces), next(forces)
         return bytes(message.SerializeToString())
@@ -188,12 +188,12 @@ def _foot_forces(layout: Layout) -> Callable[[Sample], bytes]:
 def _haptics(layout: Layout) -> Callable[[Sample], bytes]:
     message = message_class("Haptics")(name=MOTORS)
     fields = ("vibration", "amplitude"), ("vibration_command", "commanded_amplitude")
-    places = [(getattr(message, field), layout[name]) for name, field in fields if name in layout]
+    targets = [(getattr(message, field), layout[name]) for name, field in fields if name in layout]
 
     def encode(sample: Sample) -> bytes:
         _begin(message, sample)
-        for field, place in places:
-            field[:] = sample.values[place]
+        for field, columns in targets:
+            field[:] = sample.values[columns]
         return bytes(message.SerializeToString())
 
     return encode
@@ -201,14 +201,14 @@ def _haptics(layout: Layout) -> Callable[[Sample], bytes]:
 
 def _guide(layout: Layout) -> Callable[[Sample], bytes]:
     message = message_class("Guide")()
-    places = [(getattr(message, field), layout[CONTROLLER + name]) for field, name in _GUIDE_FIELDS.items()]
+    targets = [(getattr(message, field), layout[CONTROLLER + name]) for field, name in _GUIDE_FIELDS.items()]
     active, step, phase, stance = (layout[CONTROLLER + name] for name in _GUIDE_OTHERS)
 
     def encode(sample: Sample) -> bytes:
         _begin(message, sample)
         values = sample.values
-        for field, place in places:
-            field[:] = values[place]
+        for field, columns in targets:
+            field[:] = values[columns]
         message.active[:] = [value > 0.5 for value in values[active]]
         message.phase = values[phase.start]
         message.step, message.stance = max(0, int(values[step.start])), int(values[stance.start])
@@ -221,12 +221,12 @@ def _guide(layout: Layout) -> Callable[[Sample], bytes]:
 def _controller(layout: Layout, fields: Sequence[str]) -> Callable[[Sample], bytes]:
     message = message_class("Controller")()
     names = [name.removeprefix(CONTROLLER) for name in fields]
-    places = [(field.value, layout[name]) for field, name in zip(_named(message.field, names), fields, strict=True)]
+    targets = [(field.value, layout[name]) for field, name in zip(_named(message.field, names), fields, strict=True)]
 
     def encode(sample: Sample) -> bytes:
         _begin(message, sample)
-        for field, place in places:
-            field[:] = sample.values[place]
+        for field, columns in targets:
+            field[:] = sample.values[columns]
         return bytes(message.SerializeToString())
 
     return encode
@@ -280,7 +280,7 @@ class LoopWindow:
             self._lateness_max = max(self._lateness_max, float(records[:, self._lateness].max()))
 
     def encode(self, sample: Sample, lost: int) -> bytes:
-        """Encode the message up to a sample and begin the next window.
+        """Encode the message for the cycles up to a sample, and begin the next window.
 
         Args:
             sample: Last sample of the window; its counters are copied to the message.

@@ -1,4 +1,4 @@
-"""Telemetry as used by the loop's process: a context manager that owns the rings and the telemetry subprocess.
+"""Control loop's side of the telemetry: a context manager that owns the rings and the telemetry subprocess.
 
 The subprocess is a new interpreter (`python -m atalante_hal.telemetry`, see `service`), not a fork. It has its own process group,
 so Ctrl-C in the terminal ends only the loop, which then closes the rings. The subprocess may be killed or stopped at any time.
@@ -34,17 +34,17 @@ from atalante_hal.telemetry.ring import RingWriter
 
 CYCLES_PER_SECOND = 1000
 CYCLE_NS = 1_000_000_000 // CYCLES_PER_SECOND
-#: Gap in log time between two runs in lock-step [ns], so that a plot shows where a run ends.
+#: Gap in log time between two runs in lock-step [ns]. It separates the runs in a plot.
 RUN_GAP_NS = 1_000_000_000
 
 
-#: Time without progress after which the subprocess counts as hung, while records wait in the ring [s].
+#: Time after which the subprocess counts as hung if it reads none of the records in the ring [s].
 HANGS_AFTER = 2.0
 #: Largest number of restarts in a session.
 RESTARTS = 3
-#: Time for the subprocess to end its Zenoh session after its summary [s].
+#: Time limit for the subprocess to end its Zenoh session, after it has printed its summary [s].
 _SESSION_END = 2.0
-#: Time for a replacement subprocess to become ready [s].
+#: Time limit for a restarted subprocess to become ready [s].
 _RESTART = 30.0
 
 
@@ -69,7 +69,7 @@ class TelemetryConfig:
     record_rate: int = 100  # Hz in robot time, recording rate of each stream; 1000: every cycle
     can_log: Path | None = None  # log of every CAN frame, format by suffix; None: no CAN log
     lock_step: bool = False  # True: virtual time, and the loop waits for recorder and CAN log
-    slots: int = 1024  # records, capacity of each ring, which gets about one record per cycle
+    slots: int = 1024  # capacity of each ring [records]; a cycle adds about one record
     patience: float = 5.0  # s, longest wait of the loop for the recorder in lock-step
     certificate: Path | None = None  # TLS certificate, see `access.Access`
     private_key: Path | None = None  # key of the certificate, see `access.Access`
@@ -118,23 +118,26 @@ class TelemetryConfig:
 
 @dataclass(frozen=True)
 class Recording:
-    """Result of the recording of a session."""
+    """Files of the recording of a session, and whether they are complete.
+
+    Below 1000 Hz, the cycles between two messages count as recorded together with the second message.
+    """
 
     files: tuple[str, ...]  # file names in order; each restart of the subprocess begins a new file
-    complete: bool  # True: one file with its index and without missing cycles
-    missing_cycles: int  # cycles in no file; at 100 Hz the cycles between two messages count with the second message
+    complete: bool  # True if there is one file, with an index and with all cycles
+    missing_cycles: int  # number of cycles that are in no file
 
 
 @dataclass(frozen=True)
 class TelemetrySummary:
     """Result of a telemetry session."""
 
-    complete: bool = False  # False: a subprocess ended without its summary, so the numbers are incomplete
+    complete: bool = False  # False if a subprocess ended without a summary; the numbers are then incomplete
     published: int = 0  # messages
     recorded: int = 0  # messages
     frames_logged: int = 0
     lost: int = 0  # cycles that telemetry lost
-    frames_lost: int = 0  # records of the CAN frame ring that were lost; the ring gets about one record per cycle
+    frames_lost: int = 0  # lost records of the CAN frame ring; a cycle adds about one record
     restarts: int = 0  # restarts of the subprocess after it ended or hung
     notices: tuple[str, ...] = field(default=())  # faults of the session, one sentence each
     recording: Recording | None = None  # None: no recording was requested
@@ -165,19 +168,19 @@ class TelemetryProcess(Closing):
         about: Mapping[str, object] | None = None,
     ) -> None:
         self.config, self.layout = config, layout
-        self.endpoint: str | None = None  # endpoint for subscribers after the start; a restart may change it
-        self.notices: tuple[str, ...] = ()  # faults of the start, one sentence each
+        self.endpoint: str | None = None  # endpoint for subscribers; a restart may change it
+        self.notices: tuple[str, ...] = ()  # faults during the start, one sentence each
         self._start_ns = 0 if config.lock_step else time.time_ns()
         self._runs = 0
         self._closed = False
         self._tap: RingTap | None = None
         self._child: subprocess.Popen[bytes] | None = None
         self._restarts = 0
-        self._mishaps: list[str] = []  # faults of subprocesses, one sentence each
+        self._faults: list[str] = []  # faults of subprocesses, one sentence each
         self._recordings: list[str] = []  # names of the files begun so far
-        self._last_endpoint: str | None = None  # last endpoint in use; None: nothing was published so far
+        self._last_endpoint: str | None = None  # last endpoint in use; None before the first one was opened
         self._restarting: threading.Thread | None = None
-        self._progress = (0, 0.0)  # number of records read, and time [s], at the last progress
+        self._progress = (0, 0.0)  # number of read records at the last progress, and its time [s]
         meta = {
             "layout": layout.to_json(),
             "diagnostics": list(diagnostics),
@@ -192,8 +195,7 @@ class TelemetryProcess(Closing):
             patience=config.patience,
             meta=meta,
         )
-        #: Function that copies the record of a cycle, shape (layout.size,), to the ring. It takes about 1 us; a memoryview that
-        #: the caller created once is faster than an array.
+        #: Function that copies the record of a cycle, shape (layout.size,), to the ring. A memoryview is faster than an array.
         self.write = self.records.write
         self.events = RingWriter(EVENT_BYTES, EVENT_SLOTS)
         self.frames: RingWriter | None = None
@@ -214,7 +216,7 @@ class TelemetryProcess(Closing):
         """
         try:
             self.notices = self._launch(self.config, timeout)
-        except BaseException:  # also after Ctrl-C during the wait
+        except BaseException:  # includes KeyboardInterrupt during the wait
             self.close(0.0)
             raise
 
@@ -234,9 +236,9 @@ class TelemetryProcess(Closing):
         rings = {"records": self.records, "events": self.events, "frames": self.frames}
         fds = {name: ring.fd for name, ring in rings.items() if ring is not None}
         before = {"restarts": self._restarts, "endpoint": self._last_endpoint}
-        order = json.dumps({"config": config.to_json(), "rings": fds, **before})
+        arguments = json.dumps({"config": config.to_json(), "rings": fds, **before})
         self._child = subprocess.Popen(
-            [sys.executable, "-P", "-m", "atalante_hal.telemetry", order],
+            [sys.executable, "-P", "-m", "atalante_hal.telemetry", arguments],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             pass_fds=tuple(fds.values()),
@@ -254,7 +256,7 @@ class TelemetryProcess(Closing):
         return tuple(report["notices"])
 
     def tend(self) -> None:
-        """Check the subprocess, and replace it in the background if it has ended or hangs. Call it a few times a second.
+        """Restart the subprocess in the background if it has ended or hangs. Call this a few times a second.
 
         The replacement continues to read where the other one stopped, and writes numbered files. It listens on the same endpoint.
         If that is taken, it uses another one or publishes nothing: `endpoint` then changes, or is None.
@@ -265,19 +267,19 @@ class TelemetryProcess(Closing):
         if not fault or self._restarts > RESTARTS:
             return
         self._restarts += 1
-        again = self._restarts <= RESTARTS
+        restart = self._restarts <= RESTARTS
         last = self.records.last()
         cycle = int(np.frombuffer(last)[self.layout["cycle"]][0]) if last else 0
-        text = f"telemetry {fault}; it is {'restarted' if again else f'not restarted after {RESTARTS} restarts'}"
-        self._mishaps.append(text)
+        text = f"telemetry {fault}; it is {'restarted' if restart else f'not restarted after {RESTARTS} restarts'}"
+        self._faults.append(text)
         self.event(cycle, "TELEMETRY_DOWN", text, "error", "TELEMETRY", self._restarts)
-        if again:
-            # In a thread, because ending a subprocess and starting another takes longer than a cycle.
+        if restart:
+            # In a thread, because a restart takes longer than a cycle.
             self._restarting = threading.Thread(target=self._restart, daemon=True)
             self._restarting.start()
 
     def _fault(self, now: float) -> str:
-        """Return the fault of the subprocess as a verb phrase; empty if there is none."""
+        """Return the fault of the subprocess, such as "has ended"; empty if there is no fault."""
         if not self.alive:
             return "has ended"
         taken = self.records.taken
@@ -295,13 +297,13 @@ class TelemetryProcess(Closing):
             can_log=_numbered(self.config.can_log, self._restarts),
         )
         try:
-            self._mishaps.extend(self._launch(config, _RESTART))
+            self._faults.extend(self._launch(config, _RESTART))
         except TelemetryError as error:
-            self._mishaps.append(str(error))
+            self._faults.append(str(error))
             self._end(self._child, 0.0)
 
     def tap(self, now: Callable[[], int] = time.time_ns, stamps: Callable[[], Stamps] | None = None) -> RingTap:
-        """Create the frame tap that the HAL uses for the CAN log; a new tap replaces the one before.
+        """Create the frame tap, which passes the HAL's frames to the CAN log. A new tap replaces the previous tap.
 
         Args:
             now: Function that returns the time of a sent frame [ns]; in lock-step the virtual time since the start of the run.
@@ -358,7 +360,7 @@ class TelemetryProcess(Closing):
 
     @property
     def alive(self) -> bool:
-        """Return whether the subprocess exists, running or stopped. It costs a system call: do not call it every cycle."""
+        """Return whether the subprocess exists, running or stopped. The system call is too slow for every cycle."""
         return self._child is not None and self._child.poll() is None
 
     @property
@@ -408,7 +410,7 @@ class TelemetryProcess(Closing):
         """
         facts = {"lost": self.records.lost, "notices": (), "finished": False, **(report or {})}
         finished = facts.pop("finished") and not self._restarts
-        notices = tuple(dict.fromkeys((*self._mishaps, *facts.pop("notices"))))
+        notices = tuple(dict.fromkeys((*self._faults, *facts.pop("notices"))))
         missing = self.records.written - self.records.kept
         recording = Recording(tuple(self._recordings), finished and not missing, missing)
         return TelemetrySummary(
@@ -455,7 +457,7 @@ class TelemetryProcess(Closing):
 
 
 def _numbered(path: Path | None, number: int) -> Path | None:
-    """Return the file of the subprocess with a given number: recording-1.mcap beside recording.mcap."""
+    """Return the file name for a restarted subprocess, such as recording-1.mcap for recording.mcap."""
     if path is None:
         return None
     stem, dot, suffixes = path.name.partition(".")

@@ -1,4 +1,4 @@
-"""Zenoh publisher: the only module of the telemetry with a network socket, and only for output.
+"""Zenoh publisher, the only telemetry module with a network socket. It sends data and accepts no commands.
 
 The session is a Zenoh peer without scouting and gossip. By default it listens on the loopback, and subscribers connect to it.
 Access control permits only the output of our own keys, and nothing in this process subscribes. Messages of a stream are dropped
@@ -25,18 +25,18 @@ from atalante_hal.telemetry.schema import encoding
 from atalante_hal.telemetry.sink import EVENTS, SinkError
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 7447
-#: Number of ports tried in turn if no endpoint is configured, so that several demos can run on one machine.
+#: Number of ports that are tried if no endpoint is configured. Several demos can then run on one machine.
 PORTS_TRIED = 16
 #: Number of events cached for late subscribers.
 EVENTS_KEPT = 256
-#: Access without restrictions: every client that reaches the endpoint may subscribe.
+#: Access without TLS and users: every client that reaches the endpoint may subscribe.
 OPEN = Access()
 
 _log = logging.getLogger(__name__)
 
 
 class Publisher(Closing):
-    """Zenoh session that publishes one key for each stream.
+    """Zenoh session with one publisher for each stream.
 
     Use it as a context manager, because an open session prevents the end of the process.
 
@@ -104,7 +104,7 @@ class Publisher(Closing):
         self.messages += 1
 
     def begin_run(self, number: int, about: Mapping[str, object]) -> None:
-        """Do nothing, because every `SystemState` message contains the run.
+        """Do nothing, because every `SystemState` message contains the number of the run.
 
         Args:
             number: Ignored.
@@ -112,7 +112,7 @@ class Publisher(Closing):
         """
 
     def close(self) -> None:
-        """End the session. With a stopped subscriber this takes 10 s and fails.
+        """End the session. This fails after 10 s if a subscriber's process is stopped.
 
         Raises:
             SinkError: If Zenoh could not end the session.
@@ -133,20 +133,22 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
     Returns:
         Configuration as JSON types, without the settings of `Access`.
     """
-    own = [f"atalante/{robot}/**", f"atalante/{robot}/**/@adv/**"]  # "**" does not match a chunk that begins with @
+    own = [
+        f"atalante/{robot}/**",
+        f"atalante/{robot}/**/@adv/**",
+    ]  # "**" does not match a part of a key that begins with @
     return {
         "mode": "peer",
         "listen": {"endpoints": [listen]},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
-            "shared_memory": {"enabled": False},  # a killed process would leave its segments in /dev/shm
+            "shared_memory": {"enabled": False},  # a killed process would leave its memory segments in /dev/shm
             "link": {
                 "tx": {
                     "queue": {
-                        # Number of batches. With the default of 2 and a subscriber, a put took ten times longer.
+                        # Number of batches. With the default of 2, a put took ten times longer for a connected subscriber.
                         "size": {"real_time": 16},
-                        # Messages that are never dropped (undeclarations, heartbeats) wait this long [us] for a stopped
-                        # subscriber, which is then disconnected; the default is 5 s.
+                        # Longest wait for a subscriber that reads nothing, before it is disconnected [us]. The default is 5 s.
                         "congestion_control": {"block": {"wait_before_close": 100_000}},
                     }
                 }
@@ -157,29 +159,29 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
             "default_permission": "deny",
             "rules": [
                 {
-                    "id": "telemetry leaves",
+                    "id": "publish telemetry",
                     "permission": "allow",
                     "flows": ["egress"],
                     "messages": ["put", "reply", "declare_queryable", "liveliness_token"],
                     "key_exprs": own,
                 },
                 {
-                    # Messages of a subscriber: its subscription, with any wildcard, and its query for cached events.
-                    "id": "subscribers ask",
+                    # Messages of a subscriber: its subscription with any wildcard, and its query for cached events.
+                    "id": "subscribe and query",
                     "permission": "allow",
                     "flows": ["ingress"],
                     "messages": ["declare_subscriber", "query", "liveliness_query", "declare_liveliness_subscriber"],
                     "key_exprs": ["**", "**/@adv/**"],
                 },
             ],
-            "subjects": [{"id": "everybody"}],
-            "policies": [{"rules": ["telemetry leaves", "subscribers ask"], "subjects": ["everybody"]}],
+            "subjects": [{"id": "all clients"}],
+            "policies": [{"rules": ["publish telemetry", "subscribe and query"], "subjects": ["all clients"]}],
         },
     }
 
 
 def _open(robot: str, listen: str | None, access: Access, before: str | None) -> tuple[zenoh.Session, str]:
-    """Open a session and return it with the endpoint on which it listens."""
+    """Open a session and return it with its endpoint."""
     if listen is not None:
         try:
             return zenoh.open(_parsed(robot, listen, access)), listen
@@ -204,12 +206,12 @@ def _open(robot: str, listen: str | None, access: Access, before: str | None) ->
 
 def _parsed(robot: str, listen: str, access: Access) -> zenoh.Config:
     config = configuration(robot, listen)
-    asked = access.transport()
-    config["transport"] |= asked | {"link": {**config["transport"]["link"], **asked["link"]}}
+    restrictions = access.transport()
+    config["transport"] |= restrictions | {"link": {**config["transport"]["link"], **restrictions["link"]}}
     return zenoh.Config.from_json5(json.dumps(config))
 
 
 def _reason(error: zenoh.ZError) -> str:
-    """Return the error of the operating system without Zenoh's source positions."""
+    """Return the text of a Zenoh error without the positions in Zenoh's source code."""
     text = str(error)
     return "the port is taken" if "os error 98" in text else text.split(" at /")[0]

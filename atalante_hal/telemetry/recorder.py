@@ -1,4 +1,4 @@
-"""MCAP recorder: the recording of a session, with its protobuf schema.
+"""Recorder of telemetry messages in an MCAP file, which also contains the protobuf schema.
 
 One file contains all runs of a session in order of log time. Each run has a metadata record `run/<number>` with its name and
 start time, and every `SystemState` message contains the number. The topics are the keys of the streams.
@@ -16,7 +16,7 @@ from atalante_hal.closing import Closing
 from atalante_hal.telemetry.schema import PACKAGE, descriptor_set
 from atalante_hal.telemetry.sink import EVENTS, SinkError
 
-#: Size of a chunk [bytes]: the data that a crash of the telemetry process can lose, about 2 s at 100 Hz.
+#: Size of an MCAP chunk [bytes]. A crash of the telemetry process loses at most one chunk, about 2 s at 100 Hz.
 _CHUNK_BYTES = 1 << 18
 
 
@@ -35,8 +35,8 @@ class Recorder(Closing):
     def __init__(self, path: Path, streams: Iterable[tuple[str, str]], about: Mapping[str, object]) -> None:
         self.path = path
         self.messages = 0
-        self.saved = 0  # number of messages that stay in the file even if this process is killed
-        self.finished = False  # True: closed with its index, so every message is in the file
+        self.saved = 0  # number of messages that remain in the file if this process is killed
+        self.finished = False  # True if the file was closed with its index, so that it has every message
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("wb")
@@ -72,7 +72,7 @@ class Recorder(Closing):
         try:
             self._writer.add_message(self._channels[key], timestamp, payload, timestamp, cycle & 0xFFFFFFFF)
             self.messages += 1
-            if self._file.tell() != self._length:  # the file grew, so the chunk with this message was written
+            if self._file.tell() != self._length:  # a longer file: the chunk with this message was written
                 self._file.flush()
                 self._length, self.saved = self._file.tell(), self.messages
         except OSError as error:
@@ -95,7 +95,7 @@ class Recorder(Closing):
             raise self._failed(error) from error
 
     def close(self) -> None:
-        """Write index and statistics, and close the file.
+        """Write the index and the statistics, and close the file.
 
         Raises:
             SinkError: If the disk is full. Readers then scan the file, because it has no index.
@@ -110,7 +110,7 @@ class Recorder(Closing):
         self.saved, self.finished = self.messages, True
 
     def _failed(self, error: OSError) -> SinkError:
-        with contextlib.suppress(OSError):  # the buffered rest cannot be written either
+        with contextlib.suppress(OSError):  # writing the buffered data fails, too
             self._file.close()
         return SinkError("RECORD_STOPPED", f"the recording {self.path} stopped: {error.strerror}")
 

@@ -1,4 +1,4 @@
-"""Shared-memory ring: the loop's process writes fixed-size records, the telemetry process reads them.
+"""Ring buffer in shared memory. The control loop writes records of fixed size, and the telemetry process reads them.
 
 A ring has one writer and one reader. `write` needs no lock and no system call: it copies the record and then stores the counter
 of written records. The slot after the newest record may be written at any time. So a reader copies a batch, reads the counter
@@ -33,25 +33,25 @@ from atalante_hal.memory import anonymous_file
 MAGIC = int.from_bytes(b"ATLRING\0", "little")
 VERSION = 1
 
-# The header as 64-bit words; writer and reader have a cache line of their own.
+# Indices of the 64-bit header words. Writer and reader have separate cache lines.
 _MAGIC, _VERSION, _RECORD_SIZE, _STRIDE, _SLOTS, _META_LENGTH, _NOTES_SIZE, _DATA = range(8)
 _WRITTEN, _CLOSED, _WRITER_PID, _NOTES_LENGTH, _LOSSLESS = range(8, 13)
 _READ, _LOST, _READER_PID, _KEPT = range(16, 20)
 _HEADER_BYTES = 256
 
-_WRITER_BYTE, _READER_BYTE = 0, 1  # offsets of the bytes that writer and reader lock until their process ends
-_LOCK_TRIES = 50  # several, because the other end locks the byte for some microseconds in `_held`
+_WRITER_BYTE, _READER_BYTE = 0, 1  # offsets of the bytes that writer and reader lock
+_LOCK_TRIES = 50  # retries, because `_held` of the other end locks the byte for some microseconds
 
-_WAIT = 0.0002  # s, one sleep of a lossless writer
+_WAIT = 0.0002  # s, polling period
 NOTES_BYTES = 1 << 16
 
 
 class RingError(RuntimeError):
-    """Error on creating, opening or writing a ring; the message names the cause."""
+    """Error of a ring that cannot be created, opened or written; the message names the cause."""
 
 
 class _Ring:
-    """Mapped memory of a ring, and the header fields that both ends read."""
+    """Memory of a ring, and the header fields that both ends read."""
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
@@ -66,7 +66,7 @@ class _Ring:
 
     @property
     def slots(self) -> int:
-        """Return the number of slots for records, one of which is reserved for writing."""
+        """Return the number of slots. One slot is reserved for writing."""
         return self._header[_SLOTS]
 
     @property
@@ -81,7 +81,7 @@ class _Ring:
 
     @property
     def kept(self) -> int:
-        """Return the number of records whose content the readers have saved to disk so far."""
+        """Return the number of records that readers have saved to disk so far."""
         return self._header[_KEPT]
 
     @property
@@ -96,7 +96,7 @@ class _Ring:
 
     @property
     def meta(self) -> dict[str, Any]:
-        """Return the writer's description of the records, as JSON types."""
+        """Return the description of the records, as JSON types."""
         length = self._header[_META_LENGTH]
         found: dict[str, Any] = json.loads(bytes(self._bytes[_HEADER_BYTES : _HEADER_BYTES + length]))
         return found
@@ -106,7 +106,7 @@ class _Ring:
         return _HEADER_BYTES + self._header[_META_LENGTH]
 
     def _lock(self, byte: int) -> bool:
-        """Lock one byte of the file for this process; return False if another process holds the lock."""
+        """Lock one byte of the file, and return False if another process holds the lock."""
         for _ in range(_LOCK_TRIES):
             try:
                 fcntl.lockf(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, byte)
@@ -145,13 +145,13 @@ class _Ring:
 
 
 class RingWriter(_Ring, Closing):
-    """Writing end of a ring, which creates the memory.
+    """Writing end of a ring. It creates the memory.
 
     Args:
         record_size: Size of a record [bytes].
-        slots: Number of slots, at least 2; one less can wait for the reader.
+        slots: Number of slots, at least 2. `slots` - 1 records can wait for the reader.
         lossless: True: wait for the reader when the ring is full.
-        patience: Longest such wait [s]. After it the ring is no longer lossless.
+        patience: Longest wait for the reader [s]. After it the ring is no longer lossless.
         meta: Description of the records for the reader, as JSON types.
 
     Raises:
@@ -168,7 +168,7 @@ class RingWriter(_Ring, Closing):
         meta: Mapping[str, Any] | None = None,
     ) -> None:
         if record_size < 1 or slots < 2:
-            raise RingError(f"a ring must have 2 slots and 1 byte a record or more, got {slots} and {record_size}")
+            raise RingError(f"a ring must have 2 slots or more of 1 byte or more, got {slots} of {record_size} bytes")
         packed = json.dumps(dict(meta or {})).encode()
         stride = -(-record_size // 8) * 8
         data = -(-(_HEADER_BYTES + len(packed) + NOTES_BYTES) // mmap.PAGESIZE) * mmap.PAGESIZE
@@ -207,7 +207,7 @@ class RingWriter(_Ring, Closing):
         self._offset = offset if offset < self._end else self._begin
 
     def _wait_for_reader(self) -> None:
-        """Wait until there is room for one record; after the patience, let the ring overwrite records from now on."""
+        """Wait until there is room for one record. After the longest wait, the ring overwrites its oldest records."""
         header, oldest = self._header, self._count - self._slots + 1
         give_up = time.monotonic() + self._patience
         while header[_READ] <= oldest:
@@ -219,14 +219,14 @@ class RingWriter(_Ring, Closing):
         self._limit = header[_READ] + self._slots - 1
 
     def last(self) -> bytes:
-        """Return the bytes of the record written last; empty if there is none."""
+        """Return the bytes of the newest record; empty before the first record."""
         if not self._count:
             return b""
         offset = self._begin + (self._count - 1) % self._slots * self._stride
         return bytes(self._map[offset : offset + self._size])
 
     def note(self, note: Mapping[str, Any]) -> None:
-        """Append a note, which the reader receives with the next record. Notes are for rare facts, not for every cycle.
+        """Append a note, which the reader receives with the next record. Use notes only for rare data.
 
         Args:
             note: JSON types.
@@ -254,11 +254,11 @@ class RingWriter(_Ring, Closing):
         return pid != 0 and self._held(_READER_BYTE, pid)
 
     def finish(self) -> None:
-        """Mark the ring as closed for the reader: no more records follow."""
+        """Mark the ring as closed, so that the reader expects no more records."""
         self._header[_CLOSED] = 1
 
     def close(self) -> None:
-        """Finish and release the memory. The kernel frees it when the reader has also closed."""
+        """Mark the ring as closed and release the memory. The kernel frees it after the reader has closed, too."""
         if not self._map.closed:
             self.finish()
             self._release()
@@ -284,7 +284,7 @@ class RingReader(_Ring, Closing):
             raise RingError(f"file descriptor {fd} is not a telemetry ring of version {VERSION}")
         if not self._lock(_READER_BYTE):
             self._release()
-            raise RingError("another process reads this telemetry ring; a ring has one reader")
+            raise RingError("a telemetry ring must have only one reader, but another process reads this ring")
         header[_READER_PID] = os.getpid()
         data, stride, slots = header[_DATA], header[_STRIDE], header[_SLOTS]
         self._records = np.frombuffer(self._map, np.uint8, stride * slots, data).reshape(slots, stride)
@@ -320,11 +320,11 @@ class RingReader(_Ring, Closing):
 
     @property
     def position(self) -> int:
-        """Return the number of the record with which the next `read` begins if none is lost."""
+        """Return the number of the next record to read."""
         return self._next
 
     def notes(self) -> list[dict[str, Any]]:
-        """Return the notes written since the last call; "from" is the number of the record that follows a note.
+        """Return the notes written since the last call. "from" is the number of the record that follows the note.
 
         Call it after `read` to get every note that belongs to the records read.
         """

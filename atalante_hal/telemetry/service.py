@@ -1,4 +1,4 @@
-"""Service of the telemetry process: read the rings, and pass the records to publisher, recorder and CAN log.
+"""Main loop of the telemetry process: reads the rings and passes the records to publisher, recorder and CAN log.
 
     rings -> records -> messages -> Zenoh, MCAP
           -> frames ---------------> python-can log
@@ -23,19 +23,19 @@ from atalante_hal.telemetry.process import CYCLE_NS
 from atalante_hal.telemetry.ring import RingReader
 from atalante_hal.telemetry.sink import EVENTS, MessageSink, SinkError
 
-if TYPE_CHECKING:  # these need protobuf and python-can, which a session may do without
+if TYPE_CHECKING:  # only for type checks: protobuf and python-can may not be installed
     from atalante_hal.telemetry.can_log import CanLog
     from atalante_hal.telemetry.messages import Encoder
     from atalante_hal.telemetry.recorder import Recorder
 
 _POLL = 0.005  # s, polling period of empty rings
-_WRITER_CHECK = 0.2  # s, shortest time between two checks that the writer's process exists
+_WRITER_CHECK = 0.2  # s, shortest time between two checks whether the writer's process exists
 _DROPPED_EVERY = 1.0  # s, shortest time between two reports of lost cycles
 
 
 @dataclass(frozen=True)
 class Run:
-    """Run of a session, as its note in the ring describes it."""
+    """Run of a session, as described by its note in the ring."""
 
     number: int
     name: str
@@ -44,7 +44,7 @@ class Run:
 
 
 class Service:
-    """Loop that reads the rings and writes to the sinks.
+    """Main loop that reads the rings and writes to the sinks.
 
     Args:
         records: Reader of the ring of cycle records.
@@ -72,11 +72,11 @@ class Service:
         self._records, self._events, self._frames = records, events, frames
         self._encoder, self._sinks, self._loop_every, self._can_log = encoder, list(sinks), loop_every, can_log
         self._runs = [Run(0, "", records.meta["start_ns"], 0)]
-        self._cycle, self._timestamp = 0, self._runs[0].start_ns  # of the last record
+        self._cycle, self._timestamp = 0, self._runs[0].start_ns  # cycle and log time of the last record
         self._lost, self._lost_reported = 0, -math.inf
-        self._recorder, self._saved = recorder, 0  # saved messages of the recorder at the last check
-        self._handled = 0  # number of records whose messages were all passed to the sinks
-        self._kept = 0  # number of records counted as saved in the ring
+        self._recorder, self._saved = recorder, 0  # recorder, and its number of saved messages at the last check
+        self._handled = 0  # number of records whose messages have been passed to all sinks
+        self._kept = 0  # number of records that are marked as saved in the ring
         self.notices: list[str] = []  # faults, one sentence each
 
     def run(self, stop: Sequence[object]) -> None:
@@ -99,13 +99,13 @@ class Service:
         self.step()
 
     def settle(self) -> None:
-        """Count every record as saved if the recording is complete. Call it after the recorder was closed."""
+        """Mark every record as saved if the recording is complete. Call this after the recorder was closed."""
         if self._recorder is not None and self._recorder.finished:
-            self._keep()
+            self._mark_saved()
 
     def step(self) -> bool:
-        """Handle the contents of the rings and return whether there were any."""
-        # Read events first: the note of a run is written before the events in it, so it is certainly there when read after them.
+        """Process the contents of the rings and return whether there were any."""
+        # Read the events before the notes: the note of a run is written before the events of the run.
         events = [unpack(bytes(event)) for event in self._events.read()]
         records = self._records.read()
         first = self._records.position - len(records)
@@ -137,7 +137,7 @@ class Service:
         return next((run for run in reversed(self._runs) if run.first <= record), self._runs[0])
 
     def _handle_records(self, encoder: Encoder, records: npt.NDArray[np.float64], first: int) -> None:
-        """Encode the due records and pass them to the sinks.
+        """Encode the records that are due at the rate of a sink, and pass the messages to the sinks.
 
         Args:
             encoder: Encoder for the layout of the records.
@@ -189,10 +189,10 @@ class Service:
                 self._remove(sink, error)
         if self._recorder is not None and self._recorder.saved != self._saved:
             self._saved = self._recorder.saved
-            self._keep()
+            self._mark_saved()
 
-    def _keep(self) -> None:
-        """Count the records handled so far as saved in the ring."""
+    def _mark_saved(self) -> None:
+        """Mark the records that were processed so far as saved in the ring."""
         self._records.keep(self._handled - self._kept)
         self._kept = self._handled
 
@@ -203,7 +203,7 @@ class Service:
             self.report(error.code, str(error), "error")
 
     def report(self, code: str, text: str, severity: str, value: float = 0.0) -> None:
-        """Publish and record an event of the telemetry process, and add its text to the notices.
+        """Publish and record an event of the telemetry process itself, and add its text to the notices.
 
         Args:
             code: Code of the event.

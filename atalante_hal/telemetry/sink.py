@@ -1,11 +1,11 @@
-"""Protocol of the message sinks (publisher and recorder), and the error with which a sink fails."""
+"""Interface of the message sinks (publisher and recorder), and their exception."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Protocol
 
-#: Key of the messages that report events. All other keys are names of streams.
+#: Key of event messages. All other keys are names of streams.
 EVENTS = "events"
 
 
@@ -23,7 +23,7 @@ class SinkError(RuntimeError):
 
 
 class MessageSink(Protocol):
-    """Receiver of encoded messages with several keys."""
+    """Destination of encoded messages: the publisher or the recorder."""
 
     def put(self, key: str, payload: bytes, timestamp: int, cycle: int) -> None:
         """Store or publish one message.

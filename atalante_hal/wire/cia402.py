@@ -55,7 +55,7 @@ TRANSITIONS: dict[tuple[DriveState, Controlword], DriveState] = {
     (_S.FAULT, _C.FAULT_RESET): _S.SWITCH_ON_DISABLED,
 }
 
-#: Automatic transitions of CiA 402: 1 after the start of the drive, 14 after its fault reaction.
+#: Transitions without a controlword (CiA 402): 1 after the start of the drive, 14 after its fault reaction.
 AUTOMATIC: dict[DriveState, DriveState] = {
     _S.NOT_READY_TO_SWITCH_ON: _S.SWITCH_ON_DISABLED,
     _S.FAULT_REACTION_ACTIVE: _S.FAULT,
@@ -84,7 +84,7 @@ def next_state(state: DriveState, controlword: int, *, latched: bool = False) ->
         return state
 
 
-#: State -> controlword that brings the drive one transition closer to OPERATION ENABLED.
+#: State -> controlword for the next transition towards OPERATION ENABLED.
 TOWARDS_OPERATION: dict[int, Controlword] = {
     _S.SWITCH_ON_DISABLED: _C.SHUTDOWN,
     _S.READY_TO_SWITCH_ON: _C.SWITCH_ON,

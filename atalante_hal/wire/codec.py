@@ -1,4 +1,4 @@
-"""Array codec: decodes or encodes all signals of a list of messages in one pass of compiled code.
+"""Signal codec that decodes or encodes all signals of a list of messages in one pass of compiled code.
 
 The decoding plan (word, shift, mask, range, factor of each signal) is built once from the DBC. No signal crosses a 64-bit word of
 the payload. So a signal is decoded with one word, one shift, one mask, one addition and one multiplication.
@@ -19,40 +19,41 @@ from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, WORDS, Frames, new_frame
 
 Words = npt.NDArray[np.int64]
 
-#: Rows of the plan, with one column per signal: payload word, shift, mask, largest code, range of codes, invalid code.
+#: Rows of the decoding plan: word, shift, mask, largest code, low and high end of the range, invalid code.
 WORD, SHIFT, MASK, LARGEST, LOW, HIGH, INVALID = range(7)
-#: Rows of the scales, with one column per signal: value = (code + base) * factor + offset.
+#: Rows of the scales, as in the equation: value = (code + base) * factor + offset.
 BASE, FACTOR, OFFSET = range(3)
-#: Marker instead of an invalid code or a signal index: there is none.
+#: Marker for a signal without an invalid code, and result of `encode` if all signals were encoded.
 NO_CODE = -1
 #: Results of `read_row`: all signals in range, a signal out of range, a signal with its invalid code.
 INSIDE, OUTSIDE, SAYS_INVALID = range(3)
-#: Adding this number to a float64 and subtracting it again rounds the float to an integer.
+#: A float64 is rounded to an integer if this number is added and then subtracted.
 _ROUND = 1.5 * 2.0**52
-_LONGEST = 51  # largest signal length in bits that this rounding supports
+_LONGEST = 51  # largest signal length that `_ROUND` supports [bits]
 
 
 class SignalTable(NamedTuple):
-    """Coding of all signals of a codec, in the order of the decoded values, for the compiled functions of this module.
+    """Arrays with the coding of all signals of a codec, for the compiled functions of this module.
 
-    The codec owns the arrays. All are constant except `codes`, which every decoding and encoding overwrites.
+    The columns are in the order of the decoded values. The codec owns the arrays. Only `codes` changes: every decoding and
+    encoding overwrites it.
     """
 
-    plan: Words  # (7, size) position in the frames, mask and range of each signal; rows WORD to INVALID
-    scales: Vector  # (3, size) base, factor and offset of each signal; rows BASE to OFFSET
-    codes: Words  # (size,) raw code of each signal in the last decoding or encoding
-    words: Words  # (words with a signal,) indices of the 64-bit words that contain a signal
-    by_row: Words  # (size,) signal indices sorted by row: those of row r are by_row[row_begins[r] : row_begins[r + 1]]
-    row_begins: Words  # (rows + 1,) begin of each row in `by_row`
+    plan: Words  # (7, size) decoding plan, with the rows WORD to INVALID
+    scales: Vector  # (3, size) scales, with the rows BASE to OFFSET
+    codes: Words  # (size,) raw codes of the last decoding or encoding
+    words: Words  # (n,) indices of the 64-bit words that contain a signal
+    by_row: Words  # (size,) signal indices, sorted by row
+    row_begins: Words  # (rows + 1,) index in `by_row` at which each row begins
 
 
 def group_of(signal: str) -> str:
-    """Return the quantity in a signal name: TargetTorque for `FH_TargetTorque`, Quaternion for `QuaternionW`."""
+    """Return the quantity in a signal name, such as Quaternion for `QuaternionW`."""
     return signal.rsplit("_", 1)[-1].rstrip("WXYZ")
 
 
 class Codec:
-    """Compiled codec for a fixed list of messages; row i of the frames is messages[i].
+    """Compiled codec for a fixed list of messages. Row i of a frame array contains messages[i].
 
     The decoded values are ordered by sign (signed signals first), then by quantity, then by frame id, independent of the order of
     the rows. So the positions of the twelve joints are one contiguous slice in joint order.
@@ -65,10 +66,11 @@ class Codec:
         for _, message, signal in entries:
             if signal.length > _LONGEST or signal.start // 64 != (signal.start + signal.length - 1) // 64:
                 raise ValueError(
-                    f"{message.name}.{signal.name} is longer than {_LONGEST} bits or crosses a 64-bit word"
+                    f"{message.name}.{signal.name} must have at most {_LONGEST} bits in one 64-bit word of the payload, got "
+                    f"{signal.length} bits from bit {signal.start}"
                 )
         groups = dict.fromkeys((not s.signed, group_of(s.name)) for _, _, s in entries)
-        order = {key: place for place, key in enumerate(sorted(groups, key=lambda key: key[0]))}
+        order = {key: index for index, key in enumerate(sorted(groups, key=lambda key: key[0]))}
         entries.sort(key=lambda e: (order[not e[2].signed, group_of(e[2].name)], e[1].frame_id, e[2].start))
         #: (message, signal) pairs in the order of the decoded values.
         self.signals: tuple[tuple[Message, Signal], ...] = tuple((m, s) for _, m, s in entries)
@@ -86,13 +88,13 @@ class Codec:
             mask, largest = (1 << s.length) - 1, (1 << s.length - s.signed) - 1
             invalid = NO_CODE if s.invalid_raw is None else s.invalid_raw
             plan.append((row * WORDS + 1 + s.start // 64, s.start % 64, mask, largest, low, high, invalid))
-            # If the offset is a whole number of codes, it is added to the code, because integer addition is exact.
+            # An offset of a whole number of codes is added to the code, because integer addition is exact.
             code = s.offset / s.factor
             exact = code == round(code) and round(code) * s.factor == s.offset
             scales.append((code, s.factor, 0.0) if exact else (0.0, s.factor, s.offset))
         plan_array: Words = np.array(plan, np.int64).T.copy()
         by_row: Words = np.argsort(self.row_of, kind="stable").astype(np.int64)
-        #: Arrays that the compiled functions decode and encode with.
+        #: Arrays for the compiled functions.
         self.table = SignalTable(
             plan=plan_array,
             scales=np.array(scales).T.copy(),
@@ -116,10 +118,10 @@ class Codec:
         try:
             return self._index[message, signal]
         except KeyError:
-            raise KeyError(f"no signal {message}.{signal}; messages are {', '.join(self.rows)}") from None
+            raise KeyError(f"there is no signal {message}.{signal}; messages are {', '.join(self.rows)}") from None
 
     def slice(self, group: str) -> slice:
-        """Return the slice of a quantity in the decoded values, with all messages in the order of their frame ids.
+        """Return the slice of a quantity in the decoded values, in the order of the frame identifiers.
 
         Args:
             group: name of the quantity, see `group_of`.
@@ -127,13 +129,14 @@ class Codec:
         Raises:
             KeyError: If there is no such quantity, or if it is signed in one message and unsigned in another.
         """
-        places = [i for i, name in enumerate(self._groups) if name == group]
-        if not places or places[-1] - places[0] + 1 != len(places):
-            raise KeyError(f"no contiguous quantity {group!r}; there are {', '.join(dict.fromkeys(self._groups))}")
-        return slice(places[0], places[-1] + 1)
+        found = [i for i, name in enumerate(self._groups) if name == group]
+        if not found or found[-1] - found[0] + 1 != len(found):
+            valid = ", ".join(dict.fromkeys(self._groups))
+            raise KeyError(f"quantity must be contiguous and one of {valid}, got {group!r}")
+        return slice(found[0], found[-1] + 1)
 
     def template(self) -> Frames:
-        """Return new frames with identifier, length and flags of each message and an empty payload, shape (rows,)."""
+        """Create one frame per message, with identifier, length, flags and an empty payload, shape (rows,)."""
         frames = new_frames(len(self.messages))
         for row, message in enumerate(self.messages):
             frames[row]["can_id"], frames[row]["len"] = message.frame_id, message.length
@@ -153,15 +156,16 @@ class Codec:
         return self._decode(frames.view(np.int64), self.table, out)
 
     def rows_outside(self) -> list[int]:
-        """Return the rows that had a signal outside its range in the last `decode`."""
+        """Return the rows with a signal outside its range, as of the last `decode`."""
         codes, plan = self.table.codes, self.table.plan
         outside = (codes < plan[LOW]) | (codes > plan[HIGH])
         return sorted(set(self.row_of[outside].tolist()))
 
     def encode(self, values: Vector, frames: Frames) -> None:
-        """Encode physical values into the payloads; bits without a signal become 0 in each word that contains a signal.
+        """Encode physical values into the payloads.
 
-        A value outside its range is encoded as the nearest valid code, and NaN as the invalid code of its signal.
+        A value outside its range is encoded as the nearest valid code, and NaN as the invalid code of its signal. Bits without a
+        signal become 0 in each word that contains a signal.
 
         Args:
             values: physical values, shape (size,), in DBC units.
@@ -172,18 +176,20 @@ class Codec:
         """
         self.require_code(self._encode(values, self.table, frames.view(np.int64)))
 
-    def require_code(self, nameless: int) -> None:
-        """Raise an error if the function `encode` returned the index of a signal that it could not encode.
+    def require_code(self, result: int) -> None:
+        """Raise an error if the function `encode` could not encode a signal.
 
         Args:
-            nameless: result of the function `encode`: `NO_CODE`, or the index of a signal.
+            result: result of the function `encode`: `NO_CODE`, or the index of a signal.
 
         Raises:
-            ValueError: If it is the index of a signal.
+            ValueError: If `result` is the index of a signal.
         """
-        if nameless != NO_CODE:
-            message, signal = self.signals[nameless]
-            raise ValueError(f"{message.name}.{signal.name} is NaN and has no invalid code in the DBC")
+        if result != NO_CODE:
+            message, signal = self.signals[result]
+            raise ValueError(
+                f"{message.name}.{signal.name} must be a number, because the DBC has no invalid code for it, got NaN"
+            )
 
 
 def decode(words: Words, table: SignalTable, values: Vector) -> bool:
@@ -203,7 +209,7 @@ def decode(words: Words, table: SignalTable, values: Vector) -> bool:
 
 
 def read_codes(words: Words, table: SignalTable) -> bool:
-    """Read the raw codes of all signals. This is the first step of `decode`.
+    """Read the raw codes of all signals, as the first step of `decode`.
 
     Args:
         words: frames as a flat array of 64-bit words, shape (rows * 9,).
@@ -223,7 +229,7 @@ def read_codes(words: Words, table: SignalTable) -> bool:
 
 
 def signed(raw: int, mask: int, largest: int) -> int:
-    """Return the code of the raw bits of a signal, with the sign of two's complement.
+    """Convert the raw bits of a signal to its code. Negative codes are in two's complement.
 
     Args:
         raw: raw bits, right-aligned.
@@ -234,7 +240,7 @@ def signed(raw: int, mask: int, largest: int) -> int:
 
 
 def scale(table: SignalTable, values: Vector) -> None:
-    """Convert the raw codes of all signals to physical values. This is the second step of `decode`.
+    """Convert the raw codes of all signals to physical values, as the second step of `decode`.
 
     Args:
         table: signals of the codec, with their raw codes.
@@ -247,7 +253,7 @@ def scale(table: SignalTable, values: Vector) -> None:
 
 
 def read_row(words: Words, offset: int, row: int, table: SignalTable) -> int:
-    """Read the raw codes of one frame, as `read_codes` does for all frames.
+    """Read the raw codes of one frame.
 
     Args:
         words: frames as a flat array of 64-bit words.
@@ -272,7 +278,7 @@ def read_row(words: Words, offset: int, row: int, table: SignalTable) -> int:
 
 
 def scale_row(row: int, table: SignalTable, values: Vector) -> None:
-    """Convert the raw codes of one row to physical values, as `scale` does for all signals.
+    """Convert the raw codes of one row to physical values.
 
     Args:
         row: row of the message.
@@ -303,7 +309,7 @@ def encode(values: Vector, table: SignalTable, words: Words) -> int:
     base, factor, offset = scales[BASE], scales[FACTOR], scales[OFFSET]
     low, high, invalid = plan[LOW], plan[HIGH], plan[INVALID]
     for i in range(len(codes)):
-        # This rounds half to even and keeps infinities and NaN.
+        # Round half to even; infinities and NaN stay unchanged.
         code = ((values[i] - offset[i]) / factor[i] + (_ROUND - base[i])) - _ROUND
         if low[i] <= code <= high[i]:
             codes[i] = int(code)

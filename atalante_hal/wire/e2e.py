@@ -1,4 +1,4 @@
-"""AUTOSAR E2E Profile 5: protects each frame with an alive counter and a CRC over payload and Data ID.
+"""AUTOSAR E2E Profile 5, which protects each frame with an alive counter and a CRC over payload and Data ID.
 
 The CRC is CRC-16/CCITT-FALSE (polynomial 0x1021, initial value 0xFFFF) over the payload after the CRC field, followed by the Data
 ID, low byte first. It detects frames that are damaged, truncated, or sent with a wrong identifier. The counter detects lost,
@@ -22,8 +22,9 @@ Octets = npt.NDArray[np.uint8]
 Words = npt.NDArray[np.int64]
 
 CRC_START = 0xFFFF
-#: Length of the CRC field at the start of the payload, and offset of the alive counter in the payload [bytes].
+#: Length of the CRC field at the start of the payload [bytes].
 CRC_BYTES = 2
+#: Offset of the alive counter in the payload [bytes].
 COUNTER_BYTE = 2
 #: Largest counter step that is accepted as new data: up to four frames in a row may be lost.
 MAX_DELTA = 5
@@ -37,12 +38,12 @@ class Check(IntEnum):
     NO_DATA = 2  # no frame was received
     REPEATED = 3  # same counter and same bytes as the last accepted frame
     CONFLICT = 4  # same counter as the last accepted frame, but other bytes
-    WRONG_SEQUENCE = 5  # the counter jumped: a replayed frame, or more than 4 frames lost
-    CRC = 6  # damaged frame, or data of another message
+    WRONG_SEQUENCE = 5  # the counter jumped: the frame is old, or more than 4 frames are missing
+    CRC = 6  # wrong CRC: the frame is damaged or belongs to another message
     LENGTH = 7  # length or frame format differs from the DBC
     RANGE = 8  # a signal is outside its DBC range
     INVALID = 9  # a signal has its invalid code: the node has no value for it
-    IMPLAUSIBLE = 10  # the frame is correct, but its values are physically impossible
+    IMPLAUSIBLE = 10  # the frame is intact, but its values are physically impossible
 
     @property
     def fresh(self) -> bool:
@@ -51,7 +52,7 @@ class Check(IntEnum):
 
 
 def data_id_bytes(data_id: int) -> bytes:
-    """Return the Data ID as the two bytes that enter the CRC, low byte first."""
+    """Return the Data ID as two bytes, low byte first, as the CRC requires."""
     return data_id.to_bytes(2, "little")
 
 
@@ -65,12 +66,12 @@ def crc(protected: bytes | memoryview, data_id: bytes) -> int:
     return crc_hqx(data_id, crc_hqx(protected, CRC_START))
 
 
-#: CRC remainder of each byte value, for the table-driven CRC.
+#: Lookup table of the CRC: remainder for each byte value.
 _TABLE = np.array([crc_hqx(bytes([octet]), 0) for octet in range(256)], np.int64)
 
 
 def protected_spans(messages: Sequence[Message]) -> Words:
-    """Return begin and end of the payload of each row in bytes, and its Data ID.
+    """Return the begin and end of each row's payload [bytes], and its Data ID.
 
     Args:
         messages: message of each row of frames.
@@ -86,7 +87,7 @@ def protected_spans(messages: Sequence[Message]) -> Words:
 
 
 def checksum(octets: Octets, begin: int, end: int, data_id: int) -> int:
-    """Return the CRC of a payload, as `crc` does, in a form that can be compiled.
+    """Return the CRC of a payload. This variant of `crc` can be compiled.
 
     Args:
         octets: frames as a flat array of bytes.
@@ -136,7 +137,7 @@ def protect(octets: Octets, spans: Words, counters: Words) -> None:
         octets[begin], octets[begin + 1] = crc & 0xFF, crc >> 8
 
 
-#: Marker instead of an expected counter: no frame has been received yet.
+#: Value of an expected counter before the first frame was accepted.
 NOTHING = -1
 _OK, _SOME_LOST, _REPEATED, _WRONG_SEQUENCE = map(
     int, (Check.OK, Check.SOME_LOST, Check.REPEATED, Check.WRONG_SEQUENCE)
@@ -144,7 +145,7 @@ _OK, _SOME_LOST, _REPEATED, _WRONG_SEQUENCE = map(
 
 
 def judge_counter(expected: int, received: int) -> int:
-    """Check an alive counter, as `check_counter` does, in a form that can be compiled.
+    """Check an alive counter. This variant of `check_counter` can be compiled.
 
     Args:
         expected: last accepted counter plus 1, modulo 256, or `NOTHING`.
@@ -171,19 +172,20 @@ def check_counter(last: int | None, received: int) -> Check:
     return Check(judge_counter(NOTHING if last is None else last + 1 & 0xFF, received))
 
 
-#: Leaky bucket of a message: units that a bad cycle adds, units that a good cycle removes, and level at which the message loses
-#: its trust. A steady loss of more than a fifth of the frames fills the bucket.
-BAD_CYCLE, GOOD_CYCLE, FULL = 4, 1, 64
-#: Good cycles in a row after which a message is trusted, or trusted again. The delay prevents frequent changes. No input of a
-#: pendant counts before.
+#: Units that a bad cycle adds to the leaky bucket of a message.
+BAD_CYCLE = 4
+#: Units that a good cycle removes. The bucket fills up if more than a fifth of the frames are lost for a long time.
+GOOD_CYCLE = 1
+#: Level of the leaky bucket at which the message loses its trust.
+FULL = 64
+#: Number of consecutive good cycles after which a message is trusted. Inputs of a pendant are ignored before.
 REQUALIFY = 16
-#: Evidence that a cycle with a frame of a second sender adds; any other cycle removes `GOOD_CYCLE`. Two senders are confirmed at
-#: `FULL`, after four such cycles in a row. The takeover from one pendant to another has an overlap of two cycles.
+#: Evidence that a cycle with frames of two senders adds. Four such cycles reach `FULL`; a pendant takeover has only two.
 RIVAL_CYCLE = 16
 
 
 class Qualification(NamedTuple):
-    """Trust in the sender of one message, with its leaky bucket."""
+    """Qualification of the sender of one message, with its leaky bucket."""
 
     bucket: int = 0  # level of the leaky bucket, 0 to `FULL`
     good: int = 0  # good cycles in a row, counted up to `REQUALIFY`
@@ -214,10 +216,13 @@ def qualify(before: Qualification, *, good: bool, timed_out: bool = False) -> Qu
 
 
 def suspect(evidence: int, *, rival: bool) -> int:
-    """Update the evidence, 0 to `FULL`, that two nodes send the same message, by one cycle.
+    """Return the evidence that two nodes send the same message, after one more cycle.
 
     Args:
         evidence: evidence after the previous cycle, 0 to `FULL`.
-        rival: True if this cycle has a frame that the sender of the accepted frame cannot have sent.
+        rival: True if this cycle has a frame that cannot be from the sender of the accepted frame.
+
+    Returns:
+        Evidence, 0 to `FULL`, at which two senders are confirmed. A cycle without a rival removes `GOOD_CYCLE`.
     """
     return min(evidence + RIVAL_CYCLE, FULL) if rival else max(evidence - GOOD_CYCLE, 0)

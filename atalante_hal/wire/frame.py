@@ -21,7 +21,7 @@ HEADER_BYTES = FRAME_BYTES - FRAME["data"].itemsize
 WORDS = FRAME_BYTES // 8
 _WORD = np.dtype("<u8")
 
-FLAG_BRS = 0x01  # bit rate switch: the payload is sent at the data bit rate
+FLAG_BRS = 0x01  # bit rate switch: the payload has the data bit rate
 FLAG_ESI = 0x02  # error state indicator: the sender is error passive
 FLAG_FDF = 0x04  # CAN FD frame
 ID_EXTENDED = 1 << 31
@@ -40,9 +40,8 @@ def new_frames(count: int) -> Frames:
 
 
 def joined(parts: Sequence[Frames]) -> Frames:
-    """Return all frames of several arrays in one new array, shape (total number of frames,)."""
-    # The arrays are joined as bytes: numpy compares the fields of all arrays when it joins records, which takes forty times as
-    # long.
+    """Concatenate several arrays of frames, shape (total number of frames,)."""
+    # As bytes, because numpy needs 40 times longer to concatenate records.
     return np.frombuffer(bytearray().join([part.tobytes() for part in parts]), FRAME)
 
 
@@ -52,7 +51,7 @@ def as_words(frames: Frames) -> npt.NDArray[np.uint64]:
 
 
 def header_word(can_id: int, length: int, flags: int) -> int:
-    """Return the first 64-bit word of a record, which combines identifier, length and flags for a fast comparison.
+    """Return identifier, length and flags as the first 64-bit word of a frame record.
 
     Args:
         can_id: identifier with its flag bits, 32 bits.

@@ -1,4 +1,4 @@
-"""Encoder checks: compare each joint position with the previous one, the position limits and the reported velocity.
+"""Encoder checks, which compare each position with the previous position, its limits and the reported velocity.
 
 *Jump.* Between two good values, n cycles apart, a joint moves at most n * velocity_max * period, plus 3 sigma of the noise. A
 value that changed by more is not used. After `JUMPS_TO_CONFIRM` such values in a row the encoder counts as having lost its
@@ -25,15 +25,15 @@ from atalante_hal.safety.plausibility.finding import JOINT_NODES, Cycles, Signal
 from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import NEVER
 
-#: Number of jumps in a row, without a good value between them, after which the diagnostic is confirmed.
+#: Number of consecutive jumps after which the diagnostic is confirmed.
 JUMPS_TO_CONFIRM = 5
-#: Number of wrong velocity comparisons in a row after which the diagnostic is raised.
+#: Number of consecutive wrong velocities after which the diagnostic is raised.
 VELOCITY_SAMPLES = 3
 _ALL = b"\1" * len(JOINTS)
 
 
 class Lost(NamedTuple):
-    """Record of an encoder that jumped; positions on the motor side."""
+    """Record of an encoder that jumped. Positions are on the motor side."""
 
     last: float  # last received position [rad]
     cycles: int  # time from the last good position to `last` [cycles]
@@ -53,13 +53,13 @@ class EncoderChecks:
 
     def __init__(self, robot: Robot, now: Signals, before: Signals, period: float, every: int) -> None:
         self._now, self._before = now, before
-        self._way = robot.velocity_max * robot.gear * period
+        self._travel = robot.velocity_max * robot.gear * period
         self._noise = 3.0 * robot.encoder_noise * robot.gear
-        self._reach = self._way + self._noise
+        self._reach = self._travel + self._noise
         self.jumps = [0] * len(JOINTS)
         self._jump_of: dict[int, float] = {}  # size of the last jump of a joint [rad]
         self._lost: dict[int, Lost] = {}
-        #: Joint index -> position [rad], for each joint outside its range.
+        #: Joint index -> position [rad] of each joint outside its range.
         self.outside: dict[int, float] = {}
         self._range = np.array([robot.position_min, robot.position_max])
         tolerance = robot.thresholds.position_tolerance
@@ -69,8 +69,7 @@ class EncoderChecks:
         )
         self._polarity = robot.polarity.tolist()
         self._period, self._every = period, every
-        # `judge_velocity` computes 2 * (mean reported velocity - mean encoder velocity). `_of_later` and `_of_earlier` are the
-        # coefficients for position and velocity of the later and of the earlier sample.
+        # Coefficients of (position, velocity) in twice the velocity error, for the later and the earlier sample.
         time = every * period
         self._of_later, self._of_earlier = np.array([[-2.0 / time, 1.0], [2.0 / time, 1.0]])
         self._earlier = np.zeros((2, len(JOINTS)))  # position [rad] and velocity [rad/s] of the last sample
@@ -81,30 +80,32 @@ class EncoderChecks:
         self._wrong_findings: tuple[Finding, ...] = ()
         self._gear = robot.gear.tolist()
         self._within_reach = compiled(within_reach)
-        self.within_reach()  # compile the function here and not in the first cycle
+        self.within_reach()  # compile the function before the first cycle
 
     def within_reach(self) -> bool:
-        """Return whether each joint moved no further than possible in one cycle, and is in its range."""
+        """Return whether each joint is in its range and moved at most as far as possible in one cycle."""
         ranges = self._low, self._high
         return not self.outside and self._within_reach(self._now.position, self._before.position, self._reach, *ranges)
 
     def accept(self, joint: int, cycles: int) -> bool:
-        """Check the new position of one joint for a jump, and return whether it may be used.
+        """Check the new position of one joint for a jump, and return whether the position may be used.
 
         Args:
             joint: index of the joint in JOINTS.
             cycles: time from its last good position to the new one [cycles].
         """
         now, before = float(self._now.position[joint]), float(self._before.position[joint])
-        way, noise = float(self._way[joint]), float(self._noise[joint])
+        travel, noise = float(self._travel[joint]), float(self._noise[joint])
         confirmed = self.jumps[joint] >= JUMPS_TO_CONFIRM
         moved = abs(now - before)
-        good = not confirmed and not moved > cycles * way + noise  # NaN (no previous value) passes
+        good = not confirmed and not moved > cycles * travel + noise  # NaN, without a previous value, is accepted
         if not good:
-            lost = self._lost[joint] = followed(self._lost.get(joint, Lost(before, 0, before)), now, cycles, way, noise)
+            lost = self._lost[joint] = followed(
+                self._lost.get(joint, Lost(before, 0, before)), now, cycles, travel, noise
+            )
             if confirmed:
                 moved = abs(now - lost.expected)
-                good = moved <= JUMPS_TO_CONFIRM * way + noise
+                good = moved <= JUMPS_TO_CONFIRM * travel + noise
         if good:
             self.reference(joint)
             self._judge_range(joint, now)
@@ -114,7 +115,7 @@ class EncoderChecks:
         return False
 
     def reference(self, joint: int) -> None:
-        """Clear the jumps of a joint, so that its encoder is used again from the next value on.
+        """Clear the jumps of a joint. Its encoder is used again from the next value on.
 
         Args:
             joint: index of the joint in JOINTS.
@@ -152,7 +153,7 @@ class EncoderChecks:
         return bool(self._wrong_findings)
 
     def _error_between(self, age: Cycles) -> tuple[Vector, list[bool]]:
-        """Return the doubled velocity error of each joint, and whether each joint is compared.
+        """Return twice the velocity error of each joint, and whether each joint is compared.
 
         Args:
             age: age of the values of each joint [cycles], shape (12,).
@@ -169,7 +170,7 @@ class EncoderChecks:
         return np.where(compared, error, 0.0), compared.tolist()
 
     def _count_wrong(self, error: list[float], right: list[bool], compared: list[bool] | None) -> None:
-        """Count the wrong comparisons of each joint in a row, and update the findings.
+        """Count the consecutive wrong velocities of each joint, and update the findings.
 
         Args:
             error: twice the velocity error of each joint [rad/s, motor side].
@@ -198,7 +199,7 @@ class EncoderChecks:
 
     def _jump(self, joint: int) -> Finding:
         size, confirmed = self._jump_of[joint], self.jumps[joint] >= JUMPS_TO_CONFIRM
-        text = f"the encoder of {JOINTS[joint]} jumped by {np.degrees(size):.2f} degrees, which the joint cannot"
+        text = f"the encoder of {JOINTS[joint]} jumped by {np.degrees(size):.2f} degrees, more than the joint can move"
         if confirmed:
             text += "; it is not used until it jumps back or its drive restarts"
         return Finding(Dtc.ENC_JUMP, JOINT_NODES[joint], size, confirmed, text)
@@ -214,29 +215,29 @@ class EncoderChecks:
 
     def _wrong_velocity(self, joint: int, error: float) -> Finding:
         at_joint = error / self._gear[joint]
-        text = f"the velocity of {JOINTS[joint]} is {np.degrees(at_joint):+.0f} deg/s off what its encoder does"
+        text = f"the velocity of {JOINTS[joint]} differs from its encoder by {np.degrees(at_joint):+.0f} deg/s"
         return Finding(Dtc.ENC_VELOCITY, JOINT_NODES[joint], at_joint, True, text)
 
 
-def followed(lost: Lost, now: float, cycles: int, way: float, noise: float) -> Lost:
+def followed(lost: Lost, now: float, cycles: int, travel: float, noise: float) -> Lost:
     """Return the updated record of an encoder that jumped.
 
-    A change of the encoder position that is not a jump counts as motion of the joint, and is added to its expected position.
+    A change without a jump counts as motion of the joint and is added to its expected position.
 
     Args:
         lost: record before this position.
         now: received position [rad].
         cycles: time from the last good position to the received one [cycles].
-        way: largest motion of the joint in one cycle [rad].
+        travel: largest motion of the joint in one cycle [rad].
         noise: noise bound of the encoder [rad].
     """
     step = now - lost.last
-    jumped = abs(step) > (cycles - lost.cycles) * way + noise
+    jumped = abs(step) > (cycles - lost.cycles) * travel + noise
     return Lost(now, cycles, lost.expected if jumped else lost.expected + step)
 
 
 def within_reach(position: Vector, before: Vector, reach: Vector, low: Vector, high: Vector) -> bool:
-    """Return whether no joint moved by more than its reach, and all joints are within their limits.
+    """Return whether every joint is within its limits and moved by at most its reach.
 
     Args:
         position: new positions, shape (12,) [rad, motor side].

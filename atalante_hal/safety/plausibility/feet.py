@@ -1,4 +1,4 @@
-"""Foot checks: compare the force cells of a foot with each other, and the ground contact of both feet.
+"""Foot checks, which compare the force cells of a foot with each other, and the ground contact of both feet.
 
 *Cell.* A foot is a rigid plate on four cells. A cell is stuck or dead if it carries load while the other three are free, or if it
 is free while the other three carry load, for longer than the foot can rock. A cell without noise is detected sooner by
@@ -14,9 +14,11 @@ from atalante_hal.robot import CELLS, FEET, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import FOOT_NODES, Signals
 
-#: Times after which a cell counts as faulty, the swing of both feet as implausible, and the robot as lifted on purpose [cycles].
+#: Time after which a cell that contradicts the other cells counts as faulty [cycles].
 CELL_CYCLES = 256
+#: Time after which a swing of both feet counts as implausible [cycles].
 SWING_CYCLES = 20
+#: Time without ground contact after which the robot counts as lifted on purpose [cycles].
 LIFTED_CYCLES = 100
 
 
@@ -33,21 +35,21 @@ class FootChecks:
         self._force, self._forces = now.force, now.forces
         self._free, self._loaded = robot.sensors.cell_free, robot.sensors.cell_loaded
         self._every = every
-        # If the sum of the squares of all forces is at most this value, no cell carries load [N^2].
+        # No cell carries load if the sum of all squared force components is at most this value [N^2].
         self._surely_free = self._free**2
-        #: Index in FEET of the swing leg while the other leg stands; None if there is no swing leg.
+        #: Index of the swing leg in FEET; None unless exactly one foot is on the ground.
         self.swing: int | None = None
-        self._swinging = LIFTED_CYCLES  # time since a foot last stood on the ground [cycles]
-        self._contradicts = [[0] * len(CELLS) for _ in FEET]  # cycles in which a cell contradicted the others
-        #: (foot, cell) -> vertical force [N], for each cell that contradicts the others.
+        self._swinging = LIFTED_CYCLES  # time since a foot was last on the ground [cycles]
+        # Time for which each cell has contradicted the other cells of its foot [cycles].
+        self._contradicts = [[0] * len(CELLS) for _ in FEET]
+        #: (foot, cell) -> vertical force [N] of each cell that contradicts the other cells.
         self.cells: dict[tuple[int, int], float] = {}
 
-    def judge(self, heard: tuple[bool, bool]) -> bool:
+    def judge(self, updated: tuple[bool, bool]) -> bool:
         """Check the vertical forces of both feet.
 
         Args:
-            heard: whether the left and the right foot have new values since the last call. The cells of a foot without new values
-                are not checked again.
+            updated: whether the left and the right foot have new values since the last call. Only then their cells are checked.
 
         Returns:
             Whether a cell or the ground contact is implausible.
@@ -55,14 +57,14 @@ class FootChecks:
         lifted = self._swinging >= LIFTED_CYCLES
         if lifted and self._forces.dot(self._forces) <= self._surely_free and not any(map(any, self._contradicts)):
             return False
-        stands = []
+        on_ground = []
         for foot, cells in enumerate(self._force[:, :, 2].tolist()):
             carries = [abs(force) > self._free for force in cells]
-            stands.append(sum(carries) >= 2)
-            if heard[foot]:
+            on_ground.append(sum(carries) >= 2)
+            if updated[foot]:
                 self._judge_cells(foot, cells, carries)
-        self.swing = None if stands[0] == stands[1] else stands.index(False)
-        self._swinging = 0 if any(stands) else self._swinging + self._every
+        self.swing = None if on_ground[0] == on_ground[1] else on_ground.index(False)
+        self._swinging = 0 if any(on_ground) else self._swinging + self._every
         return bool(self.cells) or self._both_swing()
 
     def _both_swing(self) -> bool:
@@ -87,10 +89,10 @@ class FootChecks:
 
 
 def _contradicting(foot: int, cell: int, force: float) -> Finding:
-    text = f"force cell {CELLS[cell]} of the {FEET[foot]} foot says {force:.0f} N, which contradicts the other three"
+    text = f"force cell {CELLS[cell]} of the {FEET[foot]} foot reports {force:.0f} N, which contradicts the other three cells"
     return Finding(Dtc.FOOT_CELL, FOOT_NODES[foot], force, True, text)
 
 
 _BOTH_SWING = Finding(
-    Dtc.CONTACT_IMPLAUSIBLE, FOOT_NODES[0], float(SWING_CYCLES), True, "both feet say that they swing on the ground"
+    Dtc.CONTACT_IMPLAUSIBLE, FOOT_NODES[0], float(SWING_CYCLES), True, Dtc.CONTACT_IMPLAUSIBLE.meaning
 )

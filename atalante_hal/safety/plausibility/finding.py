@@ -1,4 +1,4 @@
-"""Location of the checked signals in the process image."""
+"""Views of the checked signals in the process image."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ JOINT_NODES, IMU_NODES, FOOT_NODES = (
 
 
 class Signals(NamedTuple):
-    """Views of the measured signals in a vector of decoded values; joint positions and velocities are on the motor side."""
+    """Views of the measured signals in the decoded values. Joint positions and velocities are on the motor side."""
 
     position: Vector  # (12,) rad
     velocity: Vector  # (12,) rad/s
@@ -35,12 +35,12 @@ class Signals(NamedTuple):
     gyro: Vector  # (4, 3) rad/s
     accel: Vector  # (4, 3) m/s2
     force: Vector  # (2, 4, 3) N
-    motion: Vector  # (2, 12) position and velocity in one view
+    motion: Vector  # (2, 12) `position` and `velocity` in one view
     forces: Vector  # (24,) all components of `force` in one view
 
 
 class Ages(NamedTuple):
-    """Ages of the sensor values [cycles]; values with an age of `NEVER` or more are too old for any comparison."""
+    """Ages of the sensor values [cycles]. An age of `NEVER` or more is too old for any check."""
 
     joint: Cycles  # (12,)
     imu: Cycles  # (4,)
@@ -73,7 +73,7 @@ class Rows:
 
 
 def measured(codec: Codec) -> slice:
-    """Return the slice of the measured signals in the decoded values; they are contiguous because signed signals come first.
+    """Return the slice of the measured signals in the decoded values.
 
     Args:
         codec: codec of the process image.

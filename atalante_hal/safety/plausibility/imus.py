@@ -1,4 +1,4 @@
-"""IMU checks: each quaternion must have unit norm, and no axis may be at the end of its measuring range.
+"""IMU checks, which detect quaternions without unit norm and readings at the end of the measuring range.
 
 The module `legs` compares the IMUs with the encoders.
 """
@@ -14,7 +14,7 @@ from atalante_hal.safety.plausibility.finding import IMU_NODES, Signals
 from atalante_hal.types import Vector
 from atalante_hal.wire.codec import Codec
 
-#: Time without a good value after which the diagnostic of an IMU is confirmed [cycles].
+#: Time without good values after which the diagnostic of an IMU is confirmed [cycles].
 IMU_CYCLES = 10
 
 
@@ -31,21 +31,21 @@ class Imus:
         self._now = now
         self._gyro_end, self._accel_end = (_end_of_range(codec, signal) for signal in ("GyroX", "AccelX"))
         self._norm_error = robot.sensors.quaternion_error
-        #: IMU index -> norm of the quaternion, for each IMU without unit norm.
+        #: IMU index -> norm of the quaternion of each IMU without unit norm.
         self.no_attitude: dict[int, float] = {}
-        #: IMU index -> largest reading [rad/s or m/s2], for each IMU at the end of its range.
+        #: IMU index -> largest reading [rad/s or m/s2] of each saturated IMU.
         self.saturated: dict[int, float] = {}
-        self._given_up: dict[int, bool] = {}
+        self._confirmed: dict[int, bool] = {}
         self._usable = compiled(usable)
-        self.usable()  # compile the function here and not in the first cycle
+        self.usable()  # compile the function before the first cycle
 
     def usable(self) -> bool:
-        """Return whether every quaternion has unit norm and no axis is at the end of its range."""
+        """Return whether every quaternion has unit norm and no IMU is saturated."""
         now = self._now
         return self._usable(now.quaternion, now.gyro, now.accel, self._norm_error, self._gyro_end, self._accel_end)
 
     def accept(self, imu: int, cycles: int, *, frozen: bool) -> bool:
-        """Check the new values of one IMU, and return whether they may be used.
+        """Check the new values of one IMU, and return whether the values may be used.
 
         Args:
             imu: index of the IMU in IMUS.
@@ -53,32 +53,32 @@ class Imus:
             frozen: True if the readings of the IMU do not change.
         """
         saturation, norm = self._saturation(imu), self._wrong_norm(imu)
-        for value, standing in ((saturation, self.saturated), (norm, self.no_attitude)):
+        for value, found in ((saturation, self.saturated), (norm, self.no_attitude)):
             if value is None:
-                standing.pop(imu, None)
+                found.pop(imu, None)
             else:
-                standing[imu] = value
+                found[imu] = value
         usable = not frozen and saturation is None and norm is None
-        self._given_up[imu] = not usable and cycles >= IMU_CYCLES
+        self._confirmed[imu] = not usable and cycles >= IMU_CYCLES
         return usable
 
     def _saturation(self, imu: int) -> float | None:
-        """Return the largest reading of an IMU at the end of its range [rad/s or m/s2], or None if no axis is there."""
+        """Return the largest reading of a saturated IMU [rad/s or m/s2]; None if no axis is saturated."""
         for readings, end in ((self._now.gyro, self._gyro_end), (self._now.accel, self._accel_end)):
             if (most := largest(readings[imu])) >= end:
                 return most
         return None
 
     def _wrong_norm(self, imu: int) -> float | None:
-        """Return the norm of the quaternion of an IMU, or None if the norm is 1 within the tolerance."""
+        """Return the norm of the quaternion of an IMU; None if the norm is 1 within the tolerance."""
         squared = squared_norm(self._now.quaternion[imu])
         return None if abs(squared - 1.0) <= self._norm_error else math.sqrt(squared)
 
     def findings(self) -> tuple[Finding, ...]:
         """Return the present findings."""
         return (
-            *(_no_attitude(imu, norm, self._given_up[imu]) for imu, norm in self.no_attitude.items()),
-            *(_saturated(imu, value, self._given_up[imu]) for imu, value in self.saturated.items()),
+            *(_no_attitude(imu, norm, self._confirmed[imu]) for imu, norm in self.no_attitude.items()),
+            *(_saturated(imu, value, self._confirmed[imu]) for imu, value in self.saturated.items()),
         )
 
 
@@ -115,16 +115,16 @@ def largest(readings: Vector) -> float:
 
 
 def _end_of_range(codec: Codec, name: str) -> float:
-    """Return the reading from which a signal is in the last step of its range; the range is the same for all IMUs."""
+    """Return the reading from which an IMU signal counts as saturated: half a step below its maximum."""
     signal = next(signal for _, signal in codec.signals if signal.name == name)
     return signal.maximum - 0.5 * signal.factor
 
 
-def _no_attitude(imu: int, norm: float, given_up: bool) -> Finding:
-    text = f"the quaternion of the {IMUS[imu]} IMU has the norm {norm:.3f}, not 1"
-    return Finding(Dtc.IMU_INVALID, IMU_NODES[imu], norm, given_up, text)
+def _no_attitude(imu: int, norm: float, confirmed: bool) -> Finding:
+    text = f"the quaternion of the {IMUS[imu]} IMU must have the norm 1, got {norm:.3f}"
+    return Finding(Dtc.IMU_INVALID, IMU_NODES[imu], norm, confirmed, text)
 
 
-def _saturated(imu: int, value: float, given_up: bool) -> Finding:
+def _saturated(imu: int, value: float, confirmed: bool) -> Finding:
     text = f"the {IMUS[imu]} IMU is at the end of its range, {value:.0f}"
-    return Finding(Dtc.IMU_SATURATED, IMU_NODES[imu], value, given_up, text)
+    return Finding(Dtc.IMU_SATURATED, IMU_NODES[imu], value, confirmed, text)

@@ -1,4 +1,4 @@
-"""Leg checks: compare the encoders of each leg with its IMUs, to detect encoders that drift or are stuck.
+"""Leg checks, which compare the encoders of a leg with its IMUs to detect drifting and stuck encoders.
 
 The joints FH, TH, SH and SK of a leg lie between the pelvis IMU and the tibia IMU. Their axes are x, z, y, y of parallel frames.
 So the attitude of the tibia relative to the pelvis is Rx(FH) Rz(TH) Ry(SH + SK). The two IMUs give these three angles, and the
@@ -34,25 +34,26 @@ from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Signals
 from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import NEVER
 
-#: Number of samples in a row after which a drift and a stuck encoder are reported.
-DRIFT_SAMPLES, STANDSTILL_SAMPLES = 4, 2
-#: Change of the difference between encoder and IMUs that is ignored while the encoder reading is constant [rad per sample]. It is
-#: more than ten times the heading drift of a healthy IMU.
-_FORGOTTEN = 2e-5
+#: Number of consecutive samples after which an encoder drift is reported.
+DRIFT_SAMPLES = 4
+#: Number of consecutive samples after which a stuck encoder is reported.
+STANDSTILL_SAMPLES = 2
+#: Largest change per sample of an encoder error that counts as IMU drift [rad]. Healthy IMUs drift less than a tenth of it.
+_IMU_DRIFT = 2e-5
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 _AXES = (("FH",), ("TH",), ("SH", "SK"))
-#: Axis of each of a leg's first four joints, as an index in `_AXES`.
+#: Axis of the first four joints of a leg, as indices in `_AXES`.
 _AXIS_OF = (0, 1, 2, 2)
 _HIPS = tuple(JOINTS.index(f"{side}_FH") for side in SIDES)
 
 
-class _Contradiction(NamedTuple):
-    """Comparison of the IMUs and encoders of a leg in one sample."""
+class _Comparison(NamedTuple):
+    """Comparison of the encoders and IMUs of a leg in one sample."""
 
     angles: tuple[float, float, float]  # angles FH, TH, SH + SK from the IMUs [rad]
     errors: tuple[float, float, float]  # encoder angles minus `angles` [rad]
-    doubt: float = 0.0  # uncertainty of the errors because the values are of different cycles [rad]
+    doubt: float = 0.0  # uncertainty of the errors if the values are from different cycles [rad]
 
 
 class Legs:
@@ -61,21 +62,21 @@ class Legs:
     Args:
         robot: sensor thresholds of the robot.
         now: signals decoded in this cycle.
-        standing: number of samples in a row in which the reading of each encoder was constant, shape (12,), from `Stillness`.
+        constant_samples: number of consecutive samples with a constant reading, for each encoder, shape (12,), from `Stillness`.
         period: cycle time [s].
     """
 
-    def __init__(self, robot: Robot, now: Signals, standing: npt.NDArray[np.int64], period: float) -> None:
+    def __init__(self, robot: Robot, now: Signals, constant_samples: npt.NDArray[np.int64], period: float) -> None:
         self._now, self._period = now, period
         self._velocity_error = robot.sensors.velocity_error
         self._to_joint: Vector = robot.polarity / robot.gear
         self._attitude_error = robot.sensors.attitude_error
         self._attitude_change, self._misalignment = robot.sensors.attitude_change, robot.sensors.misalignment
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
-        self._standing = [standing[hip : hip + len(_AXIS_OF)] for hip in _HIPS]
-        #: Comparison at the last sample in which the encoder reading of each joint changed.
-        self._moved: list[_Contradiction | None] = [None] * len(JOINTS)
-        #: Joint index -> number of samples in a row in which the leg turned while the encoder reading was constant.
+        self._constant_samples = [constant_samples[hip : hip + len(_AXIS_OF)] for hip in _HIPS]
+        #: Comparison of each joint's leg at the last change of the joint's encoder reading.
+        self._moved: list[_Comparison | None] = [None] * len(JOINTS)
+        #: Joint index -> number of consecutive samples in which the leg turned but the encoder reading was constant.
         self._turned: dict[int, int] = {}
         self._drifts: list[tuple[Finding, ...]] = [() for _ in SIDES]
         self._stuck: list[tuple[Finding, ...]] = [() for _ in SIDES]
@@ -105,19 +106,19 @@ class Legs:
         return self._judge(1, ages)
 
     def _judge(self, leg: int, ages: Ages | None) -> bool:
-        said = self._compare(leg, ages)
-        if said is not None:
-            self._judge_drift(leg, said)
-            self._judge_standstill(leg, said)
+        comparison = self._compare(leg, ages)
+        if comparison is not None:
+            self._judge_drift(leg, comparison)
+            self._judge_standstill(leg, comparison)
         other = 1 - leg
-        if self._stuck[other] or self._standing[other].any():
-            said = self._compare(other, ages)
-            if said is not None:
-                self._judge_standstill(other, said)
+        if self._stuck[other] or self._constant_samples[other].any():
+            comparison = self._compare(other, ages)
+            if comparison is not None:
+                self._judge_standstill(other, comparison)
         return any(self._drifts) or any(self._stuck)
 
-    def _compare(self, leg: int, ages: Ages | None) -> _Contradiction | None:
-        """Compare the IMUs and encoders of a leg in this cycle; return None if a value is too old."""
+    def _compare(self, leg: int, ages: Ages | None) -> _Comparison | None:
+        """Compare the encoders and IMUs of a leg in this cycle; return None if a value is too old."""
         now, four, doubt = self._now, slice(_HIPS[leg], _HIPS[leg] + len(_AXIS_OF)), 0.0
         angles = now.position[four] * self._to_joint[four]
         pelvis, tibia = now.quaternion[_PELVIS].tolist(), now.quaternion[_TIBIAE[leg]].tolist()
@@ -127,38 +128,38 @@ class Legs:
                 return None
             doubt = self._velocity_error * self._period * sum(cycles)
             angles += now.velocity[four] * self._to_joint[four] * (self._period * ages.joint[four])
-            pelvis = turned_on(pelvis, now.gyro[_PELVIS].tolist(), self._period * cycles[-2])
-            tibia = turned_on(tibia, now.gyro[_TIBIAE[leg]].tolist(), self._period * cycles[-1])
+            pelvis = extrapolated(pelvis, now.gyro[_PELVIS].tolist(), self._period * cycles[-2])
+            tibia = extrapolated(tibia, now.gyro[_TIBIAE[leg]].tolist(), self._period * cycles[-1])
         fh, th, sh, sk = angles.tolist()
         x, z, y = hip_angles(pelvis, tibia)
         turn = 2.0 * math.pi
         errors = math.remainder(fh - x, turn), math.remainder(th - z, turn), math.remainder(sh + sk - y, turn)
-        return _Contradiction((x, z, y), errors, doubt)
+        return _Comparison((x, z, y), errors, doubt)
 
-    def _judge_drift(self, leg: int, said: _Contradiction) -> None:
+    def _judge_drift(self, leg: int, comparison: _Comparison) -> None:
         drifts = []
         counts = self._contradicts[leg]
-        for axis, error in enumerate(said.errors):
-            counts[axis] = counts[axis] + 1 if abs(error) > self._attitude_error + said.doubt else 0
+        for axis, error in enumerate(comparison.errors):
+            counts[axis] = counts[axis] + 1 if abs(error) > self._attitude_error + comparison.doubt else 0
             if counts[axis] >= DRIFT_SAMPLES:
                 drifts.append(_drift(SIDES[leg], _AXES[axis], error))
         self._drifts[leg] = tuple(drifts)
 
-    def _judge_standstill(self, leg: int, said: _Contradiction) -> None:
+    def _judge_standstill(self, leg: int, comparison: _Comparison) -> None:
         stuck = []
-        for place, stands in enumerate(self._standing[leg].tolist()):
-            joint, axis = _HIPS[leg] + place, _AXIS_OF[place]
+        for index, constant in enumerate(self._constant_samples[leg].tolist()):
+            joint, axis = _HIPS[leg] + index, _AXIS_OF[index]
             moved = self._moved[joint]
-            if not stands or moved is None:
-                self._moved[joint], self._turned[joint] = said, 0
+            if not constant or moved is None:
+                self._moved[joint], self._turned[joint] = comparison, 0
                 continue
-            change = said.errors[axis] - moved.errors[axis]
-            turned = max(abs(angle - moved.angles[i]) for i, angle in enumerate(said.angles))
-            # A change of the error without a turn of the leg comes from an earlier jump or drift, and not from a stuck encoder.
-            allowed = self._attitude_change + self._misalignment * turned + said.doubt + moved.doubt
+            change = comparison.errors[axis] - moved.errors[axis]
+            turned = max(abs(angle - moved.angles[i]) for i, angle in enumerate(comparison.angles))
+            # Without a rotation of the leg, a change of the error comes from an earlier jump or drift.
+            allowed = self._attitude_change + self._misalignment * turned + comparison.doubt + moved.doubt
             if min(abs(change), turned) <= allowed:
                 self._turned[joint] = 0
-                self._moved[joint] = _forgotten(moved, axis, change)
+                self._moved[joint] = _follow_imu_drift(moved, axis, change)
                 continue
             self._turned[joint] += 1
             if self._turned[joint] >= STANDSTILL_SAMPLES:
@@ -184,14 +185,14 @@ def hip_angles(pelvis: list[float], tibia: list[float]) -> tuple[float, float, f
     x = a * f - b * e - c * h + d * g
     y = a * g + b * h - c * e - d * f
     z = a * h - b * g + c * f - d * e
-    sine = 2.0 * (w * z - x * y)  # sine of TH, the negative of the matrix entry (0, 1)
+    sine = 2.0 * (w * z - x * y)  # sine of TH: minus the entry (0, 1) of the rotation matrix
     th = math.asin(max(-1.0, min(1.0, sine)))
     sagittal = math.atan2(2.0 * (x * z + w * y), 1.0 - 2.0 * (y * y + z * z))
     fh = math.atan2(2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + z * z))
     return fh, th, sagittal
 
 
-def turned_on(quaternion: list[float], gyro: list[float], time: float) -> list[float]:
+def extrapolated(quaternion: list[float], gyro: list[float], time: float) -> list[float]:
     """Extrapolate an attitude with a constant angular velocity, to first order.
 
     Args:
@@ -212,20 +213,20 @@ def turned_on(quaternion: list[float], gyro: list[float], time: float) -> list[f
     ]
 
 
-def _forgotten(moved: _Contradiction, axis: int, change: float) -> _Contradiction:
-    """Return the comparison with the error of one axis moved towards its present value, by `_FORGOTTEN` at most."""
+def _follow_imu_drift(moved: _Comparison, axis: int, change: float) -> _Comparison:
+    """Move the error of one axis towards its present value, by at most `_IMU_DRIFT`."""
     errors = list(moved.errors)
-    errors[axis] += max(-_FORGOTTEN, min(_FORGOTTEN, change))
+    errors[axis] += max(-_IMU_DRIFT, min(_IMU_DRIFT, change))
     return moved._replace(errors=(errors[0], errors[1], errors[2]))
 
 
 def _drift(side: str, joints: tuple[str, ...], error: float) -> Finding:
     named = " and ".join(f"{side}_{joint}" for joint in joints)
-    text = f"encoder of {named}: {math.degrees(error):+.1f} degrees off what pelvis and tibia IMU say"
+    text = f"encoder of {named}: {math.degrees(error):+.1f} degrees away from the angle of the pelvis and tibia IMUs"
     node = JOINT_NODES[JOINTS.index(f"{side}_{joints[0]}")]
     return Finding(Dtc.ENC_DRIFT, node, error, True, text)
 
 
 def _stuck(joint: int, change: float) -> Finding:
-    text = f"the encoder of {JOINTS[joint]} stands still while its leg turned by {math.degrees(-change):+.2f} degrees"
+    text = f"the encoder of {JOINTS[joint]} has a constant reading while its leg turned by {math.degrees(-change):+.2f} degrees"
     return Finding(Dtc.ENC_STUCK, JOINT_NODES[joint], -change, True, text)

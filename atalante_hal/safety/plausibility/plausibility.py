@@ -25,16 +25,17 @@ from atalante_hal.types import Vector
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Intervals of the slow checks [cycles]: `SLOW` for standstill, velocity and the monitor of checks that lack data, `FEET` for
-#: the feet.
-SLOW, FEET = 16, 4
-#: Period of the schedule [cycles]; each leg is checked once in it.
-_ROUND = 32
+#: Interval of the foot checks [cycles].
+FEET = 4
+#: Interval of the other slow checks [cycles]: standstill, velocity, monitor of checks without data.
+SLOW = 16
+#: Period of the schedule of all slow checks [cycles]. Each leg is checked once per period.
+_PERIOD = 32
 _FRESH = int(Check.SOME_LOST)
 
 
 class Plausibility:
-    """Plausibility checks of the decoded values in the process image of the HAL.
+    """Plausibility checks of the decoded values in the process image.
 
     Args:
         robot: limits and sensor thresholds of the robot.
@@ -53,49 +54,48 @@ class Plausibility:
         self._encoders = EncoderChecks(robot, now, signals_of(codec, image.values_before), period, SLOW)
         self._imus = Imus(robot, codec, now)
         self._stillness = Stillness(robot, image, now, SLOW)
-        self._legs = Legs(robot, now, self._stillness.standing, period)
+        self._legs = Legs(robot, now, self._stillness.constant_samples, period)
         self._feet = FootChecks(robot, now, FEET)
         self._rows = Rows(codec)
         self._unchecked = Unchecked(self._rows, image.check, SLOW)
         self._joint_rows, self._imu_rows = self._rows.joint.tolist(), self._rows.imu.tolist()
-        self._foot_ages = [NEVER] * len(self._rows.foot)  # age of each foot's values at its last check [cycles]
-        #: Row -> cycle in which its last good values were measured; updated only while `_settled` is False.
+        self._foot_ages = [NEVER] * len(self._rows.foot)  # age of the values of each foot at its last check [cycles]
+        #: Row -> cycle in which its last good values were measured. It is updated only while `_settled` is False.
         self._measured = dict.fromkeys((*self._joint_rows, *self._imu_rows), -NEVER)
-        #: (foot, cell) -> measured force [N], shape (3,), for each faulty cell whose force was replaced by zero.
-        self._silenced: dict[tuple[int, int], Vector] = {}
-        self._settled = False  # the last values of all rows were good, and of the cycle they came in
+        #: (foot, cell) -> measured force, shape (3,) [N], of each faulty cell. Its force in the process image is set to zero.
+        self._measured_forces: dict[tuple[int, int], Vector] = {}
+        self._settled = False  # True if the last values of all rows were good and new
         self._turns = self._build_turns()
         self._cycle = 0
         self.findings: tuple[Finding, ...]
-        #: Findings at the last check of all rows. If the findings change, the rows are checked again, because an IMU may have
-        #: become unusable or usable.
+        #: Findings at the last check of all rows. All rows are checked again if the findings change.
         self._judged: tuple[Finding, ...]
         self.findings = self._judged = ()
 
     def _build_turns(self) -> list[Callable[[Ages | None], bool] | None]:
-        """Return the schedule: the slow check of each cycle in a round, or None.
+        """Return the slow check of each cycle in a period; None in a cycle without a slow check.
 
         Each check is called with the ages of the sensor values, or with None if all values are of this cycle. It returns whether
         it has findings.
         """
-        turns: list[Callable[[Ages | None], bool] | None] = [None] * _ROUND
-        turns[0::SLOW] = [self._sample] * (_ROUND // SLOW)
-        turns[2::SLOW] = [self._judge_velocity] * (_ROUND // SLOW)
-        turns[4::SLOW] = [self._judge_unchecked] * (_ROUND // SLOW)
-        turns[1::FEET] = [self._judge_feet] * (_ROUND // FEET)
+        turns: list[Callable[[Ages | None], bool] | None] = [None] * _PERIOD
+        turns[0::SLOW] = [self._sample] * (_PERIOD // SLOW)
+        turns[2::SLOW] = [self._judge_velocity] * (_PERIOD // SLOW)
+        turns[4::SLOW] = [self._judge_unchecked] * (_PERIOD // SLOW)
+        turns[1::FEET] = [self._judge_feet] * (_PERIOD // FEET)
         turns[8], turns[24] = self._legs.judge_left, self._legs.judge_right
         return turns
 
     def check(self) -> tuple[Finding, ...]:
-        """Run the checks of this cycle; call it once per cycle, after the process image has accepted the frames.
+        """Run the checks of one cycle. Call this after the process image has accepted the frames of the cycle.
 
         Returns:
             The present findings.
         """
         fresh = self._image.all_fresh
-        if self._silenced:
+        if self._measured_forces:
             self._restore_cells()
-        turn = self._turns[self._cycle % _ROUND]
+        turn = self._turns[self._cycle % _PERIOD]
         if turn is not None and (turn(None if fresh else self._rows.ages(self._image.age)) or self.findings):
             self._collect()
         settled = fresh and self._settled and self.findings is self._judged
@@ -104,12 +104,12 @@ class Plausibility:
             self._judge_rows()
             self._collect()
         if self.findings:
-            self._silence_cells()
+            self._set_faulty_cells_to_zero()
         self._cycle += 1
         return self.findings
 
     def reference(self, node: str) -> None:
-        """Accept the next position of a joint without a jump check, because its drive has restarted and referenced its encoder.
+        """Skip the jump check of a joint's next position, because its drive has referenced the encoder.
 
         Args:
             node: DBC name of the drive; the name of any other node has no effect.
@@ -125,7 +125,7 @@ class Plausibility:
 
     @property
     def swing(self) -> int | None:
-        """Return the index in FEET of the swing leg while the other leg stands; None if there is no swing leg."""
+        """Return the index of the swing leg in FEET; None unless exactly one foot is on the ground."""
         return self._feet.swing
 
     def _sample(self, ages: Ages | None) -> bool:
@@ -139,13 +139,13 @@ class Plausibility:
 
     def _judge_feet(self, ages: Ages | None) -> bool:
         now = [0] * len(self._foot_ages) if ages is None else ages.foot.tolist()
-        # A foot without new values since its last check is not checked again.
+        # A foot is checked only if it has new values since its last check.
         left, right = (age < before + FEET for age, before in zip(now, self._foot_ages, strict=True))
         self._foot_ages = now
         return self._feet.judge((left, right))
 
     def _judge_rows(self) -> None:
-        """Check the new values of each joint and IMU row, and reject the values that may not be used."""
+        """Check the new values of each joint and each IMU, and reject implausible values."""
         measured, cycle, image = self._measured, self._cycle, self._image
         if self._settled:
             measured.update(dict.fromkeys(measured, cycle - 1))
@@ -184,15 +184,15 @@ class Plausibility:
         if findings != self.findings:
             self.findings = findings
 
-    def _silence_cells(self) -> None:
-        """Set the force of each faulty cell to zero in the process image, so that only the other cells of its foot are used."""
+    def _set_faulty_cells_to_zero(self) -> None:
+        """Set the force of each faulty cell in the process image to zero."""
         for cell in {*self._stillness.cells, *self._feet.cells}:
-            self._silenced[cell] = self._force[cell].copy()
+            self._measured_forces[cell] = self._force[cell].copy()
             self._force[cell] = 0.0
 
     def _restore_cells(self) -> None:
-        """Undo `_silence_cells` for a foot without new values, so that the checks use the measured forces."""
-        for (foot, cell), force in self._silenced.items():
+        """Restore the measured forces of faulty cells, because the checks of a foot without new values need them."""
+        for (foot, cell), force in self._measured_forces.items():
             if self._image.check[self._rows.foot[foot]] > _FRESH:
                 self._force[foot, cell] = force
-        self._silenced.clear()
+        self._measured_forces.clear()

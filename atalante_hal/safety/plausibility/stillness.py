@@ -1,4 +1,4 @@
-"""Standstill checks: detect encoders that stay constant under a changing torque, and gyros or force cells without noise.
+"""Standstill checks, which detect stuck encoders, and gyros or force cells without noise.
 
 All signals are sampled every few cycles, and samples in a row with exactly the same value are counted. A sample that was not
 measured after the last one is ignored.
@@ -27,10 +27,11 @@ from atalante_hal.safety.plausibility.finding import (
 from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Maximum detection times for an encoder and for a gyro or force cell, from the first repeated sample [cycles].
+#: Longest time to detect a stuck encoder, from the first repeated sample [cycles].
 STUCK_CYCLES = 50
+#: Longest time to detect a frozen gyro or force cell, from the first repeated sample [cycles].
 FROZEN_CYCLES = 100
-#: Distance from a position limit within which a joint counts as being at its end stop [rad].
+#: Largest distance from a position limit at which a joint counts as at its end stop [rad].
 _AT_STOP = 0.005
 _NEVER = 1 << 30
 
@@ -50,23 +51,23 @@ class Stillness:
         where = measured(codec)
         self._values, self._now, self._age = image.values[where], now, image.age
         self._every = every
-        #: Time since the measurement of each row's last sample [cycles], shape (rows,).
+        #: Age of the last sample of each row [cycles], shape (rows,).
         self._sampled_age: Cycles = np.full(len(image.age), 2 * NEVER)
         self._row_of = codec.row_of[where]
         size = len(self._values)
         self._sampled = np.full(size, np.nan)
         self._same = np.empty(size, np.bool_)
         self._repeats = np.full(size, 0)
-        # The limits are rounded down, because the first sample of a standstill may be up to `every` - 1 cycles late.
+        # Round the limits down, because the first sample of a standstill may be up to `every` - 1 cycles late.
         limit = np.full(size, _NEVER)
         limit[codec.slice("Position")] = self._to_stuck = (STUCK_CYCLES - every + 1) // every
         limit[codec.slice("Gyro")] = limit[codec.slice("Force")] = to_freeze = (FROZEN_CYCLES - every + 1) // every
         self._to_freeze = to_freeze
         self._limit = limit
         self._none_over = bytes(size)
-        #: Number of samples in a row in which the reading of each encoder was constant, shape (12,).
-        self.standing: npt.NDArray[np.int64]
-        self.standing, self._gyros, self._cells = (
+        #: Number of consecutive samples with a constant reading, for each encoder, shape (12,).
+        self.constant_samples: npt.NDArray[np.int64]
+        self.constant_samples, self._gyros, self._cells = (
             self._repeats[codec.slice(quantity)] for quantity in ("Position", "Gyro", "Force")
         )
         self._encoders_same, self._no_encoder = self._same[codec.slice("Position")], bytes(len(JOINTS))
@@ -75,13 +76,15 @@ class Stillness:
         self._breakaway = robot.breakaway
         self._to_joint: Vector = robot.polarity / robot.gear
         self._low_stop, self._high_stop = robot.position_min + _AT_STOP, robot.position_max - _AT_STOP
-        #: Indices of the joints with a stuck encoder, of the IMUs with a frozen gyro, and of the frozen cells as (foot, cell).
+        #: Indices of the joints with a stuck encoder.
         self.encoders: list[int] = []
+        #: Indices of the IMUs with a frozen gyro.
         self.imus: list[int] = []
+        #: (foot, cell) of each frozen force cell.
         self.cells: list[tuple[int, int]] = []
 
     def sample(self, whole: bool) -> bool:
-        """Take a sample and compare it with the last one.
+        """Take a sample of all signals and compare it with the last sample.
 
         Args:
             whole: True if the values of all rows are of this cycle. If False, the ages in the process image are used.
@@ -110,15 +113,15 @@ class Stillness:
         return over
 
     def _newer(self) -> npt.NDArray[np.bool_]:
-        """Return which values were measured after their last sample, shape (measured values,)."""
+        """Return for each measured value whether it is newer than its last sample."""
         self._sampled_age += self._every
         newer = self._age < self._sampled_age
         np.copyto(self._sampled_age, self._age, where=newer)
         return newer[self._row_of]
 
     def _follow_torque(self) -> None:
-        """Update the range of the torque of each joint since its encoder reading last changed."""
-        first = self.standing == 1
+        """Update the torque range of each joint since the last change of its encoder reading."""
+        first = self.constant_samples == 1
         torque = self._now.torque
         low = np.where(first, self._sampled_torque, self._torque_low)
         high = np.where(first, self._sampled_torque, self._torque_high)
@@ -129,7 +132,7 @@ class Stillness:
         angle = self._now.position * self._to_joint
         pushed = self._torque_high - self._torque_low >= self._breakaway
         free = (angle > self._low_stop) & (angle < self._high_stop)
-        self.encoders = np.flatnonzero((self.standing >= self._to_stuck) & pushed & free).tolist()
+        self.encoders = np.flatnonzero((self.constant_samples >= self._to_stuck) & pushed & free).tolist()
         frozen = (self._gyros.reshape(len(IMUS), 3) >= self._to_freeze).all(axis=1)
         self.imus = np.flatnonzero(frozen).tolist()
         dead = (self._cells.reshape(len(FEET), len(CELLS), 3) >= self._to_freeze).any(axis=2)
@@ -145,15 +148,15 @@ class Stillness:
 
     def _stuck(self, joint: int) -> Finding:
         swing = float(self._torque_high[joint] - self._torque_low[joint])
-        text = f"the encoder of {JOINTS[joint]} stands still while the torque swings by {swing:.0f} Nm"
+        text = f"the encoder of {JOINTS[joint]} has a constant reading while the torque varies by {swing:.0f} Nm"
         return Finding(Dtc.ENC_STUCK, JOINT_NODES[joint], swing, True, text)
 
 
 def _frozen_imu(imu: int) -> Finding:
-    text = f"the gyro of the {IMUS[imu]} IMU repeats one value for {FROZEN_CYCLES} cycles"
+    text = f"the gyro of the {IMUS[imu]} IMU has had a constant reading for {FROZEN_CYCLES} cycles"
     return Finding(Dtc.IMU_STUCK, IMU_NODES[imu], float(FROZEN_CYCLES), True, text)
 
 
 def _frozen_cell(foot: int, cell: int, force: float) -> Finding:
-    text = f"force cell {CELLS[cell]} of the {FEET[foot]} foot repeats {force:.0f} N"
+    text = f"force cell {CELLS[cell]} of the {FEET[foot]} foot has a constant reading of {force:.0f} N"
     return Finding(Dtc.FOOT_CELL, FOOT_NODES[foot], force, True, text)

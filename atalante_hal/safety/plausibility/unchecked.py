@@ -1,4 +1,4 @@
-"""Monitor of the checks that cannot run because their messages arrive without usable values.
+"""Monitor of the checks that cannot run because their messages contain no usable values.
 
 A check uses values that are younger than the timeout of their message, see `finding.Rows`. If a node sends nothing for longer,
 the message monitor brings the robot to HOLD within 10 cycles. If a node keeps sending messages without values, the robot may keep
@@ -20,9 +20,9 @@ from atalante_hal.safety.plausibility.finding import FOOT_NODES, JOINT_NODES, Cy
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER
 
-#: Time after which a check that cannot run counts as failed [cycles]. The slowest check needs as long to detect a fault.
+#: Time after which a check that cannot run counts as failed [cycles]. It is the detection time of the slowest check.
 UNCHECKED_CYCLES = 128
-#: Number of joints of a leg whose encoders are compared with the IMUs.
+#: Number of encoders per leg that are compared with the IMUs.
 _COMPARED = 4
 
 
@@ -30,11 +30,11 @@ class _SensorCheck(NamedTuple):
     dtc: Dtc
     node: str
     rows: list[int]  # rows of the process image that the check needs
-    what: str  # checked quantity, for the text of the finding
+    quantity: str  # checked quantity, for the text of the finding
 
 
 class Unchecked:
-    """Monitor of the time for which each check could not run.
+    """Measurement of the time for which each check could not run.
 
     Args:
         rows: rows and timeouts of the sensor messages.
@@ -86,18 +86,18 @@ class Unchecked:
 
 
 def _checks(rows: Rows) -> Iterator[_SensorCheck]:
-    """Yield the checks that need several values; a check of a single value runs whenever the value arrives."""
+    """Yield the checks that compare several values."""
     joints, imus, feet = rows.joint.tolist(), rows.imu.tolist(), rows.foot.tolist()
     for joint, row in enumerate(joints):
         yield _SensorCheck(Dtc.ENC_VELOCITY, JOINT_NODES[joint], [row], f"the velocity of {JOINTS[joint]}")
     for leg, side in enumerate(SIDES):
         hip = leg * len(LEG_JOINTS)
         needed = [*joints[hip : hip + _COMPARED], imus[IMUS.index("pelvis")], imus[IMUS.index(f"{side}_tibia")]]
-        yield _SensorCheck(Dtc.ENC_DRIFT, JOINT_NODES[hip], needed, f"what encoders and IMUs say of the {side} leg")
+        yield _SensorCheck(Dtc.ENC_DRIFT, JOINT_NODES[hip], needed, f"the encoders against the IMUs of the {side} leg")
     for foot, row in enumerate(feet):
         yield _SensorCheck(Dtc.FOOT_CELL, FOOT_NODES[foot], [row], f"the force cells of the {FEET[foot]} foot")
 
 
 def _unchecked(check: _SensorCheck, cycles: int) -> Finding:
-    text = f"{check.what} could not be checked for {cycles} cycles"
+    text = f"{check.quantity} could not be checked for {cycles} cycles"
     return Finding(check.dtc, check.node, float(cycles), cycles >= UNCHECKED_CYCLES, text)

@@ -71,7 +71,7 @@ def asker(ends: tuple[SharedBus, SharedBus]) -> Iterator[tuple[SharedBus, Answer
     ours, theirs = ends
     ours.patience = LONG
     answering = Answering(theirs)
-    ours.meet(LONG)
+    ours.wait_until_served(LONG)
     yield ours, answering
     ours.close()
     answering.join()
@@ -127,7 +127,7 @@ def test_wait_for_an_end_that_never_serves_times_out(ends: tuple[SharedBus, Shar
     assert ours.receive(new_frames(1)) == 0
     assert time.monotonic() - begun >= 0.03
     with pytest.raises(BusDown, match="the other end did not start to serve within 0 s"):
-        ours.meet(0.03)
+        ours.wait_until_served(0.03)
 
 
 def test_full_ring_queue_rejects_whole_batches(ends: tuple[SharedBus, SharedBus]) -> None:
@@ -180,7 +180,7 @@ def test_killed_process_at_the_other_end_raises_bus_down(patience: float) -> Non
     os.close(theirs)
     bus = SharedBus("embedded", memory, bell, 0)
     bus.patience = patience
-    bus.meet(LONG)
+    bus.wait_until_served(LONG)
     child.send_signal(signal.SIGKILL)
     child.wait()
     bus.send(frames_of(1))

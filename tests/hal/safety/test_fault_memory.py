@@ -32,7 +32,7 @@ def test_persistent_diagnostic_is_logged_once(memory: FaultMemory):
         assert memory.bits == Dtc.NODE_TIMEOUT.bit
         assert memory.active[Dtc.NODE_TIMEOUT, "LEFT_SK"].value == cycle
     assert told(memory) == [(5, "NODE_TIMEOUT", "LEFT_SK", "error", 5)]
-    assert memory.events[0].text == "LEFT_SK: a node is silent"
+    assert memory.events[0].text == "LEFT_SK: a node timed out"
 
 
 @pytest.mark.parametrize("confirmed", [False, True])

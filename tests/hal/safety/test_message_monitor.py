@@ -105,7 +105,7 @@ def test_silent_node_times_out_exactly_at_its_timeout(bench: MonitorBench, row: 
     assert not bench.message_monitor.nodes_well
     event = bench.memory.events[-1]
     assert (event.code, event.node, event.value, event.cycle) == ("NODE_TIMEOUT", node, timeout, 16 + timeout)
-    assert event.text == f"{node}: a node is silent; its data is {timeout} cycles old"
+    assert event.text == f"{node}: a node timed out; its data is {timeout} cycles old"
 
 
 def test_first_frame_after_lost_frames_is_used_and_reported(bench: MonitorBench):

@@ -456,7 +456,7 @@ def test_a_start_in_hold_is_refused_with_the_reason_while_a_node_is_missing(make
     rig.operator.start()
     rig.run(2)
     assert "START_REFUSED" in rig.codes()
-    assert rig.hal.reason.startswith("START refused: LEFT_SK: a node is silent")
+    assert rig.hal.reason.startswith("START refused: LEFT_SK: a node timed out")
     rig.bus.to_hal = lambda frames: frames
     rig.run(2)
     rig.operator.start()

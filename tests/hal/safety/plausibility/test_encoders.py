@@ -265,7 +265,10 @@ class TestVelocity:
             finding = only(robot.checks.findings)
             assert finding.node == JOINTS[joint].upper()
             assert finding.value == pytest.approx(sign * error, rel=1e-5)
-            assert f"velocity of {JOINTS[joint]} is {math.degrees(sign * error):+.0f} deg/s" in finding.text
+            assert (
+                f"velocity of {JOINTS[joint]} differs from its encoder by {math.degrees(sign * error):+.0f} deg/s"
+                in finding.text
+            )
             assert robot.run(33) == ()
 
     def test_velocity_noise_without_mean_is_accepted(self):

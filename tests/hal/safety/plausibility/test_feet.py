@@ -25,7 +25,7 @@ class TestForceCells:
         finding = only(robot.checks.findings)
         assert finding.node == f"FOOT_{FEET[foot].upper()}"
         assert finding.value == pytest.approx(sign * 200.0, abs=20.0)
-        assert f"force cell {CELLS[cell]} of the {FEET[foot]} foot says" in finding.text
+        assert f"force cell {CELLS[cell]} of the {FEET[foot]} foot reports" in finding.text
         assert not robot.now.force[foot, cell].any()
         assert only(robot.run(8, change)) == finding
         robot.missing = {row(f"FOOT_{FEET[foot]}")}
@@ -110,7 +110,7 @@ class TestFeetAlone:
         for _ in range(2):
             assert [feet.judge(*loads) for _ in range(257)] == [False] * 255 + [True] * 2
             assert feet.checks.cells == {(foot, cell): -200.0}
-            text = f"force cell {CELLS[cell]} of the {FEET[foot]} foot says -200 N, which contradicts the other three"
+            text = f"force cell {CELLS[cell]} of the {FEET[foot]} foot reports -200 N, which contradicts the other three cells"
             node = f"FOOT_{FEET[foot].upper()}"
             assert feet.checks.findings() == (Finding(Dtc.FOOT_CELL, node, -200.0, True, text),)
             # The cells of a foot without new values are not checked again.
@@ -151,7 +151,7 @@ class TestFeetAlone:
         feet.judge(LOADED, UNLOADED)
         for _ in range(20):
             feet.judge(UNLOADED, UNLOADED)
-        assert [f.text for f in feet.checks.findings()] == ["both feet say that they swing on the ground"]
+        assert [f.text for f in feet.checks.findings()] == ["both feet report no load on the ground"]
         assert not feet.judge(LOADED, UNLOADED)
         assert feet.checks.findings() == ()
 

@@ -76,7 +76,9 @@ class TestQuaternion:
             assert (finding.dtc, finding.node) == (Dtc.IMU_INVALID, f"IMU_{IMUS[imu].upper()}")
             assert not finding.confirmed
             assert finding.value == pytest.approx(math.sqrt(squared))
-            assert f"quaternion of the {IMUS[imu]} IMU has the norm {math.sqrt(squared):.3f}" in finding.text
+            assert (
+                f"quaternion of the {IMUS[imu]} IMU must have the norm 1, got {math.sqrt(squared):.3f}" in finding.text
+            )
             assert robot.rejected == {row(f"IMU_{IMUS[imu]}"): 1}
             assert np.allclose(np.linalg.norm(robot.now.quaternion[imu]), 1.0)
             assert not only(robot.run(8, stretch)).confirmed

@@ -144,7 +144,7 @@ class TestDrift:
         side, axis = JOINTS[joint].split("_")
         named_joints = f"{side}_SH and {side}_SK" if axis in ("SH", "SK") else JOINTS[joint]
         assert finding.text == (
-            f"encoder of {named_joints}: {math.degrees(offset):+.1f} degrees off what pelvis and tibia IMU say"
+            f"encoder of {named_joints}: {math.degrees(offset):+.1f} degrees away from the angle of the pelvis and tibia IMUs"
         )
         robot.missing = {row("pendant")}
         assert only(robot.run(40, off)) is finding
@@ -268,7 +268,8 @@ class TestStandingEncoder:
         finding = only(robot.checks.findings)
         assert finding.node == JOINTS[joint].upper()
         assert finding.text == (
-            f"the encoder of {JOINTS[joint]} stands still while its leg turned by {math.degrees(finding.value):+.2f} degrees"
+            f"the encoder of {JOINTS[joint]} has a constant reading "
+            f"while its leg turned by {math.degrees(finding.value):+.2f} degrees"
         )
         robot.missing = {row(f"IMU_{JOINTS[joint].split('_')[0]}_tibia")}
         assert robot.run(9, stick)[0] is finding

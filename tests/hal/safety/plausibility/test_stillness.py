@@ -31,7 +31,9 @@ class TestStuckEncoder:
         finding = only(robot.checks.findings)
         assert finding.node == JOINTS[joint].upper()
         assert finding.value >= ROBOT.breakaway[joint]
-        assert f"{JOINTS[joint]} stands still while the torque swings by {finding.value:.0f} Nm" in finding.text
+        assert (
+            f"{JOINTS[joint]} has a constant reading while the torque varies by {finding.value:.0f} Nm" in finding.text
+        )
         assert robot.rejected == {}
         assert robot.run(17) == ()
 
@@ -180,7 +182,7 @@ class TestRepeatedForce:
         assert 80 < robot.until_found(Dtc.FOOT_CELL, 100, stick) <= 96
         finding = only(robot.checks.findings)
         assert finding.node == f"FOOT_{FEET[foot].upper()}"
-        assert f"force cell {CELLS[cell]} of the {FEET[foot]} foot repeats" in finding.text
+        assert f"force cell {CELLS[cell]} of the {FEET[foot]} foot has a constant reading of" in finding.text
         if axis == 2:
             assert finding.value == value
         assert not robot.now.force[foot, cell].any()
@@ -213,7 +215,7 @@ class TestStillnessAlone:
 
     def test_new_standstill_check_has_no_findings(self):
         stillness, _, _ = self.stillness()
-        assert not stillness.standing.any()
+        assert not stillness.constant_samples.any()
         assert stillness.findings() == ()
 
     @pytest.mark.parametrize(("every", "to_stuck", "to_freeze"), [(3, 16, 32), (4, 11, 24), (16, 2, 5)])

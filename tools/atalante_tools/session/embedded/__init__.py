@@ -110,7 +110,7 @@ class EmbeddedRobot(Closing):
         with suppress(BrokenPipeError), pipe:
             pickle.dump(config, pipe)
         try:
-            self.bus.meet(_START)
+            self.bus.wait_until_served(_START)
         except BusDown as error:
             raise Failed(str(error)) from error
 
