@@ -99,10 +99,11 @@ class Recording:
         error = rng.uniform(-ERROR, ERROR, len(JOINTS))
         self.values[:, codec.slice("Position")] = (walk.tables.q[0] + error + swing) * motor
         self.values[:, codec.slice("Velocity")] = ERROR_RATE * np.cos(phase) * motor
-        turn = np.where(np.arange(POSES) % 2, 1.0, -1.0)[:, None]  # alternating sign, because consecutive sensor values must differ
+        # Noise of alternating sign, because consecutive sensor values must differ.
+        sign = np.where(np.arange(POSES) % 2, 1.0, -1.0)[:, None]
         for name, noise in (("Torque", 0.05), ("Gyro", 0.01), ("Accel", 0.05), ("Force", 1.0)):
             columns = codec.slice(name)
-            self.values[:, columns] += turn * rng.uniform(0.5 * noise, noise, (POSES, columns.stop - columns.start))
+            self.values[:, columns] += sign * rng.uniform(0.5 * noise, noise, (POSES, columns.stop - columns.start))
         for side, leg in (("LEFT", 0), ("RIGHT", len(JOINTS) // 2)):
             # The tibia pitch is the sum of hip and knee angle [rad]. Its quaternion contains half of this angle.
             half_pitch = 0.5 * (walk.tables.q[0] + error)[leg + 2 : leg + 4].sum()

@@ -81,7 +81,7 @@ def emulated_robot(network: Network, robot: Robot, robot_bus: Bus) -> Iterator[E
     Args:
         network: nodes and messages of the DBC.
         robot: joint properties.
-        robot_bus: end of the bus for the robot.
+        robot_bus: bus of the robot.
     """
     with open_body(robot) as body:  # if PyBullet is missing, the error names the package to install
         from atalante_emulator.emulator import Emulator
@@ -94,7 +94,7 @@ def connect(hal_bus: Bus, emulator: Emulator) -> Callable[[], object] | None:
     """Connect the emulated robot to the bus of the HAL.
 
     Args:
-        hal_bus: HAL's end of the bus.
+        hal_bus: bus of the HAL.
         emulator: emulated robot at the other end.
 
     Returns:
