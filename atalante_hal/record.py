@@ -35,7 +35,7 @@ class Record:
         self.layout = Layout(_fields(codec, controller_fields))
         self._imu_rows = tuple(codec.rows[f"IMU_{imu.upper()}_STATE"] for imu in IMUS)
         self.values = np.zeros(self.layout.size)
-        # A memoryview, because access to a single number takes half as long as with an array.
+        # Access to one number of a memoryview takes half as long as access to one number of an array.
         self.header = memoryview(self.values.data).cast("B").cast("d")[: len(HEADER_FIELDS)]
         first = self.layout["motor_position"].start
         self.signals = self.values[first : first + codec.size]

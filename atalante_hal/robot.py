@@ -17,15 +17,15 @@ import numpy.typing as npt
 
 from atalante_hal.types import Vector
 
-#: Joints of one leg, hip to foot: frontal, transverse and sagittal hip; sagittal knee; sagittal and Henke ankle.
+#: Joints of one leg: frontal, transverse and sagittal hip, sagittal knee, sagittal and Henke ankle.
 LEG_JOINTS = ("FH", "TH", "SH", "SK", "SA", "HA")
 SIDES = ("left", "right")
 JOINTS = tuple(f"{side}_{joint}" for side in SIDES for joint in LEG_JOINTS)
-#: Sign of each leg joint in the mirrored pose: q_right = sign * q_left.
+#: Sign of each leg joint for a mirrored pose: q_right = sign * q_left.
 MIRROR_SIGN = (-1, -1, 1, 1, 1, -1)
 IMUS = ("torso", "pelvis", "left_tibia", "right_tibia")
 FEET = SIDES
-#: Force cells of one foot: front/rear, left/right in the foot frame.
+#: Force cells of one foot: front or rear, left or right in the foot frame.
 CELLS = ("FL", "FR", "RL", "RR")
 #: Vibration motors: front and back of each thigh and shank.
 MOTORS = tuple(
@@ -45,17 +45,17 @@ class RobotError(ValueError):
 class Envelope:
     """Reduction of the torque near the limits of position and velocity, see `limiter`."""
 
-    look_ahead: float  # s, time in which a joint at its present velocity must stay inside its position limits
-    position_margin: float  # rad beyond a position limit from which no torque drives the joint further out
-    velocity_margin: float  # rad/s beyond a velocity limit from which no torque accelerates the joint further
+    look_ahead: float  # s, time ahead for which a joint at constant velocity must stay inside its position limits
+    position_margin: float  # rad, distance beyond a position limit at which the outward torque becomes 0
+    velocity_margin: float  # rad/s, excess over a velocity limit at which the accelerating torque becomes 0
 
 
 @dataclass(frozen=True)
 class Derating:
     """Torque limit of a hot drive as a function of its temperature."""
 
-    start: float  # degC, up to this temperature torque_max is allowed
-    end: float  # degC, from this temperature on only `floor` is allowed
+    start: float  # degC, highest temperature at which `torque_max` is allowed
+    end: float  # degC, temperature from which only `floor` is allowed
     floor: float  # share of torque_max, 0 to 1
 
 
@@ -63,34 +63,34 @@ class Derating:
 class Sensors:
     """Tolerances of healthy sensors, see `plausibility`."""
 
-    velocity_error: float  # rad/s at the joint, mean error of the reported velocity against the encoder
-    attitude_error: (
-        float  # rad, each axis: attitude of a tibia IMU relative to the pelvis IMU, compared with the encoders
-    )
-    attitude_change: float  # rad, change of the attitude error within a fraction of a second
-    misalignment: float  # rad of additional tolerance for each rad the leg turns meanwhile
-    quaternion_error: float  # error of the squared norm of a quaternion against 1
+    velocity_error: float  # rad/s at the joint, mean difference between reported velocity and encoder motion
+    attitude_error: float  # rad per axis, difference between the encoders and the IMUs of a leg
+    attitude_change: float  # rad, change of the encoder-to-IMU difference while an encoder reading is constant
+    misalignment: float  # rad of additional tolerance for each rad by which the leg turns
+    quaternion_error: float  # difference between the squared norm of a quaternion and 1
     cell_free: float  # N, vertical force below which a cell carries no load
-    cell_loaded: float  # N, vertical force of three cells together, above which the fourth must carry load
+    cell_loaded: float  # N, total vertical force of three cells above which the fourth cell must carry load
 
 
 @dataclass(frozen=True)
 class Thresholds:
     """Thresholds and ramps of the HAL's fault reactions."""
 
-    supply_low: float  # V at a drive; below it the battery is nearly empty
-    supply_under: float  # V at a drive; below it the drives cannot hold much longer
-    #: Smallest ratio of a hot drive's remaining torque share to that of the other leg's drive at which the robot may walk.
+    supply_low: float  # V at a drive; below this voltage the battery is nearly empty
+    supply_under: float  # V at a drive; below this voltage the drives may soon fail to hold
+    #: Smallest torque limit of a hot drive at which the robot may walk, as a share of the other leg's torque limit.
     derated_imbalance: float
-    full_assist_ramp: float  # s, time in which FULL_ASSIST ramps the assistance factor from 0 to 1
-    position_tolerance: float  # rad beyond a position limit from which a joint is out of its range
-    idle_torque: float  # Nm that a drive may report while off, or beyond its limit while on
-    surplus_frames: float  # frames a cycle may bring in addition to one of each cyclic message
+    full_assist_ramp: float  # s, time for the ramp of the assistance factor from 0 to 1 in FULL_ASSIST
+    position_tolerance: float  # rad, distance beyond a position limit at which a joint counts as out of range
+    idle_torque: (
+        float  # Nm, largest torque that a drive may report while off, and largest excess over its limit while on
+    )
+    surplus_frames: float  # largest number of frames in a cycle, in addition to one frame of each cyclic message
 
 
 @dataclass(frozen=True)
 class Robot:
-    """Limits, transmission and sensor tolerances of the robot.
+    """Limits, gear ratios and sensor tolerances of the robot.
 
     Arrays have shape (12,), in the order of `JOINTS`, on the joint side, and are read-only.
     """
@@ -101,11 +101,11 @@ class Robot:
     torque_max: Vector  # Nm
     torque_rate_max: Vector  # Nm/s
     gear: Vector  # motor turns for each joint turn
-    polarity: Vector  # +1 or -1: encoder sign against the joint
-    hold_kp: Vector  # Nm/rad, stiffness of the drive's own position hold
-    hold_kd: Vector  # Nm s/rad, damping of the drive's own position hold
+    polarity: Vector  # +1 or -1: sign of the encoder direction relative to the joint
+    hold_kp: Vector  # Nm/rad, stiffness of the position control in the drive
+    hold_kd: Vector  # Nm s/rad, damping of the position control in the drive
     encoder_noise: Vector  # rad rms
-    breakaway: Vector  # Nm, change of torque that overcomes dry friction
+    breakaway: Vector  # Nm, change of torque that moves the joint against its dry friction
     envelope: Envelope
     derating: Derating
     sensors: Sensors
@@ -128,7 +128,7 @@ class Robot:
 
 
 class _Key(NamedTuple):
-    """Valid values of a key. The range is wide: it detects a wrong unit or a misplaced decimal point."""
+    """Valid values of a key. The wide range detects a wrong unit or a misplaced decimal point."""
 
     size: int
     low: float
@@ -139,7 +139,7 @@ class _Key(NamedTuple):
 _KEYS = {
     "position": _Key(2, -math.pi, math.pi, "rad"),
     "velocity_max": _Key(1, 0.01, 50.0, "rad/s"),
-    "torque_max": _Key(1, 0.1, 400.0, "Nm"),  # the command frame carries 409 Nm
+    "torque_max": _Key(1, 0.1, 400.0, "Nm"),  # the command frame can encode at most 409 Nm
     "torque_rate_max": _Key(1, 10.0, 1e6, "Nm/s"),
     "gear": _Key(1, 1.0, 1000.0, "motor turns for each joint turn"),
     "polarity": _Key(1, -1.0, 1.0, "1 or -1"),
@@ -204,7 +204,8 @@ def load_robot(path: Path | None = None) -> Robot:
         raise RobotError(f"{path}: the top-level tables must be joints, {', '.join(_TABLES)}, got {sorted(document)}")
     tables = document["joints"]
     if not isinstance(tables, dict) or set(tables) != set(LEG_JOINTS):
-        raise RobotError(f"{path}: [joints] must have exactly the tables {', '.join(LEG_JOINTS)}")
+        found = sorted(tables) if isinstance(tables, dict) else tables
+        raise RobotError(f"{path}: [joints] must have exactly the tables {', '.join(LEG_JOINTS)}, got {found}")
     joints = {joint: _table(f"{path}: joints.{joint}", tables[joint], _KEYS) for joint in LEG_JOINTS}
     left = {key: np.array([joints[joint][key] for joint in LEG_JOINTS]) for key in _KEYS}
     scalars = {
@@ -258,7 +259,7 @@ def _table(where: str, table: Any, keys: dict[str, _Key]) -> dict[str, list[floa
 
 def _numbers(where: str, value: Any, valid: _Key) -> list[float]:
     numbers = value if isinstance(value, list) else [value]
-    # The comparison is false for NaN too.
+    # The comparison is also false for NaN.
     if len(numbers) != valid.size or not all(type(n) in (int, float) and valid.low <= n <= valid.high for n in numbers):
         count = "1 number" if valid.size == 1 else f"{valid.size} numbers"
         valid_range = f"from {valid.low:.6g} to {valid.high:.6g} ({valid.unit})"

@@ -55,10 +55,10 @@ class State:
     foot_force: Vector  # (2, 4, 3) N, on the foot, in the foot frame
     vibration: Vector  # (8,) measured level, 0 to 1
     valid: npt.NDArray[np.bool_]  # (messages,) True if the data is new and plausible and its sender is trusted
-    age: npt.NDArray[np.int64]  # (messages,) age of the data [cycles], from the SYNC that the sender answered
+    age: npt.NDArray[np.int64]  # (messages,) age of the data [cycles], since the SYNC that triggered it
     joints_valid: bool  # True if all twelve joint states are valid
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown
-    torque_sent: Vector | None = None  # (12,) Nm, torques that were sent last, after the limits; None if unknown
+    torque_sent: Vector | None = None  # (12,) Nm, last torques that were sent, after the limits; None if unknown
 
 
 @dataclass(slots=True)

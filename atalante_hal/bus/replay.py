@@ -35,7 +35,7 @@ UNREADABLE = (
     KeyError,
     EOFError,
     OSError,
-    NotImplementedError,  # if the package for this log format is not installed
+    NotImplementedError,  # raised if the package for the log format is missing
     struct.error,
     zlib.error,
     sqlite3.Error,

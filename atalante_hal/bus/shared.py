@@ -84,7 +84,7 @@ class SharedBus:
         self._sent = self._received = 0
         self._waits_without_polling = 0  # remaining waits that sleep without polling
         self._closed = False
-        self._close_reason = ""  # sent by the other end when it closed
+        self._close_reason = ""  # reason that the other end sent when it closed
         self._stamps: Stamps = np.zeros(size // FRAME_BYTES, np.int64)
         self._received_at = 0
         self._batches = Batches()

@@ -25,7 +25,7 @@ from atalante_hal.wire.frame import FLAG_FDF, FRAME_BYTES, Frames, as_words, new
 CLASSIC_BYTES = 16  # struct can_frame
 CAN_RAW_ERR_FILTER: Final = 2
 SO_RCVBUFFORCE: Final = 33
-SO_TIMESTAMPNS: Final = 35  # option number, and type of its control message
+SO_TIMESTAMPNS: Final = 35  # number of the socket option and of its control message
 SO_RXQ_OVFL: Final = 40
 SIOCGIFFLAGS: Final = 0x8913
 SIOCGIFMTU: Final = 0x8921

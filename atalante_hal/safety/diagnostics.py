@@ -42,7 +42,7 @@ class Dtc(StrEnum):
     severity: Severity
     #: Short description for the operator.
     meaning: str
-    #: Integer with only the bit of this code set, for bit sets of codes.
+    #: Integer with one bit set, which represents this code in a bit set.
     bit: int
 
     def __new__(cls, code: str, reaction: Reaction, severity: Severity, meaning: str) -> Dtc:
@@ -128,7 +128,7 @@ class Finding:
     dtc: Dtc
     node: str  # DBC name of the affected node
     value: float  # measured value; quantity and unit depend on the code
-    confirmed: bool  # True: the reaction is due; False: pending, the fault is still short
+    confirmed: bool  # True: confirmed, its reaction follows; False: pending, no reaction yet
     text: str  # one sentence for the operator; empty: node name and meaning of the code
 
 

@@ -84,7 +84,7 @@ class Outlets:
             from atalante_hal.telemetry.messages import Encoder
         except ImportError as error:
             if config.recording is not None:
-                raise SinkError("RECORD_STOPPED", f"a recording needs {error.name}: {_INSTALL}") from error
+                raise SinkError(f"a recording needs {error.name}: {_INSTALL}", "RECORD_STOPPED") from error
             self.notices.append(f"nothing is published, {error.name} is missing: {_INSTALL}")
             return None
         return Encoder(Layout.from_json(meta["layout"]), meta["diagnostics"])
@@ -138,7 +138,7 @@ def _open_recorder(config: TelemetryConfig, streams: list[tuple[str, str]], abou
     try:
         from atalante_hal.telemetry.recorder import Recorder
     except ImportError as error:
-        raise SinkError("RECORD_STOPPED", f"a recording needs {error.name}: {_INSTALL}") from error
+        raise SinkError(f"a recording needs {error.name}: {_INSTALL}", "RECORD_STOPPED") from error
     assert config.recording is not None
     return Recorder(config.recording, streams, {**about, "record_rate_hz": config.record_rate})
 
@@ -147,7 +147,7 @@ def _open_publisher(config: TelemetryConfig, streams: list[tuple[str, str]], bef
     try:
         from atalante_hal.telemetry.publisher import Publisher
     except ImportError as error:
-        raise SinkError("TELEMETRY_DOWN", f"{error.name} is missing: {_INSTALL}") from error
+        raise SinkError(f"{error.name} is missing: {_INSTALL}", "TELEMETRY_DOWN") from error
     return Publisher(config.robot, streams, config.listen, config.access, before)
 
 

@@ -42,8 +42,8 @@ def check_format(path: Path) -> str:
         if name.endswith(suffix):
             return suffix
     raise SinkError(
-        "RECORD_STOPPED",
         f"the format of the CAN log {path.name} cannot store CAN FD frames; end its name in one of {', '.join(FORMATS)}",
+        "RECORD_STOPPED",
     )
 
 
@@ -72,7 +72,7 @@ class CanLog(Closing):
             self._logger = can.Logger(path)
             self._open = True
         except OSError as error:
-            raise SinkError("RECORD_STOPPED", f"the CAN log {path} cannot be created: {error.strerror}") from error
+            raise SinkError(f"the CAN log {path} cannot be created: {error.strerror}", "RECORD_STOPPED") from error
 
     def write(self, frames: Frames, stamps: npt.NDArray[np.int64], sent: npt.NDArray[np.uint8]) -> None:
         """Append frames to the log.
@@ -130,4 +130,4 @@ class CanLog(Closing):
         self._open = False
         with contextlib.suppress(OSError):  # writing the buffered frames fails, too
             self._logger.stop()
-        return SinkError("RECORD_STOPPED", f"the CAN log {self.path} stopped: {error.strerror}")
+        return SinkError(f"the CAN log {self.path} stopped: {error.strerror}", "RECORD_STOPPED")

@@ -178,9 +178,9 @@ class TelemetryProcess(Closing):
         self._restarts = 0
         self._faults: list[str] = []  # faults of subprocesses, one sentence each
         self._recordings: list[str] = []  # names of the files begun so far
-        self._last_endpoint: str | None = None  # last endpoint in use; None before the first one was opened
+        self._last_endpoint: str | None = None  # last endpoint in use; None before the first endpoint was opened
         self._restarting: threading.Thread | None = None
-        self._progress = (0, 0.0)  # number of read records at the last progress, and its time [s]
+        self._progress = (0, 0.0)  # number of records read, and time [s], at the last progress
         meta = {
             "layout": layout.to_json(),
             "diagnostics": list(diagnostics),

@@ -100,7 +100,7 @@ class Publisher(Closing):
         try:
             self._publishers[key].put(payload)
         except zenoh.ZError as error:
-            raise SinkError("TELEMETRY_DOWN", f"Zenoh cannot publish: {error}") from error
+            raise SinkError(f"Zenoh cannot publish: {error}", "TELEMETRY_DOWN") from error
         self.messages += 1
 
     def begin_run(self, number: int, about: Mapping[str, object]) -> None:
@@ -120,7 +120,7 @@ class Publisher(Closing):
         try:
             self._stack.close()
         except zenoh.ZError as error:
-            raise SinkError("TELEMETRY_DOWN", f"Zenoh did not end its session: {error}") from error
+            raise SinkError(f"Zenoh did not end its session: {error}", "TELEMETRY_DOWN") from error
 
 
 def configuration(robot: str, listen: str) -> dict[str, Any]:
@@ -146,7 +146,7 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
             "link": {
                 "tx": {
                     "queue": {
-                        # Number of batches. With the default of 2, a put took ten times longer for a connected subscriber.
+                        # Number of batches. With the default of 2, publishing took ten times longer.
                         "size": {"real_time": 16},
                         # Longest wait for a subscriber that reads nothing, before it is disconnected [us]. The default is 5 s.
                         "congestion_control": {"block": {"wait_before_close": 100_000}},
@@ -187,8 +187,8 @@ def _open(robot: str, listen: str | None, access: Access, before: str | None) ->
             return zenoh.open(_parsed(robot, listen, access)), listen
         except zenoh.ZError as error:
             raise SinkError(
-                "TELEMETRY_DOWN",
                 f"Zenoh cannot listen on {listen}: {_reason(error)}; give another endpoint, such as tcp/127.0.0.1:7448",
+                "TELEMETRY_DOWN",
             ) from error
     refused = ""
     ports = range(DEFAULT_PORT, DEFAULT_PORT + PORTS_TRIED)
@@ -200,7 +200,7 @@ def _open(robot: str, listen: str | None, access: Access, before: str | None) ->
             refused = _reason(error)
             _log.info("%s is not free, trying the next", endpoint)
     raise SinkError(
-        "TELEMETRY_DOWN", f"Zenoh found no free port from {ports[0]} to {ports[-1]} on {DEFAULT_HOST}: {refused}"
+        f"Zenoh found no free port from {ports[0]} to {ports[-1]} on {DEFAULT_HOST}: {refused}", "TELEMETRY_DOWN"
     )
 
 

@@ -41,7 +41,7 @@ class Recorder(Closing):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("wb")
         except OSError as error:
-            raise SinkError("RECORD_STOPPED", f"the recording {path} cannot be created: {error.strerror}") from error
+            raise SinkError(f"the recording {path} cannot be created: {error.strerror}", "RECORD_STOPPED") from error
         self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._channels: dict[str, int] = {}
         try:
@@ -68,11 +68,11 @@ class Recorder(Closing):
             SinkError: If the file cannot be written. The recorder is then closed and rejects further messages.
         """
         if self._file.closed:
-            raise SinkError("RECORD_STOPPED", f"the recording {self.path} is closed")
+            raise SinkError(f"the recording {self.path} is closed", "RECORD_STOPPED")
         try:
             self._writer.add_message(self._channels[key], timestamp, payload, timestamp, cycle & 0xFFFFFFFF)
             self.messages += 1
-            if self._file.tell() != self._length:  # a longer file: the chunk with this message was written
+            if self._file.tell() != self._length:  # the file has grown, so a chunk was written
                 self._file.flush()
                 self._length, self.saved = self._file.tell(), self.messages
         except OSError as error:
@@ -112,7 +112,7 @@ class Recorder(Closing):
     def _failed(self, error: OSError) -> SinkError:
         with contextlib.suppress(OSError):  # writing the buffered data fails, too
             self._file.close()
-        return SinkError("RECORD_STOPPED", f"the recording {self.path} stopped: {error.strerror}")
+        return SinkError(f"the recording {self.path} stopped: {error.strerror}", "RECORD_STOPPED")
 
 
 def _texts(about: Mapping[str, object]) -> dict[str, str]:

@@ -40,7 +40,7 @@ _READ, _LOST, _READER_PID, _KEPT = range(16, 20)
 _HEADER_BYTES = 256
 
 _WRITER_BYTE, _READER_BYTE = 0, 1  # offsets of the bytes that writer and reader lock
-_LOCK_TRIES = 50  # retries, because `_held` of the other end locks the byte for some microseconds
+_LOCK_TRIES = 50  # number of attempts, because `_held` of the other end locks the byte for some microseconds
 
 _WAIT = 0.0002  # s, polling period
 NOTES_BYTES = 1 << 16
@@ -311,7 +311,7 @@ class RingReader(_Ring, Closing):
         return self._batch[intact - first : count, : self.record_size]
 
     def keep(self, records: int) -> None:
-        """Add to the number of saved records, see `kept`.
+        """Increase the number of saved records, see `kept`.
 
         Args:
             records: Number of records whose content was saved to disk since the last call.

@@ -23,7 +23,7 @@ from atalante_hal.telemetry.process import CYCLE_NS
 from atalante_hal.telemetry.ring import RingReader
 from atalante_hal.telemetry.sink import EVENTS, MessageSink, SinkError
 
-if TYPE_CHECKING:  # only for type checks: protobuf and python-can may not be installed
+if TYPE_CHECKING:  # only for type checks, because protobuf and python-can may not be installed
     from atalante_hal.telemetry.can_log import CanLog
     from atalante_hal.telemetry.messages import Encoder
     from atalante_hal.telemetry.recorder import Recorder
@@ -119,7 +119,7 @@ class Service:
         self._report_lost()
         return bool(len(records) or events or logged)
 
-    # -- records -----------------------------------------------------------------------------------------------------
+    # -- records --
 
     def _begin_runs(self) -> None:
         for note in self._records.notes():
@@ -179,7 +179,7 @@ class Service:
             self.report(error.code, str(error), "error")
         return True
 
-    # -- sinks -------------------------------------------------------------------------------------------------------
+    # -- sinks --
 
     def _put(self, sinks: Sequence[MessageSink], key: str, payload: bytes, timestamp: int, cycle: int) -> None:
         for sink in sinks:

@@ -13,11 +13,11 @@ class SinkError(RuntimeError):
     """Error of a sink that cannot be opened or can no longer be used.
 
     Args:
-        code: Code of the event that reports the error, e.g. RECORD_STOPPED.
         message: Cause and remedy, one sentence.
+        code: Code of the event that reports the error, e.g. RECORD_STOPPED.
     """
 
-    def __init__(self, code: str, message: str) -> None:
+    def __init__(self, message: str, code: str) -> None:
         super().__init__(message)
         self.code = code
 

@@ -23,7 +23,7 @@ Words = npt.NDArray[np.int64]
 WORD, SHIFT, MASK, LARGEST, LOW, HIGH, INVALID = range(7)
 #: Rows of the scales, as in the equation: value = (code + base) * factor + offset.
 BASE, FACTOR, OFFSET = range(3)
-#: Marker for a signal without an invalid code, and result of `encode` if all signals were encoded.
+#: Entry of the plan for a signal without an invalid code; also the result of `encode` without an error.
 NO_CODE = -1
 #: Results of `read_row`: all signals in range, a signal out of range, a signal with its invalid code.
 INSIDE, OUTSIDE, SAYS_INVALID = range(3)
@@ -33,7 +33,7 @@ _LONGEST = 51  # largest signal length that `_ROUND` supports [bits]
 
 
 class SignalTable(NamedTuple):
-    """Arrays with the coding of all signals of a codec, for the compiled functions of this module.
+    """Arrays that describe the coding of all signals of a codec, for the compiled functions of this module.
 
     The columns are in the order of the decoded values. The codec owns the arrays. Only `codes` changes: every decoding and
     encoding overwrites it.
@@ -77,7 +77,7 @@ class Codec:
         self.size = len(entries)
         self._index = {(m.name, s.name): i for i, (m, s) in enumerate(self.signals)}
         self._groups = [group_of(s.name) for _, s in self.signals]
-        #: Frame row of each decoded value, shape (size,).
+        #: Row of the frame that contains each decoded value, shape (size,).
         self.row_of = np.array([row for row, _, _ in entries], dtype=np.intp)
         self._compile([s for _, _, s in entries])
 

@@ -137,7 +137,7 @@ def protect(octets: Octets, spans: Words, counters: Words) -> None:
         octets[begin], octets[begin + 1] = crc & 0xFF, crc >> 8
 
 
-#: Value of an expected counter before the first frame was accepted.
+#: Expected counter while no frame has been accepted yet.
 NOTHING = -1
 _OK, _SOME_LOST, _REPEATED, _WRONG_SEQUENCE = map(
     int, (Check.OK, Check.SOME_LOST, Check.REPEATED, Check.WRONG_SEQUENCE)
@@ -174,13 +174,13 @@ def check_counter(last: int | None, received: int) -> Check:
 
 #: Units that a bad cycle adds to the leaky bucket of a message.
 BAD_CYCLE = 4
-#: Units that a good cycle removes. The bucket fills up if more than a fifth of the frames are lost for a long time.
+#: Units that a good cycle removes from the bucket. The bucket fills if more than a fifth of the frames are lost.
 GOOD_CYCLE = 1
 #: Level of the leaky bucket at which the message loses its trust.
 FULL = 64
 #: Number of consecutive good cycles after which a message is trusted. Inputs of a pendant are ignored before.
 REQUALIFY = 16
-#: Evidence that a cycle with frames of two senders adds. Four such cycles reach `FULL`; a pendant takeover has only two.
+#: Evidence of two senders that a cycle with frames of both adds. Four such cycles reach `FULL`.
 RIVAL_CYCLE = 16
 
 

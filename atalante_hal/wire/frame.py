@@ -41,7 +41,7 @@ def new_frames(count: int) -> Frames:
 
 def joined(parts: Sequence[Frames]) -> Frames:
     """Concatenate several arrays of frames, shape (total number of frames,)."""
-    # As bytes, because numpy needs 40 times longer to concatenate records.
+    # Concatenate bytes, because numpy takes 40 times as long to concatenate records.
     return np.frombuffer(bytearray().join([part.tobytes() for part in parts]), FRAME)
 
 

@@ -148,7 +148,7 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Any:
         (AccessError("telemetry.toml: listne is unknown"), 1),
         (TelemetryError("the recorder is gone"), 1),
         (RingError("no such ring"), 1),
-        (SinkError("RECORD_STOPPED", "the disk is full"), 1),
+        (SinkError("the disk is full", "RECORD_STOPPED"), 1),
         (Failed("it did not work"), 1),
         (FaultLatched("left_SK is in FAULT"), 4),
         (click.UsageError("no such thing"), 2),

@@ -69,7 +69,7 @@ class EncoderChecks:
         )
         self._polarity = robot.polarity.tolist()
         self._period, self._every = period, every
-        # Coefficients of (position, velocity) in twice the velocity error, for the later and the earlier sample.
+        # Twice the velocity error is a linear function of both samples. These are its coefficients.
         time = every * period
         self._of_later, self._of_earlier = np.array([[-2.0 / time, 1.0], [2.0 / time, 1.0]])
         self._earlier = np.zeros((2, len(JOINTS)))  # position [rad] and velocity [rad/s] of the last sample
@@ -98,7 +98,7 @@ class EncoderChecks:
         travel, noise = float(self._travel[joint]), float(self._noise[joint])
         confirmed = self.jumps[joint] >= JUMPS_TO_CONFIRM
         moved = abs(now - before)
-        good = not confirmed and not moved > cycles * travel + noise  # NaN, without a previous value, is accepted
+        good = not confirmed and not moved > cycles * travel + noise  # accepts NaN: there is no previous value
         if not good:
             lost = self._lost[joint] = followed(
                 self._lost.get(joint, Lost(before, 0, before)), now, cycles, travel, noise

@@ -38,7 +38,7 @@ from atalante_hal.wire.process_image import NEVER
 DRIFT_SAMPLES = 4
 #: Number of consecutive samples after which a stuck encoder is reported.
 STANDSTILL_SAMPLES = 2
-#: Largest change per sample of an encoder error that counts as IMU drift [rad]. Healthy IMUs drift less than a tenth of it.
+#: Largest change per sample of an encoder error that counts as IMU drift [rad]. Healthy IMUs drift less than a tenth of this.
 _IMU_DRIFT = 2e-5
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
@@ -74,7 +74,7 @@ class Legs:
         self._attitude_change, self._misalignment = robot.sensors.attitude_change, robot.sensors.misalignment
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
         self._constant_samples = [constant_samples[hip : hip + len(_AXIS_OF)] for hip in _HIPS]
-        #: Comparison of each joint's leg at the last change of the joint's encoder reading.
+        #: For each joint: comparison of its leg at the last change of its encoder reading.
         self._moved: list[_Comparison | None] = [None] * len(JOINTS)
         #: Joint index -> number of consecutive samples in which the leg turned but the encoder reading was constant.
         self._turned: dict[int, int] = {}

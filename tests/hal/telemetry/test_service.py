@@ -36,7 +36,7 @@ class Sink:
 
     def put(self, key: str, payload: bytes, timestamp: int, cycle: int) -> None:
         if len(self.got) == self.fails_at:
-            raise SinkError("RECORD_STOPPED", "the disk is full")
+            raise SinkError("the disk is full", "RECORD_STOPPED")
         self.got.append((key, payload, timestamp, cycle))
 
     def begin_run(self, number: int, about: Mapping[str, object]) -> None:
