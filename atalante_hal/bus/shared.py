@@ -38,7 +38,7 @@ _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
 #: Time for which a waiting end polls before it sleeps [s]. It is longer than the computing time of a cycle.
 _POLL_TIME = 500e-6
-#: Number of waits that sleep without polling, after a wait in which polling failed. This saves computing time.
+#: Number of waits without polling that follow a wait in which polling received nothing. This saves computing time.
 _WAITS_WITHOUT_POLLING = 32
 #: Longest sleep before the shared memory is read again [ms]. A new value can become visible after its wake-up.
 _SLEEP = 20

@@ -78,7 +78,7 @@ class MessageMonitor:
         self.qualification = [Qualification()] * len(messages)
         #: Evidence that each row has two senders, 0 to `FULL`.
         self._evidence = [0] * len(messages)
-        #: True for each row that was trusted before. The node of any other row may not be connected.
+        #: True for each row that was trusted at least once. Other rows may belong to nodes that are not connected.
         self._known = [False] * len(messages)
         #: True for each row with new, intact, trusted and plausible data, shape (rows,).
         self.valid: npt.NDArray[np.bool_] = np.zeros(len(messages), np.bool_)
@@ -105,7 +105,7 @@ class MessageMonitor:
         Args:
             cycle: number of the current cycle.
             memory: fault memory in which diagnostics are raised.
-            swing: index in SIDES of the swing leg while the other leg stands; None if there is no swing leg.
+            swing: index of the swing leg in SIDES; None if there is no swing leg.
         """
         image = self._image
         checks, ages = image.check.tolist(), image.age.tolist()

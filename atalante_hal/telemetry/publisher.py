@@ -146,7 +146,7 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
             "link": {
                 "tx": {
                     "queue": {
-                        # Number of batches. With the default of 2, publishing took ten times longer.
+                        # Number of message batches in the queue. With the default of 2, publishing took ten times longer.
                         "size": {"real_time": 16},
                         # Longest wait for a subscriber that reads nothing, before it is disconnected [us]. The default is 5 s.
                         "congestion_control": {"block": {"wait_before_close": 100_000}},

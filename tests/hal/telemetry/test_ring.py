@@ -83,7 +83,7 @@ class TestOrder:
 
     @pytest.mark.parametrize(("size", "slots"), [(0, 8), (8, 1)])
     def test_invalid_sizes_are_rejected(self, size: int, slots: int) -> None:
-        with pytest.raises(RingError, match="must have 2 slots or more of 1 byte or more"):
+        with pytest.raises(RingError, match="must have at least 2 slots of at least 1 byte"):
             RingWriter(size, slots)
 
 
