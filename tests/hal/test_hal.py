@@ -1,4 +1,4 @@
-"""The HAL on an embedded bus: start-up, what is sent, and every way into HOLD."""
+"""HAL on an embedded bus: start-up, sent frames, and every transition to HOLD."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def torques(rig) -> np.ndarray:
     return np.array([commands[j.split("_")[0]][f"{j.split('_')[1]}_TargetTorque"] for j in JOINTS])
 
 
-def test_start_up_walks_off_ready_active(rig):
+def test_start_up_goes_from_off_to_ready_to_active(rig):
     assert rig.cycle().supervisor is S.OFF
     rig.until(S.READY)
     assert rig.controlwords() == {Controlword.QUICK_STOP}
@@ -34,7 +34,7 @@ def test_start_up_walks_off_ready_active(rig):
     assert [c for c in rig.codes() if c in S.__members__] == ["READY", "ACTIVE"]
 
 
-def test_what_write_returns_is_what_is_on_the_wire(rig):
+def test_write_returns_the_torque_that_is_sent(rig):
     rig.until(S.ACTIVE)
     rng = np.random.default_rng(0)
     for _ in range(50):
@@ -44,14 +44,14 @@ def test_what_write_returns_is_what_is_on_the_wire(rig):
         assert (np.abs(torques(rig)) <= rig.hal.robot.torque_max).all()
 
 
-def test_torques_are_not_used_outside_active(rig):
+def test_torques_are_ignored_outside_active(rig):
     rig.until(S.READY)
     sent = rig.hal.write(Command(np.full(12, 50.0), np.ones(8)))
     assert not sent.any()
     assert rig.controlwords() == {Controlword.QUICK_STOP}
 
 
-def test_the_record_says_what_the_state_says(rig):
+def test_record_contains_the_values_of_the_state(rig):
     state = rig.until(S.ACTIVE)
     hal = rig.hal
     for name in (
@@ -72,7 +72,7 @@ def test_the_record_says_what_the_state_says(rig):
         hal.record[hal.layout["torque_command"]] - torques(rig)).max() < 0.00626  # fmt: skip
 
 
-def test_joint_side_is_motor_side_over_gear(rig):
+def test_joint_position_is_motor_position_over_gear(rig):
     state = rig.until(S.ACTIVE)
     record, layout = rig.hal.record, rig.hal.layout
     assert np.allclose(record[layout["motor_position"]] / 100.0, state.position, rtol=1e-12)
@@ -82,13 +82,13 @@ def test_joint_side_is_motor_side_over_gear(rig):
 
 
 @pytest.mark.parametrize("factor", [-0.1, 1.1, float("nan")])
-def test_an_assistance_factor_outside_its_range_is_refused(factor, network, robot, rig):
+def test_assistance_factor_out_of_range_is_rejected(factor, network, robot, rig):
     with pytest.raises(ValueError, match="between 0 and 1"):
         Hal(network, robot, rig.bus, assistance_factor=factor)
 
 
 @pytest.mark.parametrize("joint", JOINTS)
-def test_a_silent_drive_is_noticed_after_exactly_five_lost_frames(rig, joint, network):
+def test_silent_drive_leads_to_hold_after_exactly_five_lost_frames(rig, joint, network):
     message = network.message(f"{joint.upper()}_STATE")
     rig.until(S.ACTIVE)
     rig.bus.to_hal = rig.drop(message.frame_id)
@@ -98,7 +98,7 @@ def test_a_silent_drive_is_noticed_after_exactly_five_lost_frames(rig, joint, ne
     assert rig.hal.missing() == [message.sender]
 
 
-def test_four_lost_frames_are_ridden_through(rig):
+def test_four_lost_frames_are_tolerated(rig):
     rig.until(S.ACTIVE)
     rig.bus.to_hal = rig.drop(0x183)
     state = rig.run(4)
@@ -109,7 +109,7 @@ def test_four_lost_frames_are_ridden_through(rig):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_a_torque_that_is_not_finite_sends_the_hold_frame_in_the_same_cycle(rig, bad):
+def test_torque_of_nan_or_infinity_sends_hold_in_the_same_cycle(rig, bad):
     rig.until(S.ACTIVE)
     torque = np.zeros(12)
     torque[4] = bad
@@ -121,7 +121,7 @@ def test_a_torque_that_is_not_finite_sends_the_hold_frame_in_the_same_cycle(rig,
 
 
 @pytest.mark.parametrize("error", [BusDown("the interface is down"), BusFull("the queue is full")])
-def test_a_bus_that_refuses_frames_ends_in_hold_and_raises_nothing(make_rig, monkeypatch, error):
+def test_failing_bus_leads_to_hold_and_raises_nothing(make_rig, monkeypatch, error):
     rig = make_rig(patience=60.0)
     rig.until(S.ACTIVE)
     receive, waits = rig.bus.receive, []
@@ -137,7 +137,7 @@ def test_a_bus_that_refuses_frames_ends_in_hold_and_raises_nothing(make_rig, mon
     with monkeypatch.context() as patch:
         patch.setattr(rig.bus, "receive", wait)
         assert rig.run(8).supervisor is S.HOLD
-    assert 0.0 < max(waits) <= 0.1  # for the answers to a SYNC that was not sent
+    assert 0.0 < max(waits) <= 0.1  # the wait for answers is short, because the SYNC was not sent
     rig.bus.to_nodes = lambda frames: frames
     assert rig.run(50).supervisor is S.HOLD
 
@@ -149,7 +149,7 @@ def test_stop_leaves_every_drive_holding(rig):
     assert (rig.hal.state.drive_state == DriveState.QUICK_STOP_ACTIVE).all()
 
 
-def test_damaged_frames_are_counted_and_not_used(rig):
+def test_damaged_frames_are_counted_and_rejected(rig):
     rig.until(S.ACTIVE)
 
     def damage(frames):
@@ -177,7 +177,7 @@ def test_every_frame_sent_decodes_with_cantools(rig):
     assert {"SYNC_LEFT_LEG", "SYNC_RIGHT_SENSE", "COMMAND_LEFT_LEG", "HAPTICS_COMMAND", "HAL_STATUS"} <= seen
 
 
-def test_a_controller_is_told_what_the_limits_left_of_its_last_command(rig):
+def test_state_contains_the_limited_torque_of_the_last_command(rig):
     rig.until(S.ACTIVE)
     state = rig.hal.read()
     asked = state.torque_sent + 1e3
@@ -191,13 +191,13 @@ def test_a_controller_is_told_what_the_limits_left_of_its_last_command(rig):
     assert rig.hal.read().torque_sent.tobytes() == little.tobytes()
 
 
-def test_a_joint_outside_the_guide_is_told_and_nothing_else(rig):
+def test_joint_outside_the_guide_is_only_reported(rig):
     rig.until(S.ACTIVE)
     assert rig.walk(5, outside=True).supervisor is S.ACTIVE
     assert rig.seen("GUIDE_OUTSIDE") == [("GUIDE_OUTSIDE", "info")]
 
 
-def test_active_diagnostics_are_in_the_record_and_the_worst_in_the_status(rig):
+def test_record_lists_diagnostics_and_status_the_most_severe(rig):
     rig.until(S.ACTIVE)
     diagnostics = rig.hal.layout["diagnostics"]
     assert rig.hal.record[diagnostics] == 0
@@ -214,7 +214,7 @@ def test_active_diagnostics_are_in_the_record_and_the_worst_in_the_status(rig):
     assert (said["DbcHash"], said["ConfigHash"]) == (rig.hal.network.hash32, rig.hal.robot.hash32)
 
 
-def test_the_status_carries_the_hash_of_the_gait_and_the_step(make_rig):
+def test_status_contains_gait_hash_and_step(make_rig):
     rig = make_rig(gait_hash=0xCAFE)
     rig.until(S.ACTIVE)
     rig.walk(120, step=70000)
@@ -223,14 +223,14 @@ def test_the_status_carries_the_hash_of_the_gait_and_the_step(make_rig):
     assert (said["GaitHash"], said["Step"]) == (0xCAFE, 70000 & 0xFFFF)
 
 
-def test_an_exception_sends_the_prepared_hold_frame_under_the_next_counter(rig):
+def test_exception_sends_the_prepared_hold_frame(rig):
     rig.until(S.ACTIVE)
     rig.cycle(np.full(12, 10.0))
     before = next(f for f in reversed(rig.sent) if f["can_id"][0] == 0x100)["data"][0, 2]
     rig.hal.read()
     with pytest.raises(ValueError, match="broadcast") as mistake:
         rig.hal.write(Command(np.full(3, 10.0), np.zeros(8)))
-    rig.hal._commands.torque.fill(np.nan)  # whatever else was written before it raised
+    rig.hal._commands.torque.fill(np.nan)  # an exception may leave any values in the transmit buffer
     sent = rig.hal.fail(mistake.value)
     assert not sent.any()
     frames = next(f for f in reversed(rig.sent) if f["can_id"][0] == 0x100)
@@ -239,7 +239,7 @@ def test_an_exception_sends_the_prepared_hold_frame_under_the_next_counter(rig):
     assert not torques(rig).any()
 
 
-def test_the_cycle_after_an_exception_is_whole(rig):
+def test_cycle_after_an_exception_is_complete(rig):
     rig.until(S.ACTIVE)
     rig.hal.read()
     rig.hal.fail(ValueError("a mistake"))
@@ -250,7 +250,7 @@ def test_the_cycle_after_an_exception_is_whole(rig):
     assert not [e for e in rig.hal.events if e.code.startswith("E2E")]
 
 
-def test_a_gap_drops_what_piled_up_and_holds(rig):
+def test_long_cycle_gap_leads_to_hold(rig):
     rig.until(S.ACTIVE)
     rig.hal.report(Dtc.CYCLE_GAP, "no cycle began for 2000 ms", value=2.0)
     assert rig.cycle().supervisor is S.HOLD
@@ -258,15 +258,15 @@ def test_a_gap_drops_what_piled_up_and_holds(rig):
     assert (event.cycle, event.value, event.severity) == (rig.hal.state.cycle, 2.0, "error")
 
 
-def test_a_short_gap_is_noted(rig):
+def test_short_cycle_gap_is_reported_as_warning(rig):
     rig.until(S.ACTIVE)
     rig.hal.report(Dtc.CYCLE_GAP, "no cycle began for 4 ms", confirmed=False, value=0.004)
     assert rig.cycle().supervisor is S.ACTIVE
     assert rig.seen("CYCLE_GAP") == [("CYCLE_GAP", "warning")]
 
 
-def test_stopping_on_a_dead_bus_takes_a_bounded_time(network, robot, monkeypatch):
-    """A clock that the bus moves on: nobody ever answers, and every wait is waited to its end."""
+def test_stop_on_a_dead_bus_takes_a_bounded_time(network, robot, monkeypatch):
+    """No node answers, and simulated time passes only while the HAL waits."""
     import atalante_hal.hal as module
     import atalante_hal.transceiver as transceiver
 
@@ -287,19 +287,19 @@ def test_stopping_on_a_dead_bus_takes_a_bounded_time(network, robot, monkeypatch
     for one in (module, transceiver):
         monkeypatch.setattr(one.time, "monotonic", lambda: bus.now)
     hal = Hal(network, robot, bus, patience=2.0)
-    hal._image.age.fill(0)  # everybody was there a moment ago
+    hal._image.age.fill(0)  # all nodes were alive before
     hal.stop()
     assert bus.now <= module.STOP_PATIENCE + 0.01
     assert hal.patience == 2.0
 
 
-def test_listening_before_the_start_sends_nothing(rig):
+def test_listen_sends_nothing(rig):
     rig.bus.to_hal = lambda frames: frames[:0]
     rig.hal.listen()
     assert rig.sent == []
 
 
-def test_the_bus_and_the_tap_can_be_changed(rig):
+def test_bus_and_tap_can_be_replaced(rig):
     assert rig.hal.bus is rig.bus
     tap = rig.hal.tap
     rig.hal.tap = None
@@ -313,7 +313,7 @@ def test_the_bus_and_the_tap_can_be_changed(rig):
     assert not rig.hal.silent
 
 
-def test_reading_without_writing_goes_on_with_the_next_sync(rig):
+def test_read_without_write_sends_the_next_sync(rig):
     for _ in range(3):
         rig.hal.read()
     syncs = [int(f["data"][0, 2]) for f in rig.sent if f["can_id"][0] == 0x10]

@@ -1,4 +1,4 @@
-"""The HAL's end of the bus: the transmit table, the receive budget, and a bus that fails in every way."""
+"""Transceiver: transmit table, receive budget, and failures of the bus."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ CYCLIC = [NETWORK.message(name) for name in ("LEFT_SK_STATE", "RIGHT_SK_STATE")]
 
 
 class Clock:
-    """Time goes by while a bus is waited for, and at no other time; who looks at the clock for ever is lost."""
+    """Simulated clock: time passes only while the bus waits; an endless loop fails."""
 
     def __init__(self) -> None:
         self.now, self.looks = 64.0, 0
 
     def monotonic(self) -> float:
         self.looks += 1
-        assert self.looks < 200, "waits for ever"
+        assert self.looks < 200, "endless wait"
         return self.now
 
 
 class Bus:
-    """A bus of lists: what is sent, and what each `receive` delivers."""
+    """Bus of lists: the sent frames, and the frames that each `receive` delivers."""
 
     name, dropped, stamps = "bench", 0, np.zeros(256, np.int64)
 
@@ -99,7 +99,7 @@ def desk(monkeypatch: pytest.MonkeyPatch) -> Desk:
     return made
 
 
-def test_at_rest_nothing_is_wrong(desk: Desk):
+def test_new_transceiver_has_no_diagnostics(desk: Desk):
     assert desk.transceiver.quiet is True
     assert desk.judge() == {}
     assert desk.transceiver.quiet is True
@@ -111,10 +111,10 @@ def ids(*numbers: int) -> Frames:
     return frames
 
 
-# -- what leaves -------------------------------------------------------------------------------------------------------
+# -- sending -----------------------------------------------------------------------------------------------------------
 
 
-def test_every_message_of_the_node_may_be_sent_and_no_other_of_the_network(desk: Desk):
+def test_only_messages_of_the_node_may_be_sent(desk: Desk):
     for message in NETWORK.messages:
         frames = TransmitImage([message]).frames
         if message in OURS:
@@ -130,7 +130,7 @@ def test_every_message_of_the_node_may_be_sent_and_no_other_of_the_network(desk:
 @pytest.mark.parametrize(
     ("field", "value"), [("can_id", 0x10 | ID_EXTENDED), ("len", 12), ("flags", FLAG_FDF), ("res", 1)]
 )
-def test_a_frame_in_another_format_is_none_of_the_table(desk: Desk, field: str, value: int):
+def test_frame_in_another_format_is_denied(desk: Desk, field: str, value: int):
     frames = TransmitImage([NETWORK.message("SYNC_LEFT_LEG")]).frames
     frames[field] = value
     with pytest.raises(TransmitDenied):
@@ -138,7 +138,7 @@ def test_a_frame_in_another_format_is_none_of_the_table(desk: Desk, field: str, 
 
 
 @pytest.mark.parametrize(("field", "value"), [("can_id", 0x181), ("can_id", 0x11), ("len", 12), ("flags", 0)])
-def test_a_header_changed_after_it_was_granted_does_not_leave(desk: Desk, field: str, value: int):
+def test_header_changed_after_the_grant_is_denied(desk: Desk, field: str, value: int):
     batch = desk.transceiver.grant(TransmitImage(OURS).frames)
     batch.frames[field][0] = value
     with pytest.raises(TransmitDenied, match="must keep the identifier, length and format"):
@@ -150,7 +150,7 @@ def sync(desk: Desk):
     return desk.transceiver.grant(TransmitImage([NETWORK.message("SYNC_LEFT_LEG")]).frames)
 
 
-def test_a_full_queue_is_confirmed_after_five_cycles_in_a_row(desk: Desk):
+def test_full_queue_is_confirmed_after_five_cycles_in_a_row(desk: Desk):
     batch = sync(desk)
     desk.bus.refuses = BusFull("no room", 3)
     for cycle in range(1, 8):
@@ -170,7 +170,7 @@ def test_a_full_queue_is_confirmed_after_five_cycles_in_a_row(desk: Desk):
     assert desk.judge() == {"BUS_TX_FULL": False}
 
 
-def test_a_bus_that_is_gone_is_confirmed_at_once(desk: Desk):
+def test_bus_down_while_sending_is_confirmed_immediately(desk: Desk):
     desk.bus.refuses = BusDown("gone")
     desk.transceiver.send(sync(desk))
     assert desk.judge() == {"BUS_DOWN": True}
@@ -180,10 +180,10 @@ def test_a_bus_that_is_gone_is_confirmed_at_once(desk: Desk):
     assert desk.judge() == {}
 
 
-# -- what comes --------------------------------------------------------------------------------------------------------
+# -- receiving ---------------------------------------------------------------------------------------------------------
 
 
-def test_what_is_there_is_appended(desk: Desk):
+def test_received_frames_are_appended(desk: Desk):
     desk.bus.arrivals = [ids(1, 2), ids(3)]
     assert desk.transceiver.receive() == 2
     assert desk.transceiver.receive(2) == 3
@@ -198,13 +198,13 @@ def image(*heard: int) -> ReceiveImage:
     return made
 
 
-def test_a_whole_cycle_is_not_waited_for(desk: Desk):
+def test_complete_cycle_is_returned_without_waiting(desk: Desk):
     desk.bus.arrivals = [TransmitImage(CYCLIC).frames]
     assert desk.transceiver.receive(0, image(0, 1), 1.0) == 2
     assert desk.bus.timeouts == [0.0]
 
 
-def test_who_is_alive_is_waited_for(desk: Desk):
+def test_receive_waits_for_nodes_that_are_alive(desk: Desk):
     first, second = (m.frame_id for m in CYCLIC)
     desk.bus.arrivals = [ids(first), ids(7), ids(second), ids(8)]
     assert desk.transceiver.receive(0, image(0, 1), 60.0) == 3
@@ -212,7 +212,7 @@ def test_who_is_alive_is_waited_for(desk: Desk):
     assert desk.bus.timeouts == [0.0, 60.0, 60.0]
 
 
-def test_a_wait_ends_when_patience_does(desk: Desk):
+def test_wait_ends_after_the_timeout(desk: Desk):
     first = CYCLIC[0].frame_id
     desk.bus.arrivals = [ids(first)]
     assert desk.transceiver.receive(0, image(0, 1), 60.0) == 1
@@ -222,27 +222,27 @@ def test_a_wait_ends_when_patience_does(desk: Desk):
     assert desk.bus.timeouts == [0.0, 60.0, 0.0]
 
 
-def test_frames_of_the_last_cycle_do_not_count_as_this_ones(desk: Desk):
+def test_frames_of_the_last_cycle_do_not_complete_this_cycle(desk: Desk):
     first, second = (m.frame_id for m in CYCLIC)
     desk.transceiver.scratch["can_id"][:2] = first, second
     desk.bus.arrivals = [ids(), ids(first), ids(second)]
     assert desk.transceiver.receive(2, image(0, 1), 60.0) == 4
 
 
-def test_who_is_silent_is_not_waited_for(desk: Desk):
+def test_receive_does_not_wait_for_silent_nodes(desk: Desk):
     desk.bus.arrivals = [ids(CYCLIC[0].frame_id), ids(9)]
     assert desk.transceiver.receive(0, image(0), 60.0) == 1
     assert len(desk.bus.timeouts) == 1
 
 
-def test_while_nobody_is_known_whoever_answers_is_taken_until_nobody_does(desk: Desk):
+def test_without_known_nodes_receive_waits_until_no_frame_arrives(desk: Desk):
     desk.bus.arrivals = [ids(1), ids(2), ids(3)]
     assert desk.transceiver.receive(0, image(), 60.0) == 3
     assert desk.bus.timeouts == pytest.approx([0.0, 0.1, 0.1, 0.1])
 
 
 @pytest.mark.parametrize("refusal", [BusDown("gone"), BusFull("no room", 0)])
-def test_who_may_not_have_been_asked_is_not_waited_for_long(desk: Desk, refusal: BusError):
+def test_wait_is_short_after_a_failed_sync(desk: Desk, refusal: BusError):
     desk.bus.refuses = refusal
     desk.transceiver.send(sync(desk))
     for patience, waited in ((60.0, 0.1), (0.03, 0.03)):
@@ -256,19 +256,19 @@ def test_who_may_not_have_been_asked_is_not_waited_for_long(desk: Desk, refusal:
     assert desk.bus.timeouts == [0.0, 60.0]
 
 
-def test_without_patience_nothing_is_waited_for(desk: Desk):
+def test_receive_does_not_wait_without_patience(desk: Desk):
     desk.bus.arrivals = [ids(1), ids(2)]
     assert desk.transceiver.receive(0, image(0, 1), 0.0) == 1
     assert desk.bus.timeouts == [0.0]
 
 
-def test_a_cycle_takes_no_more_than_its_budget(desk: Desk):
+def test_receive_is_limited_to_its_budget(desk: Desk):
     desk.bus.arrivals = [ids(*range(100)), ids(*range(100)), ids(1)]
     assert desk.transceiver.receive(0, image(), 60.0) == RECEIVE_BUDGET
     assert len(desk.bus.arrivals) == 1
 
 
-def test_a_flood_is_confirmed_after_five_cycles_in_a_row(desk: Desk):
+def test_flood_is_confirmed_after_five_cycles_in_a_row(desk: Desk):
     usual = len(CYCLIC) + SURPLUS
     for cycle in range(1, 8):
         desk.bus.arrivals = [ids(*range(usual + 1))]
@@ -286,7 +286,7 @@ def test_a_flood_is_confirmed_after_five_cycles_in_a_row(desk: Desk):
     assert desk.judge() == {"BUS_FLOOD": False}
 
 
-def test_a_bus_that_fails_while_receiving_raises_nothing(desk: Desk):
+def test_bus_down_while_receiving_is_reported_and_not_raised(desk: Desk):
     desk.bus.arrivals = [BusDown("gone")]
     assert desk.transceiver.receive(1) == 1
     assert desk.judge() == {"BUS_DOWN": True}
@@ -309,7 +309,7 @@ def test_a_bus_that_fails_while_receiving_raises_nothing(desk: Desk):
         (ID_ERROR | 0x04, None, 0),
     ],
 )
-def test_frames_that_are_no_message_to_this_node(desk: Desk, can_id: int, code: str | None, value: int):
+def test_foreign_frames_raise_their_diagnostic(desk: Desk, can_id: int, code: str | None, value: int):
     desk.transceiver.foreign(ids(can_id))
     assert desk.transceiver.quiet is (code is None)
     assert desk.judge() == ({code: True} if code else {})
@@ -319,7 +319,7 @@ def test_frames_that_are_no_message_to_this_node(desk: Desk, can_id: int, code: 
     assert desk.transceiver.quiet
 
 
-def test_bus_off_stands_until_somebody_acknowledges_it(desk: Desk):
+def test_bus_off_lasts_until_it_is_acknowledged(desk: Desk):
     desk.transceiver.foreign(ids(ID_ERROR | 0x40))
     for _ in range(3):
         assert desk.judge() == {"BUS_OFF": True}
@@ -329,7 +329,7 @@ def test_bus_off_stands_until_somebody_acknowledges_it(desk: Desk):
     assert desk.transceiver.quiet
 
 
-def test_each_of_several_strange_frames_counts(desk: Desk):
+def test_several_foreign_frames_raise_all_diagnostics(desk: Desk):
     desk.transceiver.foreign(ids(0x7FF, ID_ERROR | 0x40, 0x100))
     assert desk.judge() == {"FRAME_UNKNOWN": True, "BUS_OFF": True, "HAL_DUPLICATE": True}
     assert {e.text for e in desk.memory.events} == {
@@ -339,17 +339,17 @@ def test_each_of_several_strange_frames_counts(desk: Desk):
     }
 
 
-# -- before the start, and after a pause -------------------------------------------------------------------------------
+# -- listening before the start, and discarding after a pause ----------------------------------------------------------
 
 
-def test_a_hal_that_is_there_is_heard_before_anything_is_sent(desk: Desk):
+def test_listen_detects_another_hal_before_sending(desk: Desk):
     desk.bus.arrivals = [ids(0x181, 0x191), ids(0x700, 0x10)]
     with pytest.raises(HalDuplicate, match=r"another HAL is active on bench \(received id 0x10\): stop it first"):
         desk.transceiver.listen(60.0)
     assert desk.bus.sent == []
 
 
-def test_nodes_that_speak_are_no_hal(desk: Desk):
+def test_listen_accepts_frames_of_nodes(desk: Desk):
     desk.bus.arrivals = [ids(0x181), ids(0x7FF)]
     desk.transceiver.listen(0.25)
     assert desk.bus.arrivals == []
@@ -357,33 +357,33 @@ def test_nodes_that_speak_are_no_hal(desk: Desk):
     assert desk.judge() == {}
 
 
-def test_what_is_left_of_an_older_frame_in_the_buffer_is_not_heard(desk: Desk):
+def test_listen_ignores_old_frames_in_the_buffer(desk: Desk):
     desk.transceiver.scratch["can_id"].fill(0x10)
     desk.bus.arrivals = [ids(0x181)]
     desk.transceiver.listen()
     assert desk.bus.timeouts == pytest.approx([0.2, 0.2])
 
 
-def test_a_bus_that_is_gone_ends_the_listening(desk: Desk):
+def test_bus_down_ends_listen(desk: Desk):
     desk.bus.arrivals = [BusDown("gone")]
     with pytest.raises(BusDown):
         desk.transceiver.listen(60.0)
 
 
-def test_what_piled_up_is_dropped(desk: Desk):
+def test_discard_drops_all_queued_frames(desk: Desk):
     desk.bus.arrivals = [ids(*range(RECEIVE_BUDGET)), ids(*range(RECEIVE_BUDGET)), ids(1), ids(2)]
     desk.transceiver.discard()
     assert len(desk.bus.arrivals) == 1
     assert desk.judge() == {}
 
 
-def test_dropping_ends_however_fast_frames_come(desk: Desk):
+def test_discard_is_bounded_under_a_flood(desk: Desk):
     desk.bus.arrivals = [ids(*range(RECEIVE_BUDGET))] * (RECEIVE_BUDGET + 5)
     desk.transceiver.discard()
     assert len(desk.bus.arrivals) == 5
 
 
-def test_dropping_from_a_bus_that_is_gone_raises_nothing(desk: Desk):
+def test_bus_down_during_discard_is_reported_and_not_raised(desk: Desk):
     desk.bus.arrivals = [BusDown("gone")]
     desk.transceiver.discard()
     assert desk.judge() == {"BUS_DOWN": True}
@@ -391,7 +391,7 @@ def test_dropping_from_a_bus_that_is_gone_raises_nothing(desk: Desk):
     assert (event.text, event.value) == ("the bus bench cannot receive: gone", 0.0)
 
 
-def test_a_tap_is_not_needed(desk: Desk):
+def test_transceiver_works_without_a_tap(desk: Desk):
     desk.transceiver.tap = None
     desk.bus.arrivals = [ids(1)]
     desk.transceiver.send(sync(desk))

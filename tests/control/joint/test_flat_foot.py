@@ -1,4 +1,4 @@
-"""Flat foot against rotation matrices written out here: the sole's normal must come out vertical."""
+"""Flat foot, compared with rotation matrices: the normal of the sole must be vertical."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def sole_normal(foot: FlatFoot, shank: np.ndarray, sagittal: float, henke: float
 
 @pytest.mark.parametrize("foot", [LEFT, RIGHT], ids=["left", "right"])
 @given(heading=HEADING, roll=ANGLES, pitch=ANGLES)
-def test_the_sole_is_level(foot: FlatFoot, heading: float, roll: float, pitch: float):
+def test_sole_is_level_for_any_tibia_attitude(foot: FlatFoot, heading: float, roll: float, pitch: float):
     r = tibia(heading, roll, pitch)
     assume(np.trace(r) > -0.9)
     angles = level(foot.geometry, quaternion(r), STILL)[0]
@@ -62,13 +62,13 @@ def test_the_sole_is_level(foot: FlatFoot, heading: float, roll: float, pitch: f
 
 
 @given(HEADING, ANGLES)
-def test_heading_does_not_matter(heading: float, pitch: float):
+def test_ankle_angles_do_not_depend_on_heading(heading: float, pitch: float):
     assume(abs(heading) < 3.0)
     turned, ahead = (level(LEFT.geometry, quaternion(tibia(h, 0.1, pitch)), STILL)[0] for h in (heading, 0.0))
     np.testing.assert_allclose(turned, ahead, atol=1e-9)
 
 
-def test_an_upright_tibia_needs_nothing_and_a_pitched_one_its_pitch():
+def test_ankle_compensates_the_pitch_of_the_tibia():
     np.testing.assert_allclose(level(LEFT.geometry, (1.0, 0.0, 0.0, 0.0), STILL)[0], (0.0, 0.0), atol=1e-15)
     straight = FlatFoot(0.0, (0.788, 0.0, 0.616))
     np.testing.assert_allclose(
@@ -82,14 +82,16 @@ def test_left_and_right_are_mirror_images():
     np.testing.assert_allclose(right, (left[0], -left[1]), atol=1e-12)
 
 
-def test_a_tibia_leaning_too_far_gets_the_nearest_angle():
+def test_ankle_angle_is_limited_for_a_strongly_tilted_tibia():
     angles = level(LEFT.geometry, quaternion(tibia(0.0, 1.3, 0.0)), (1.0, 2.0, 3.0))[0]
     assert all(math.isfinite(a) for a in angles)
     assert abs(angles[1]) == pytest.approx(math.pi / 2)
 
 
 @given(HEADING, ANGLES, ANGLES, *[st.floats(-3.0, 3.0)] * 3)
-def test_rates_are_those_of_the_angles(heading: float, roll: float, pitch: float, p: float, q: float, r: float):
+def test_rates_are_the_derivatives_of_the_angles(
+    heading: float, roll: float, pitch: float, p: float, q: float, r: float
+):
     assume(abs(heading) < 3.0)
     gyro, shank, step = (p, q, r), tibia(heading, 0.5 * roll, 0.5 * pitch), 1e-6
     later, before = (shank @ rotation_vector(np.array(gyro) * s) for s in (step, -step))
@@ -100,7 +102,7 @@ def test_rates_are_those_of_the_angles(heading: float, roll: float, pitch: float
         )
 
 
-def test_refuses_an_axis_it_has_no_solution_for():
+def test_unsupported_henke_axis_is_rejected():
     for axis in ((0.7, 0.1, 0.7), (0.0, 0.0, 1.0)):
         with pytest.raises(ValueError, match="henke axis"):
             FlatFoot(0.0, axis)
@@ -113,7 +115,7 @@ def test_refuses_an_axis_it_has_no_solution_for():
     roll=ANGLES,
     pitch=ANGLES,
 )
-def test_the_joints_say_what_the_tibias_imu_would(
+def test_tibia_attitude_from_joints_matches_its_imu(
     side: int, foot: FlatFoot, position: np.ndarray, velocity: np.ndarray, roll: float, pitch: float
 ):
     pelvis, turning = tibia(0.3, roll, pitch), np.array([0.1, -0.2, 0.3])
@@ -132,7 +134,7 @@ def test_the_joints_say_what_the_tibias_imu_would(
     np.testing.assert_allclose(rotation_vector(np.array(gyro) * dt), r.T @ later, atol=1e-9)
 
 
-# -- in the place of the nominal -------------------------------------------------------------------------------------
+# -- targets instead of the nominal ones -------------------------------------------------------------------------------------
 
 
 def feet() -> LevelFeet:
@@ -146,7 +148,7 @@ def put(f: LevelFeet, side: int, cycle: int, r: np.ndarray, gyro: tuple[float, f
 
 
 @pytest.mark.parametrize(("side", "foot"), [(0, LEFT), (1, RIGHT)])
-def test_the_targets_of_the_swing_ankle_replace_the_nominal_ones(side: int, foot: FlatFoot):
+def test_level_targets_replace_only_those_of_the_swing_ankle(side: int, foot: FlatFoot):
     r, gyro, sa = tibia(0.4, 0.02, 0.1), (0.1, -0.2, 0.3), 6 * side + 4
     row = put(feet(), side, 500, r, gyro)
     angles, rates = level(foot.geometry, quaternion(r), gyro)
@@ -157,7 +159,7 @@ def test_the_targets_of_the_swing_ankle_replace_the_nominal_ones(side: int, foot
 
 
 @pytest.mark.parametrize("pitch", [-1.2, 1.2])
-def test_the_ankle_stays_off_its_limits_and_does_not_rush_into_them(pitch: float):
+def test_ankle_target_slows_down_and_stops_before_its_limit(pitch: float):
     row = put(feet(), 0, 500, tibia(0.0, 0.0, pitch), (0.0, 1.0, 0.0))
     margin = math.radians(1.0)
     limit = ROBOT.position_max[4] - margin if pitch < 0.0 else ROBOT.position_min[4] + margin
@@ -169,7 +171,7 @@ def test_the_ankle_stays_off_its_limits_and_does_not_rush_into_them(pitch: float
     assert row[16] == pytest.approx(0.5 * rate, rel=0.1)
 
 
-def test_a_step_begins_where_the_ankle_is_and_meets_the_target_when_the_deadbeat_ends():
+def test_ankle_target_moves_from_measured_to_level_during_re_centring():
     f, r = feet(), tibia(0.0, 0.02, 0.1)
     attitudes = np.tile(quaternion(r), (4, 1))
     state = State(

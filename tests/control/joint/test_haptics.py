@@ -1,4 +1,4 @@
-"""Haptics: the paper's law, the side of the error, silence at full assistance."""
+"""Haptics: amplitude of the paper, side of the error, and zero amplitude at full assistance."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ERRORS = st.floats(-2 * BOUND, 2 * BOUND)
 
 
 @given(st.integers(0, 1), ERRORS, ERRORS, st.floats(0.0, 1.0))
-def test_the_law_of_the_paper_on_the_side_of_the_error(leg: int, hip: float, knee: float, xi: float):
+def test_amplitude_follows_the_paper_on_the_side_of_the_error(leg: int, hip: float, knee: float, xi: float):
     out = levels(leg, (hip, knee), (BOUND, BOUND), intensity(xi), np.full(8, 9.0))
     side = ("left", "right")[leg]
     expected = dict.fromkeys(MOTORS, 0.0)
@@ -29,18 +29,18 @@ def test_the_law_of_the_paper_on_the_side_of_the_error(leg: int, hip: float, kne
     assert (out <= 1.0).all()
 
 
-def test_silent_at_full_assistance():
+def test_amplitude_is_zero_at_full_assistance():
     assert intensity(1.0) == 0.0
     assert not levels(0, (BOUND, -BOUND), (BOUND, BOUND), intensity(1.0), np.ones(8)).any()
 
 
-def test_stronger_towards_the_guide_and_with_less_assistance():
+def test_amplitude_grows_with_error_and_with_less_assistance():
     strength = [levels(0, (e, 0.0), (BOUND, BOUND), intensity(0.5), np.empty(8)).max() for e in (0.01, 0.02, 0.03)]
     assert strength == sorted(strength)
     assert intensity(0.0) > intensity(0.9) > intensity(0.99) > 0.0
 
 
-def test_asymmetric_guides_count_from_their_own_side():
+def test_asymmetric_guide_uses_the_bound_of_each_side():
     wide = levels(1, (0.02, 0.0), (0.04, 0.04), 1.0, np.empty(8)).max()
     narrow = levels(1, (-0.02, 0.0), (0.02, 0.04), 1.0, np.empty(8)).max()
     assert wide == pytest.approx(0.5)

@@ -1,4 +1,4 @@
-"""Idealization: friction and the coupled pair, against Pinocchio asked another way."""
+"""Idealization: friction and inertia of the coupled pair, compared with Pinocchio."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HIP, KNEE = JOINTS.index("left_SH"), JOINTS.index("left_SK")
 
 
 @given(st.integers(0, 5), st.floats(-10.0, 10.0))
-def test_friction_is_odd_smooth_and_tends_to_the_paper(joint: int, velocity: float):
+def test_friction_is_odd_and_approaches_the_formula_of_the_paper(joint: int, velocity: float):
     friction = Friction()
     torque = friction.torque(joint, velocity)
     assert torque == pytest.approx(-friction.torque(joint, -velocity), abs=1e-12)
@@ -33,14 +33,14 @@ def test_friction_is_odd_smooth_and_tends_to_the_paper(joint: int, velocity: flo
         assert torque == pytest.approx(paper, rel=1e-3, abs=1e-3)
 
 
-def test_friction_at_rest_is_nothing_and_has_no_step():
+def test_friction_at_rest_is_zero_and_continuous():
     friction = Friction()
     assert friction.torque(2, 0.0) == 0.0
     assert abs(friction.torque(2, 1e-6) - friction.torque(2, -1e-6)) < 1e-3
 
 
 @pytest.mark.parametrize("bad", [{"coulomb": (1.0,)}, {"viscous": (-1.0,) * 6}, {"smoothing": 0.0}])
-def test_friction_refuses_what_is_none(bad: dict[str, object]):
+def test_invalid_friction_is_rejected(bad: dict[str, object]):
     with pytest.raises(ValueError, match=r"finite|positive"):
         Friction(**bad)  # type: ignore[arg-type]
 
@@ -52,7 +52,7 @@ def mass_matrix(q: np.ndarray) -> np.ndarray:
     return (upper + np.triu(upper, 1).T)[np.ix_(MODEL.v, MODEL.v)]
 
 
-def test_assisted_inertia_is_the_block_of_the_mass_matrix_along_the_step():
+def test_assisted_inertia_matches_the_mass_matrix_along_the_step():
     inertia = AssistedInertia(MODEL, SWING)
     for pose in SWING[::50]:
         m = mass_matrix(pose)
@@ -69,7 +69,7 @@ def test_torques_give_the_accelerations_of_separate_inertias():
         v[[HIP, KNEE]] = rng.normal(size=2) * 2.0
         u = rng.normal(size=2) * 50.0
         tau = inertia.torques(float(pose[KNEE]), float(v[HIP]), float(v[KNEE]), (float(u[0]), float(u[1])))
-        # The other joints held still: inverse dynamics with only these two accelerating must ask for tau.
+        # With the other joints at rest, inverse dynamics must give tau for the accelerations of these two.
         a = np.zeros(12)
         a[[HIP, KNEE]] = u / np.array(inertia.inertias)
         pin_q, pin_v, pin_a = np.empty(12), np.empty(12), np.empty(12)
@@ -81,7 +81,7 @@ def test_torques_give_the_accelerations_of_separate_inertias():
 
 
 @given(st.floats(0.0, 1.9), *[st.floats(-3.0, 3.0)] * 2, *[st.floats(-100.0, 100.0)] * 2)
-def test_ideal_is_the_inverse_of_torques(knee: float, hip_rate: float, knee_rate: float, u1: float, u2: float):
+def test_ideal_is_the_inverse_function_of_torques(knee: float, hip_rate: float, knee_rate: float, u1: float, u2: float):
     inertia = AssistedInertia(MODEL, SWING)
     tau = inertia.torques(knee, hip_rate, knee_rate, (u1, u2))
     np.testing.assert_allclose(inertia.ideal(knee, hip_rate, knee_rate, tau), (u1, u2), atol=1e-8)
@@ -89,7 +89,7 @@ def test_ideal_is_the_inverse_of_torques(knee: float, hip_rate: float, knee_rate
 
 @pytest.mark.parametrize("leg", [0, 6])
 @pytest.mark.parametrize("decoupled", [False, True])
-def test_the_merge_is_a_mean_of_baseline_and_assistance(leg: int, decoupled: bool):
+def test_merge_is_the_weighted_mean_of_baseline_and_assistance(leg: int, decoupled: bool):
     friction, inertia, rng = Friction(), AssistedInertia(MODEL, SWING), np.random.default_rng(11)
     law, u = law_of(friction, inertia, decoupled), (30.0, -20.0)
     baseline, gravity, q, qd = rng.normal(size=(4, 12))

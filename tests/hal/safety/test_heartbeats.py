@@ -1,4 +1,4 @@
-"""Status and emergencies of the nodes."""
+"""Heartbeats: status, emergencies and supply voltage of the nodes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NODES = [n.name for n in NETWORK.nodes if n.kind not in ("master", "pendant")]
 
 
 class Nodes:
-    """What the nodes send, and a HAL that hears it."""
+    """Simulated nodes, and the heartbeat monitor that receives their frames."""
 
     def __init__(self) -> None:
         self.tx = TransmitImage(SLOW)
@@ -64,7 +64,7 @@ def well(nodes: Nodes) -> Nodes:
     return nodes
 
 
-def test_the_nodes_are_known_when_each_but_the_pendant_has_spoken(nodes: Nodes):
+def test_nodes_are_known_after_a_status_of_each_except_the_pendant(nodes: Nodes):
     *first, last = NODES
     for node in first:
         nodes.hear(nodes.frame(node))
@@ -79,7 +79,7 @@ def test_the_nodes_are_known_when_each_but_the_pendant_has_spoken(nodes: Nodes):
     assert nodes.heartbeats.quiet
 
 
-def test_a_boot_up_is_a_reset_of_a_node_that_was_there(nodes: Nodes):
+def test_second_boot_up_is_reported_as_reset(nodes: Nodes):
     nodes.hear(nodes.frame("LEFT_SK", NodeState=0))
     assert nodes.judge() == {}
     assert nodes.heartbeats.quiet
@@ -90,25 +90,25 @@ def test_a_boot_up_is_a_reset_of_a_node_that_was_there(nodes: Nodes):
     assert nodes.judge() == {}
 
 
-def test_a_node_that_began_anew_is_believed_whatever_its_counter_says(well: Nodes):
+def test_boot_up_with_any_counter_is_reported_as_reset(well: Nodes):
     well.tx.resume(well.tx.codec.rows["LEFT_SK_STATUS"], 100)
     well.hear(well.frame("LEFT_SK", NodeState=0))
     assert well.judge() == {("NODE_RESET", "LEFT_SK"): True}
 
 
-def test_another_dbc(nodes: Nodes):
+def test_other_dbc_hash_is_reported_until_it_changes(nodes: Nodes):
     nodes.hear(nodes.frame("IMU_TORSO", DbcHash=NETWORK.hash32 ^ 1))
     assert nodes.heartbeats.quiet is False
     assert nodes.judge() == {("DBC_MISMATCH", "IMU_TORSO"): True}
     assert nodes.heartbeats.missing() == set(NODES)
     assert nodes.memory.events[0].value == NETWORK.hash32 ^ 1
     nodes.now += 1
-    assert nodes.judge() == {("DBC_MISMATCH", "IMU_TORSO"): True}  # as long as it says nothing else
+    assert nodes.judge() == {("DBC_MISMATCH", "IMU_TORSO"): True}  # until the node sends another status
     assert nodes.heartbeats.quiet is False
 
 
 @pytest.mark.parametrize("node", ["LEFT_SK", "HAPTICS", "PENDANT"])
-def test_a_heartbeat_is_lost_after_its_timeout(well: Nodes, node: str):
+def test_heartbeat_is_lost_exactly_at_its_timeout(well: Nodes, node: str):
     others = [n for n in [*NODES, "PENDANT"] if n != node]
     well.hear(*[well.frame(n) for n in others], cycle=150)
     well.now = 1 + 249
@@ -125,14 +125,14 @@ def test_a_heartbeat_is_lost_after_its_timeout(well: Nodes, node: str):
     assert well.heartbeats.quiet
 
 
-def test_before_the_first_frame_nobody_is_known_and_nothing_is_wrong(nodes: Nodes):
+def test_no_node_is_known_before_the_first_frame(nodes: Nodes):
     assert nodes.heartbeats.known is False
     assert nodes.heartbeats.quiet is True
     assert nodes.heartbeats.missing() == set(NODES)
 
 
 @pytest.mark.parametrize("cycle", [0, 1, 10_000])
-def test_who_was_never_heard_is_not_overdue(nodes: Nodes, cycle: int):
+def test_node_without_any_frame_is_not_overdue(nodes: Nodes, cycle: int):
     assert not nodes.heartbeats.overdue(cycle)
     assert nodes.judge() == {}
 
@@ -148,7 +148,7 @@ def test_who_was_never_heard_is_not_overdue(nodes: Nodes, cycle: int):
         (0.0, "UNDER_VOLTAGE"),
     ],
 )
-def test_the_supply_of_a_drive(well: Nodes, volts: float, code: str | None):
+def test_low_supply_of_a_drive_is_reported(well: Nodes, volts: float, code: str | None):
     well.hear(well.frame("LEFT_SK", SupplyVoltage=volts))
     assert well.heartbeats.quiet is (code is None)
     assert well.judge() == ({(code, "LEFT_SK"): True} if code else {})
@@ -157,13 +157,13 @@ def test_the_supply_of_a_drive(well: Nodes, volts: float, code: str | None):
 
 
 @pytest.mark.parametrize("node", ["PENDANT", "IMU_TORSO", "FOOT_LEFT", "HAPTICS"])
-def test_the_supply_of_another_node_moves_nothing(well: Nodes, node: str):
+def test_low_supply_of_another_node_is_ignored(well: Nodes, node: str):
     well.hear(well.frame(node, SupplyVoltage=0.0))
     assert well.heartbeats.quiet
     assert well.judge() == {}
 
 
-def test_an_emergency_holds_until_the_node_says_that_it_is_over(well: Nodes):
+def test_emergency_lasts_until_the_node_clears_it(well: Nodes):
     well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0x4310))
     assert well.heartbeats.quiet is False
     for _ in range(3):
@@ -179,7 +179,7 @@ def test_an_emergency_holds_until_the_node_says_that_it_is_over(well: Nodes):
     assert well.judge() == {}
 
 
-def test_several_emergencies_of_a_cycle_are_all_heard(well: Nodes):
+def test_several_emergencies_in_one_cycle_are_all_reported(well: Nodes):
     well.hear(
         well.frame("LEFT_SK", "EMCY", ErrorCode=0x8110),
         well.frame("LEFT_SA", "EMCY", ErrorCode=0x2310),
@@ -199,7 +199,7 @@ def test_several_emergencies_of_a_cycle_are_all_heard(well: Nodes):
     ]
 
 
-def test_the_operator_acknowledges_all_but_what_is_still_faulty(well: Nodes):
+def test_acknowledge_keeps_emergencies_of_faulty_drives(well: Nodes):
     for node in ("LEFT_SK", "LEFT_SA"):
         well.hear(well.frame(node, "EMCY", ErrorCode=0x4310))
     well.heartbeats.acknowledge({"LEFT_SA"})
@@ -207,7 +207,7 @@ def test_the_operator_acknowledges_all_but_what_is_still_faulty(well: Nodes):
     assert well.judge() == {("OVER_TEMP", "LEFT_SA"): True}
 
 
-def test_amplitudes_are_handed_over_when_they_come(well: Nodes):
+def test_received_amplitudes_are_written_to_the_state(well: Nodes):
     level = well.tx.codec.slice("Amplitude")
     well.tx.values[level] = 0.5
     well.hear(well.frame("LEFT_SK"))
@@ -237,7 +237,7 @@ def shortened(frame: Frames) -> Frames:
     return frame
 
 
-def test_what_is_refused_is_told_and_not_believed(well: Nodes):
+def test_rejected_frames_are_reported_and_not_used(well: Nodes):
     repeated = well.frame("FOOT_LEFT")
     out_of_range = well.frame("IMU_TORSO", SupplyVoltage=np.nan)
     well.hear(
@@ -258,7 +258,7 @@ def test_what_is_refused_is_told_and_not_believed(well: Nodes):
     assert well.judge() == {}
 
 
-def test_frames_of_nobody_are_handed_back(well: Nodes):
+def test_unknown_frames_are_returned(well: Nodes):
     stranger = new_frames(1)
     stranger["can_id"] = 0x7FF
     assert well.hear(stranger, well.frame("LEFT_SK"), stranger) == [0, 2]
@@ -267,7 +267,7 @@ def test_frames_of_nobody_are_handed_back(well: Nodes):
     assert well.hear(cyclic) == [0]  # that is the fast image's
 
 
-def test_a_sender_that_begins_anew_under_the_last_counter_is_taken_and_noted(well: Nodes):
+def test_restarted_sender_with_the_last_counter_is_accepted_and_reported(well: Nodes):
     row = well.tx.codec.rows["LEFT_SK_STATUS"]
     well.tx.resume(row, int(well.tx.frames["data"][row, 2]) - 1 & 0xFF)
     well.hear(well.frame("LEFT_SK", Uptime=9.0))
@@ -277,7 +277,7 @@ def test_a_sender_that_begins_anew_under_the_last_counter_is_taken_and_noted(wel
     assert well.heartbeats.quiet
 
 
-def test_an_emergency_under_the_last_counter_is_not_hidden(well: Nodes):
+def test_emergency_with_the_last_counter_is_accepted(well: Nodes):
     row = well.tx.codec.rows["LEFT_SK_EMCY"]
     well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0x7305))
     well.tx.resume(row, int(well.tx.frames["data"][row, 2]) - 1 & 0xFF)
@@ -285,7 +285,7 @@ def test_an_emergency_under_the_last_counter_is_not_hidden(well: Nodes):
     assert well.heartbeats.emergencies == {"LEFT_SK": (Dtc.OVER_TEMP, 0x4310)}
 
 
-def test_two_senders_of_a_slow_message_are_confirmed_at_the_fifth_conflict(well: Nodes):
+def test_two_senders_are_confirmed_at_the_fifth_conflict(well: Nodes):
     row = well.tx.codec.rows["HAPTICS_STATE"]
     for pair in range(1, 7):
         true = well.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.25)
@@ -318,7 +318,7 @@ def test_one_sender_leaves_no_evidence_of_a_second(well: Nodes):
     assert well.heartbeats.quiet is True
 
 
-def test_a_node_that_booted_is_listed_until_the_reader_clears_it(well: Nodes):
+def test_booted_node_is_listed(well: Nodes):
     well.hear(well.frame("LEFT_SK"))
     assert well.heartbeats.booted == set()
     well.hear(well.frame("LEFT_SK", NodeState=BOOT_UP))
@@ -326,7 +326,7 @@ def test_a_node_that_booted_is_listed_until_the_reader_clears_it(well: Nodes):
     assert well.heartbeats.booted == {"LEFT_SK"}
 
 
-def test_an_emergency_explains_a_fault_until_the_cycle_in_which_it_is_cleared(well: Nodes):
+def test_emergency_explains_a_fault_until_it_is_cleared(well: Nodes):
     assert not well.heartbeats.explains_fault("LEFT_SK")
     well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0x7305))
     well.judge()

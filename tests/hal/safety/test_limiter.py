@@ -1,4 +1,4 @@
-"""The limiter: nothing leaves outside the limits, nothing inside them is touched, and no brake is weakened."""
+"""Torque limiter: it keeps all limits, changes no torque within them, and reduces no braking torque."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def share(beyond: np.ndarray) -> np.ndarray:
 
 
 def reach(motion: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Largest torque up and down of the docstring, written once more."""
+    """Return the largest positive and negative torque, computed as the docstring of the limiter defines them."""
     q, v = motion
     ahead = q + LOOK * v
     up = np.minimum(share((ahead - ROBOT.position_max) / PAST), share((v - ROBOT.velocity_max) / FASTER))
@@ -62,7 +62,7 @@ def reach(motion: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 @given(st.lists(st.tuples(commands, motions), min_size=1, max_size=20))
 @example([(np.full(12, 1.7e308), AT_REST), (np.full(12, -1.7e308), AT_REST)])
-def test_what_the_docstring_promises_of_every_command(cycles: list[tuple[np.ndarray, np.ndarray]]):
+def test_every_command_is_limited_as_documented(cycles: list[tuple[np.ndarray, np.ndarray]]):
     limiter = Limiter(ROBOT, PERIOD)
     saturated = 0
     for command, motion in cycles:
@@ -80,7 +80,7 @@ def test_what_the_docstring_promises_of_every_command(cycles: list[tuple[np.ndar
         assert (np.abs(u - before) <= STEP + tiny).all()
         assert (u <= np.maximum(up, before - STEP) + tiny).all()
         assert (-u <= np.maximum(down, -before - STEP) + tiny).all()
-        # And no more is cut than that.
+        # The torque is cut no further than that.
         low = np.clip(-down, before - STEP, before + STEP)
         high = np.clip(up, before - STEP, before + STEP)
         assert np.allclose(u, np.minimum(np.maximum(command, low), high), rtol=0.0, atol=tiny)
@@ -91,7 +91,7 @@ def test_what_the_docstring_promises_of_every_command(cycles: list[tuple[np.ndar
 
 
 @given(finite_commands, motions, arrays(np.float64, 12, elements=st.floats(0.0, 400.0)))
-def test_a_torque_inside_all_limits_keeps_its_bits(command: np.ndarray, motion: np.ndarray, limit: np.ndarray):
+def test_each_joint_torque_within_its_limits_is_unchanged(command: np.ndarray, motion: np.ndarray, limit: np.ndarray):
     limiter = limiter_at(np.clip(command, -limit, limit))
     limiter.derate(limit)
     up, down = reach(motion, np.minimum(limit, ROBOT.torque_max))
@@ -108,10 +108,10 @@ shares = arrays(np.float64, 12, elements=st.floats(-1.0, 1.0))
 
 
 @given(shares, shares, shares, shares, arrays(np.float64, 12, elements=st.floats(0.1, 1.0)))
-def test_a_command_inside_every_limit_at_once_is_sent_unchanged(
+def test_command_within_every_limit_is_sent_unchanged(
     torque: np.ndarray, step: np.ndarray, velocity: np.ndarray, position: np.ndarray, derated: np.ndarray
 ):
-    """Torque anywhere up to the derated limit; position, velocity and rate anywhere up to 99 % or more of theirs."""
+    """Torque up to its derated limit, position, velocity and rate up to at least 99 % of their limits."""
     limiter = Limiter(ROBOT, PERIOD)
     limiter.derate(derated * ROBOT.torque_max)
     asked = torque * limiter.limit
@@ -125,7 +125,7 @@ def test_a_command_inside_every_limit_at_once_is_sent_unchanged(
     assert limiter.saturated == 0
 
 
-def test_a_command_inside_the_limits_keeps_its_bits_for_a_thousand_cycles():
+def test_command_within_the_limits_is_unchanged_for_1000_cycles():
     limiter = Limiter(ROBOT, PERIOD)
     rng = np.random.default_rng(0)
     torque = np.zeros(12)
@@ -138,13 +138,13 @@ def test_a_command_inside_the_limits_keeps_its_bits_for_a_thousand_cycles():
 @joints
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 class TestTightThresholds:
-    """Just inside nothing happens, just outside that joint alone is cut."""
+    """A torque just inside its limit is unchanged; just outside, only that joint is cut."""
 
     def expect(self, limiter: Limiter, torque: np.ndarray, motion: np.ndarray, cut: int | None) -> None:
         assert limiter.apply(torque, motion) == (FREE if cut is None else CUT)
         assert np.flatnonzero(limiter.cut).tolist() == ([] if cut is None else [cut])
 
-    def test_torque(self, joint: int, sign: float):
+    def test_torque_above_its_limit_is_cut(self, joint: int, sign: float):
         largest = ROBOT.torque_max[joint]
         at = only(joint, sign * largest)
         self.expect(limiter_at(at), at, AT_REST, None)
@@ -153,7 +153,7 @@ class TestTightThresholds:
             self.expect(over, at * factor, moving(joint, MIDDLE[joint], velocity), joint)
             assert over.last[joint] == sign * largest
 
-    def test_derated_torque(self, joint: int, sign: float):
+    def test_torque_above_the_derated_limit_is_cut(self, joint: int, sign: float):
         limiter = limiter_at(np.zeros(12))
         limit = ROBOT.torque_max.copy()
         limit[joint] = 7.0
@@ -163,7 +163,7 @@ class TestTightThresholds:
         self.expect(limiter, only(joint, sign * 7.0001), AT_REST, joint)
         assert limiter.last[joint] == sign * 7.0
 
-    def test_rate(self, joint: int, sign: float):
+    def test_torque_change_above_the_rate_limit_is_cut(self, joint: int, sign: float):
         step = STEP[joint]
         self.expect(limiter_at(np.zeros(12)), only(joint, sign * step), AT_REST, None)
         self.expect(limiter_at(only(joint, sign)), only(joint, sign * (1.0 - step)), AT_REST, None)
@@ -172,7 +172,7 @@ class TestTightThresholds:
             self.expect(over, only(joint, sign * after), AT_REST, joint)
             assert over.last[joint] == pytest.approx(sign * (before + step))
 
-    def test_position(self, joint: int, sign: float):
+    def test_torque_beyond_the_position_limit_is_cut(self, joint: int, sign: float):
         limit = (ROBOT.position_max if sign > 0 else ROBOT.position_min)[joint]
         full = only(joint, sign * ROBOT.torque_max[joint])
         self.expect(limiter_at(full), full, moving(joint, limit), None)
@@ -180,14 +180,14 @@ class TestTightThresholds:
         self.expect(beyond, full, moving(joint, limit + sign * 1e-6), joint)
         assert sign * beyond.last[joint] == pytest.approx(ROBOT.torque_max[joint] * (1.0 - 1e-6 / PAST))
 
-    def test_where_the_joint_will_be(self, joint: int, sign: float):
+    def test_torque_towards_a_predicted_limit_violation_is_cut(self, joint: int, sign: float):
         limit = (ROBOT.position_max if sign > 0 else ROBOT.position_min)[joint]
         full = only(joint, sign * ROBOT.torque_max[joint])
         self.expect(limiter_at(full), full, moving(joint, limit - sign * (LOOK + 1e-9), sign), None)
         self.expect(limiter_at(full), full, moving(joint, limit - sign * (LOOK - 1e-6), sign), joint)
         self.expect(limiter_at(full), full, moving(joint, limit + sign * 0.9 * LOOK, -sign), None)
 
-    def test_velocity(self, joint: int, sign: float):
+    def test_torque_above_the_velocity_limit_is_cut(self, joint: int, sign: float):
         fastest = sign * ROBOT.velocity_max[joint]
         full = only(joint, sign * ROBOT.torque_max[joint])
         self.expect(limiter_at(full), full, moving(joint, MIDDLE[joint], fastest), None)
@@ -195,7 +195,7 @@ class TestTightThresholds:
         self.expect(over, full, moving(joint, MIDDLE[joint], fastest + sign * 1e-4), joint)
         assert sign * over.last[joint] == pytest.approx(ROBOT.torque_max[joint] * (1.0 - 1e-4 / FASTER))
 
-    def test_the_torque_of_the_last_cycle_hides_no_velocity_and_no_position(self, joint: int, sign: float):
+    def test_last_torque_does_not_disable_position_and_velocity_limits(self, joint: int, sign: float):
         limit = (ROBOT.position_max if sign > 0 else ROBOT.position_min)[joint]
         fastest = ROBOT.velocity_max[joint] + FASTER
         for motion, before in (
@@ -207,7 +207,7 @@ class TestTightThresholds:
             assert limiter.last[joint] == pytest.approx(0.0, abs=1e-9)
 
     @pytest.mark.parametrize("part", [0.25, 0.5, 1.0, 2.0])
-    def test_nothing_drives_a_joint_on_past_the_margin(self, joint: int, sign: float, part: float):
+    def test_torque_falls_to_zero_at_the_end_of_the_margin(self, joint: int, sign: float, part: float):
         limit = (ROBOT.position_max if sign > 0 else ROBOT.position_min)[joint]
         for motion in (
             moving(joint, limit + sign * part * PAST),
@@ -218,7 +218,7 @@ class TestTightThresholds:
                 limiter.apply(only(joint, sign * ROBOT.torque_max[joint]), motion)
             assert sign * limiter.last[joint] == pytest.approx(max(0.0, 1.0 - part) * ROBOT.torque_max[joint])
 
-    def test_a_brake_keeps_the_whole_limit(self, joint: int, sign: float):
+    def test_braking_torque_is_not_reduced_outside_the_envelope(self, joint: int, sign: float):
         limit = (ROBOT.position_max if sign > 0 else ROBOT.position_min)[joint]
         brake = only(joint, -sign * ROBOT.torque_max[joint])
         motion = moving(joint, limit + sign * PAST, sign * (ROBOT.velocity_max[joint] + 2.0 * FASTER))
@@ -226,7 +226,7 @@ class TestTightThresholds:
         self.expect(limiter, brake, motion, None)
         assert limiter.last.tobytes() == brake.tobytes()
 
-    def test_where_the_envelope_closes_the_torque_falls_at_the_rate_limit(self, joint: int, sign: float):
+    def test_torque_falls_at_the_rate_limit_outside_the_envelope(self, joint: int, sign: float):
         limit = (ROBOT.position_max if sign > 0 else ROBOT.position_min)[joint]
         limiter = limiter_at(only(joint, sign * 3.5 * STEP[joint]))
         left = []
@@ -236,7 +236,7 @@ class TestTightThresholds:
         assert left == pytest.approx([2.5, 1.5, 0.5, 0.0, 0.0], abs=1e-9)
 
 
-def test_where_the_derated_limit_falls_the_torque_follows_at_the_rate_limit():
+def test_torque_falls_at_the_rate_limit_to_the_derated_limit():
     limiter = limiter_at(np.full(12, 3.5 * STEP[0]))
     limiter.derate(np.full(12, STEP[0]))
     left = []
@@ -246,7 +246,7 @@ def test_where_the_derated_limit_falls_the_torque_follows_at_the_rate_limit():
     assert left == pytest.approx([2.5, 1.5, 1.0, 1.0])
 
 
-def test_no_limit_is_raised_above_the_robots_own():
+def test_derating_never_raises_the_limit_above_that_of_the_robot():
     limiter = Limiter(ROBOT, PERIOD)
     assert limiter.limit.tobytes() == ROBOT.torque_max.tobytes()
     assert limiter.cut.dtype == np.bool_
@@ -258,7 +258,7 @@ def test_no_limit_is_raised_above_the_robots_own():
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @joints
-def test_one_bad_number_spoils_the_whole_command(joint: int, bad: float):
+def test_one_nan_or_infinity_rejects_the_whole_command(joint: int, bad: float):
     limiter = limiter_at(np.full(12, 5.0))
     assert limiter.apply(only(joint, bad), AT_REST) == REFUSED
     for motion in (moving(joint, np.nan), moving(joint, MIDDLE[joint], np.nan)):
@@ -266,7 +266,7 @@ def test_one_bad_number_spoils_the_whole_command(joint: int, bad: float):
     assert limiter.last.tobytes() == np.full(12, 5.0).tobytes()
 
 
-def test_saturation_is_counted_while_it_lasts():
+def test_saturated_cycles_are_counted():
     limiter = Limiter(ROBOT, PERIOD)
     for cycle in range(3):
         assert limiter.apply(only(4, 1e3), AT_REST) == CUT
@@ -285,7 +285,7 @@ def ends_with_a_restart(limiter: Limiter) -> None:
 
 
 @pytest.mark.parametrize("end", [ends_outside_the_envelope, ends_with_a_restart])
-def test_saturation_ends(end: Callable[[Limiter], None]):
+def test_saturation_count_is_reset(end: Callable[[Limiter], None]):
     limiter = Limiter(ROBOT, PERIOD)
     limiter.apply(only(0, STEP[0] * 1.5), AT_REST)
     assert limiter.cut.any()
@@ -294,7 +294,7 @@ def test_saturation_ends(end: Callable[[Limiter], None]):
     assert not limiter.cut.any()
 
 
-def test_restart_counts_from_the_drives_own_torque_within_the_limits():
+def test_restart_uses_the_measured_torque_within_the_limits():
     limiter = limiter_at(np.full(12, 40.0))
     assert limiter.last.tobytes() == np.full(12, 40.0).tobytes()
     assert limiter.apply(np.full(12, 41.0), AT_REST) == FREE

@@ -1,4 +1,4 @@
-"""The process image: what is committed, what ages, and that both paths judge alike."""
+"""Process image: committed values, ages and check results, equal on the fast and the slow path."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from atalante_hal.wire.frame import new_frames
 from atalante_hal.wire.process_image import NEVER, ReceiveImage, TransmitImage
 
 NETWORK = load()
-#: A few of the cyclic messages, of every kind; the whole cycle is judged in test_e2e.
+#: Some cyclic messages of every kind; test_e2e tests all of them.
 NAMES = ("LEFT_FH", "LEFT_SK", "RIGHT_FH", "FOOT_LEFT", "RIGHT_SK", "IMU_TORSO", "IMU_PELVIS", "PENDANT")
 CYCLIC = [NETWORK.message(f"{name}_STATE") for name in NAMES]
 ROWS = len(CYCLIC)
@@ -37,7 +37,7 @@ def deliver(tx: TransmitImage, rx: ReceiveImage, buffer: np.ndarray, order: list
     return list(rx.accept(buffer, len(order)))
 
 
-def test_nothing_received_is_nothing_known():
+def test_cycle_without_frames_leaves_all_rows_without_data():
     _, rx, buffer = pair()
     rx.accept(buffer, 0)
     assert (rx.check == Check.NO_DATA).all()
@@ -45,7 +45,7 @@ def test_nothing_received_is_nothing_known():
     assert not rx.all_fresh
 
 
-def test_values_arrive():
+def test_received_values_match_the_sent_values():
     tx, rx, buffer = pair()
     rng = np.random.default_rng(0)
     for _ in range(5):
@@ -59,7 +59,7 @@ def test_values_arrive():
     assert rx.all_fresh
 
 
-def test_the_frames_of_a_missing_node_age_and_keep_their_values():
+def test_row_without_frames_ages_and_keeps_its_values():
     tx, rx, buffer = pair()
     deliver(tx, rx, buffer)
     kept = rx.values.copy()
@@ -75,7 +75,7 @@ def test_the_frames_of_a_missing_node_age_and_keep_their_values():
     assert rx.age[3] == 0
 
 
-def test_more_than_four_lost_frames_need_one_more_to_be_believed():
+def test_second_frame_after_five_lost_frames_is_accepted():
     tx, rx, buffer = pair()
     deliver(tx, rx, buffer)
     for _ in range(5):
@@ -86,7 +86,7 @@ def test_more_than_four_lost_frames_need_one_more_to_be_believed():
     assert rx.check[3] == Check.OK
 
 
-def test_an_invalid_code_leaves_the_last_good_values():
+def test_invalid_code_keeps_the_last_good_values():
     tx, rx, buffer = pair()
     deliver(tx, rx, buffer)
     before = rx.values.copy()
@@ -100,7 +100,7 @@ def test_an_invalid_code_leaves_the_last_good_values():
     assert (np.delete(rx.check, row) == Check.OK).all()
 
 
-def test_frames_can_be_sealed_under_a_counter_of_ones_own():
+def test_frames_can_be_sealed_with_a_given_counter():
     tx, rx, buffer = pair()
     deliver(tx, rx, buffer)
     tx.seal_row(2)
@@ -111,7 +111,7 @@ def test_frames_can_be_sealed_under_a_counter_of_ones_own():
     assert (tx.seal()["data"][:, 2] == 0).all()
 
 
-def test_prepared_payloads_are_sealed_with_the_next_counter_whatever_the_values_are():
+def test_prepared_payloads_are_sealed_with_the_next_counter():
     tx, rx, buffer = pair()
     tx.values[:] = 1.0
     prepared = tx.prepare()
@@ -123,7 +123,7 @@ def test_prepared_payloads_are_sealed_with_the_next_counter_whatever_the_values_
     assert np.allclose(rx.values[rx.codec.slice("Force")], 1.0)
 
 
-def test_foreign_frames_are_named_wherever_they_stand():
+def test_indices_of_foreign_frames_are_returned():
     tx, rx, buffer = pair()
     deliver(tx, rx, buffer)
     frames = tx.seal()
@@ -141,7 +141,7 @@ CHANGES = ("none", "flip", "drop", "twice", "rival", "rival first", "old", "rang
 
 
 def rival(frame: np.ndarray, message: Message, byte: int = 0) -> np.ndarray:
-    """The frame of a second sender: the same counter, a bit of another byte changed, and the right CRC."""
+    """Return the frame of a second sender: the same counter, one changed bit and the right CRC."""
     other = frame.copy()
     place = 3 + byte % (message.length - 3)
     other["data"][place] ^= 1
@@ -151,7 +151,7 @@ def rival(frame: np.ndarray, message: Message, byte: int = 0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("row", range(ROWS))
-def test_the_same_counter_with_other_bytes_is_a_conflict_and_is_not_committed(row: int):
+def test_same_counter_with_other_bytes_is_a_conflict(row: int):
     tx, rx, buffer = pair()
     deliver(tx, rx, buffer)
     for byte in range(CYCLIC[row].length - 3):
@@ -162,13 +162,13 @@ def test_the_same_counter_with_other_bytes_is_a_conflict_and_is_not_committed(ro
         assert rx.refused == [(row, Check.CONFLICT)]
         assert rx.check[row] == Check.OK
         assert rx.frames[row] == true[row]
-        # Late: the cycle of its counter is over, and the true frame of the next one comes with it.
+        # The second frame is one cycle late, and arrives with the next frame of the first sender.
         following = tx.seal().copy()
         buffer[0], buffer[1 : ROWS + 1] = rival(true[row], CYCLIC[row], byte), following
         rx.accept(buffer, ROWS + 1)
         assert rx.refused == [(row, Check.CONFLICT)]
         assert (rx.check[row], rx.age[row]) == (Check.OK, 0)
-        # Alone: the counter stands still.
+        # The second frame arrives alone: the counter is constant.
         deliver_frames(rx, buffer, [rival(following[row], CYCLIC[row], byte)])
         assert rx.check[row] == Check.CONFLICT
         assert rx.age[row] == 1
@@ -182,7 +182,7 @@ def deliver_frames(rx: ReceiveImage, buffer: np.ndarray, frames: list[np.ndarray
     rx.accept(buffer, len(frames))
 
 
-def test_what_lies_behind_the_payload_makes_no_conflict():
+def test_bytes_after_the_payload_cause_no_conflict():
     tx, rx, buffer = pair()
     true = tx.seal()[0].copy()
     again = true.copy()
@@ -191,7 +191,7 @@ def test_what_lies_behind_the_payload_makes_no_conflict():
     assert rx.refused == [(0, Check.REPEATED)]
 
 
-def test_after_a_frame_out_of_range_its_repetition_is_one_and_another_under_its_counter_is_a_conflict():
+def test_repetition_and_conflict_are_found_after_an_invalid_frame():
     tx, rx, buffer = pair()
     row = rx.codec.rows["IMU_PELVIS_STATE"]
     deliver(tx, rx, buffer)
@@ -201,7 +201,7 @@ def test_after_a_frame_out_of_range_its_repetition_is_one_and_another_under_its_
     assert rx.refused == [(row, Check.INVALID), (row, Check.REPEATED), (row, Check.CONFLICT)]
 
 
-def test_a_sender_that_may_begin_anew_is_taken_under_the_last_counter_and_the_conflict_is_listed():
+def test_restarted_sender_with_the_last_counter_is_accepted_and_listed():
     status = [m for m in NETWORK.received_by("HAL") if m.name == "LEFT_FH_STATUS"]
     tx, rx, buffer = TransmitImage(status), ReceiveImage(status, restarts=True), new_frames(4)
     uptime = tx.codec.index("LEFT_FH_STATUS", "Uptime")
@@ -214,7 +214,7 @@ def test_a_sender_that_may_begin_anew_is_taken_under_the_last_counter_and_the_co
     assert rx.refused == [(0, Check.REPEATED)]
 
 
-def test_the_frame_that_is_accepted_after_a_loss_is_not_one_of_the_others():
+def test_accepted_frame_after_a_loss_is_not_listed_beside():
     tx, rx, buffer = pair()
     deliver(tx, rx, buffer)
     tx.seal()  # lost
@@ -224,7 +224,7 @@ def test_the_frame_that_is_accepted_after_a_loss_is_not_one_of_the_others():
     assert len(rx.beside(0)) == 1
 
 
-def test_the_other_frames_of_a_row_are_decoded_in_order_of_arrival():
+def test_other_frames_of_a_row_are_decoded_in_order_of_arrival():
     tx, rx, buffer = pair()
     row, mine = rx.codec.rows["PENDANT_STATE"], slice(None)
     dead_man = rx.codec.index("PENDANT_STATE", "DeadMan")
@@ -255,8 +255,8 @@ def test_the_other_frames_of_a_row_are_decoded_in_order_of_arrival():
     ),
     st.randoms(use_true_random=False),
 )
-def test_fast_and_slow_path_give_equal_results_for_any_history(history, shuffler):
-    """One image may take its fast path, the other is made to judge frame by frame; nothing may differ."""
+def test_fast_and_slow_path_agree_for_any_history(history, shuffler):
+    """One process image may use its fast path, the other checks frame by frame; all results must be equal."""
     tx, fast, buffer = pair()
     slow = ReceiveImage(CYCLIC)
     old = tx.seal().copy()
@@ -289,7 +289,7 @@ def test_fast_and_slow_path_give_equal_results_for_any_history(history, shuffler
         assert np.array_equal(fast.age, slow.age)
         assert np.array_equal(fast.values, slow.values, equal_nan=True)
         assert fast.crc_errors == slow.crc_errors
-        # Of a perfect cycle the fast path lists nothing, and the slow path has nothing to list.
+        # In a perfect cycle neither path lists a rejected frame.
         assert slow.refused == fast.refused
         assert fast.frames.tobytes() == slow.frames.tobytes()
         for each in range(ROWS):
@@ -297,7 +297,7 @@ def test_fast_and_slow_path_give_equal_results_for_any_history(history, shuffler
 
 
 @pytest.mark.parametrize("byte", [0, 1, 2, 11])
-def test_a_flipped_bit_anywhere_is_found_in_a_frame_alone(byte: int):
+def test_flipped_bit_in_a_single_frame_is_found(byte: int):
     tx, rx, _ = pair()
     frame = tx.seal_row(0).copy()
     frame["data"][0, byte] ^= 0x40
@@ -308,7 +308,7 @@ def test_a_flipped_bit_anywhere_is_found_in_a_frame_alone(byte: int):
     assert rx.crc_errors == 1
 
 
-def test_a_single_row_can_be_sealed_alone():
+def test_single_row_has_its_own_counter():
     tx = TransmitImage(CYCLIC)
     rx = ReceiveImage(CYCLIC)
     for _ in range(3):
@@ -323,7 +323,7 @@ def test_a_single_row_can_be_sealed_alone():
 
 
 def answer(tx: TransmitImage, rx: ReceiveImage, buffer: np.ndarray, cycle: int, delays: dict[int, int]) -> None:
-    """All rows answer SYNC `cycle`, those of `delays` an earlier one instead; a delay of -1 says nothing."""
+    """Let all rows answer SYNC `cycle`; `delays` gives rows that answer an earlier SYNC, or none (-1)."""
     count = 0
     for row in range(ROWS):
         delay = delays.get(row, 0)
@@ -334,9 +334,9 @@ def answer(tx: TransmitImage, rx: ReceiveImage, buffer: np.ndarray, cycle: int, 
 
 
 class TestCycleTag:
-    """A frame tells which SYNC it answers."""
+    """The counter of a frame is the tag of the SYNC that it answers."""
 
-    def test_answers_to_this_sync_are_perfect_over_the_turn_of_the_counter(self):
+    def test_answers_to_each_sync_are_fresh_across_the_counter_overflow(self):
         tx, rx, buffer = pair()
         for cycle in range(250, 262):
             answer(tx, rx, buffer, cycle, {})
@@ -344,7 +344,7 @@ class TestCycleTag:
             assert (rx.check == Check.OK).all()
             assert (rx.age == 0).all()
 
-    def test_all_answers_a_cycle_late_are_in_sequence_and_a_cycle_old(self):
+    def test_answers_one_cycle_late_have_age_one(self):
         tx, rx, buffer = pair()
         for cycle in range(5):
             answer(tx, rx, buffer, cycle, dict.fromkeys(range(ROWS), 1))
@@ -352,7 +352,7 @@ class TestCycleTag:
             assert (rx.check == Check.OK).all()
             assert (rx.age == 1).all()
 
-    def test_a_late_answer_is_used_and_is_as_old_as_the_sync_it_answers(self):
+    def test_late_answer_has_the_age_of_its_sync(self):
         tx, rx, buffer = pair()
         for cycle, delay, check, age in (
             (100, 0, Check.OK, 0),
@@ -368,30 +368,30 @@ class TestCycleTag:
             assert (rx.check[7], rx.age[7]) == (check, age), cycle
             assert (np.delete(rx.age, 7) == 0).all()
 
-    def test_the_first_frame_may_be_fifteen_cycles_late_and_not_sixteen(self):
+    def test_first_frame_may_be_at_most_15_cycles_late(self):
         for delay, check in ((15, Check.OK), (16, Check.WRONG_SEQUENCE), (200, Check.WRONG_SEQUENCE)):
             tx, rx, buffer = pair()
             answer(tx, rx, buffer, 300, {7: delay})
             assert rx.check[7] == check
             assert rx.age[7] == (delay if check is Check.OK else NEVER + 1)
-            # What was refused says nothing about what comes next.
+            # A rejected frame has no effect on the next frame.
             answer(tx, rx, buffer, 301, {7: 0})
             assert rx.check[7] == (Check.OK if check is not Check.OK else Check.WRONG_SEQUENCE)
 
     @pytest.mark.parametrize("cycles", [5, 100, 127, 128, 160, 200, 254, 255, 256, 260, 300, 400, 512])
-    def test_a_sender_that_was_silent_for_however_long_is_used_from_its_second_frame_on(self, cycles: int):
+    def test_second_frame_after_any_silence_is_accepted(self, cycles: int):
         tx, rx, buffer = pair()
         answer(tx, rx, buffer, 10, {})
         for cycle in range(11, 11 + cycles):
             answer(tx, rx, buffer, cycle, {7: -1})
         back = 11 + cycles
-        # The first frame is refused, unless the counter happens to be one to five ahead.
+        # The first frame is rejected, unless its counter is one to five ahead.
         first = {0: Check.OK, 4: Check.SOME_LOST}.get(cycles & 0xFF, Check.WRONG_SEQUENCE)
         for cycle, check in ((back, first), (back + 1, Check.OK)):
             answer(tx, rx, buffer, cycle, {})
             assert rx.check[7] == check
         assert rx.all_fresh
-        # All of them at once, through the fast path before and after.
+        # The same for all rows at once, with the fast path before and after.
         for cycle in range(back + 2, back + 2 + cycles):
             answer(tx, rx, buffer, cycle, dict.fromkeys(range(ROWS), -1))
         back += 2 + cycles
@@ -399,7 +399,7 @@ class TestCycleTag:
             answer(tx, rx, buffer, cycle, {})
             assert (rx.check == check).all()
 
-    def test_a_counter_that_stands_still_is_never_new_however_long_it_does(self):
+    def test_constant_counter_is_never_accepted(self):
         tx, rx, buffer = pair()
         answer(tx, rx, buffer, 10, {})
         stuck = tx.frames[7].copy()
@@ -411,18 +411,18 @@ class TestCycleTag:
             assert rx.check[7] in (Check.REPEATED, Check.WRONG_SEQUENCE)
             assert rx.age[7] == cycle - 10
 
-    def test_half_a_turn_ahead_is_behind(self):
+    def test_counter_half_a_range_ahead_is_rejected(self):
         for ahead, check in ((127, Check.WRONG_SEQUENCE), (128, Check.WRONG_SEQUENCE)):
             tx, rx, buffer = pair()
             answer(tx, rx, buffer, 50, {})
             answer(tx, rx, buffer, 50 + ahead, {})
             assert (rx.check == check).all()
-            # From 127 ahead the image goes on, from 128 it does not believe that time went by.
+            # A counter 127 ahead becomes the new expected counter; 128 ahead does not.
             answer(tx, rx, buffer, 51 + ahead, {})
             assert (rx.check == (Check.OK if ahead == 127 else Check.WRONG_SEQUENCE)).all()
 
 
-def test_what_began_anew_is_taken_where_senders_may():
+def test_any_counter_is_accepted_if_senders_may_restart():
     status = [m for m in NETWORK.received_by("HAL") if m.name == "LEFT_FH_STATUS"]
     tx, buffer = TransmitImage(status), new_frames(4)
     rx = ReceiveImage(status, restarts=True)
@@ -438,7 +438,7 @@ def test_what_began_anew_is_taken_where_senders_may():
         assert rx.check[0] == check, counter
 
 
-def test_what_is_refused_later_keeps_its_values_and_ages_on():
+def test_rejected_row_keeps_its_values_and_ages():
     tx, rx, buffer = pair()
     mine = rx.codec.row_of == 3
     tx.values[mine[: tx.codec.size]] = 1.0
@@ -464,7 +464,7 @@ def test_what_is_refused_later_keeps_its_values_and_ages_on():
     assert rx.age[3] == 1
 
 
-def test_what_was_not_committed_is_listed_with_its_reason():
+def test_rejected_frames_are_listed_with_their_reason():
     tx, rx, buffer = pair()
     deliver(tx, rx, buffer)
     deliver(tx, rx, buffer)
@@ -489,7 +489,7 @@ def test_what_was_not_committed_is_listed_with_its_reason():
     assert rx.refused == []
 
 
-def test_a_good_frame_counts_whatever_comes_before_or_after_it():
+def test_good_frame_is_accepted_before_or_after_a_damaged_one():
     tx, rx, buffer = pair()
     deliver(tx, rx, buffer)
     for first, second in ((0, 1), (1, 0)):
@@ -503,7 +503,7 @@ def test_a_good_frame_counts_whatever_comes_before_or_after_it():
         assert rx.refused == [(5, Check.CRC)]
 
 
-def test_a_raw_code_out_of_range_that_is_not_the_invalid_one_is_out_of_range():
+def test_out_of_range_and_invalid_codes_are_distinguished():
     tx, rx, buffer = pair()
     row, signal = rx.codec.rows["LEFT_FH_STATE"], tx.codec.index("LEFT_FH_STATE", "DriveState")
     message, drive_state = tx.codec.signals[signal]
@@ -519,7 +519,7 @@ def test_a_raw_code_out_of_range_that_is_not_the_invalid_one_is_out_of_range():
     assert rx.values[signal] == 64
 
 
-def test_a_cycle_is_complete_when_all_messages_stand_first_and_in_order():
+def test_cycle_is_complete_if_all_messages_are_first_and_in_order():
     tx, rx, buffer = pair()
     buffer[:ROWS] = tx.seal()
     assert rx.begins(buffer, ROWS)
@@ -532,7 +532,7 @@ def test_a_cycle_is_complete_when_all_messages_stand_first_and_in_order():
     assert rx.begins(other, ROWS)
 
 
-def test_who_was_heard_within_the_timeout_is_expected():
+def test_identifiers_are_expected_until_their_timeout():
     tx, rx, buffer = pair()
     assert rx.expected_ids() == set()
     deliver(tx, rx, buffer)
@@ -546,7 +546,7 @@ def test_who_was_heard_within_the_timeout_is_expected():
     assert rx.expected_ids() == everybody - {CYCLIC[3].frame_id}
 
 
-def test_a_sender_goes_on_after_another():
+def test_resume_continues_after_the_given_counter():
     tx = TransmitImage(CYCLIC)
     assert (tx.seal()["data"][:, 2] == 0).all()
     tx.resume(2, 9)
@@ -555,8 +555,8 @@ def test_a_sender_goes_on_after_another():
     assert (np.delete(counters, 2) == 1).all()
 
 
-def test_messages_of_64_bytes_are_protected_too():
-    """No bytes behind the payload are left for the Data ID."""
+def test_messages_of_64_bytes_are_protected():
+    """A frame of 64 bytes has no free bytes for the Data ID."""
     longest = [replace(m, length=64) for m in CYCLIC[:2]]
     tx, rx, buffer = TransmitImage(longest), ReceiveImage(longest), new_frames(4)
     for _ in range(3):
@@ -570,7 +570,7 @@ def test_messages_of_64_bytes_are_protected_too():
     assert rx.all_fresh
 
 
-def test_a_refusal_is_of_its_row_alone_and_ages_from_the_cycle_before():
+def test_refuse_affects_only_its_row():
     tx, rx, buffer = pair()
     deliver(tx, rx, buffer)
     for _ in range(2):
@@ -589,7 +589,7 @@ def test_a_refusal_is_of_its_row_alone_and_ages_from_the_cycle_before():
     assert not np.array_equal(rx.values[mine], new[mine])
 
 
-def test_everything_once_in_any_order_is_a_perfect_cycle():
+def test_complete_cycle_in_any_order_is_fresh():
     tx, rx, buffer = pair()
     deliver(tx, rx, buffer)
     deliver(tx, rx, buffer, list(reversed(range(ROWS))))
@@ -601,8 +601,8 @@ def test_everything_once_in_any_order_is_a_perfect_cycle():
     assert rx.all_fresh
 
 
-def test_a_frame_that_comes_twice_is_refused_once():
-    """Of the first row, too, where the first of the two stands before everything else."""
+def test_repeated_frame_is_rejected_once():
+    """Row 0 is a special case: its frame is first in the buffer."""
     for row in (0, 3):
         tx, rx, buffer = pair()
         deliver(tx, rx, buffer)
@@ -614,7 +614,7 @@ def test_a_frame_that_comes_twice_is_refused_once():
         assert (rx.check == Check.OK).all()
 
 
-def test_what_was_lost_before_a_good_frame_stays_told_after_a_bad_one():
+def test_loss_is_reported_despite_a_later_repetition():
     tx, rx, buffer = pair()
     deliver(tx, rx, buffer)
     tx.seal()
@@ -634,7 +634,7 @@ def test_damaged_frames_are_counted():
         assert rx.crc_errors == damaged
 
 
-def test_an_image_begins_with_nothing():
+def test_new_process_image_has_no_data():
     rx = ReceiveImage(CYCLIC)
     assert (rx.check.dtype, rx.age.dtype) == (np.uint8, np.int64)
     assert rx.check.tolist() == [Check.NO_DATA] * ROWS
@@ -644,7 +644,7 @@ def test_an_image_begins_with_nothing():
     assert (rx.refused, rx.crc_errors, rx.all_fresh) == ([], 0, False)
 
 
-def test_what_comes_after_a_loss_is_used_and_refused_alike():
+def test_frame_after_a_loss_can_be_accepted_and_refused():
     tx, rx, buffer = pair()
     row, signal = rx.codec.rows["IMU_TORSO_STATE"], rx.codec.index("IMU_TORSO_STATE", "AccelX")
     deliver(tx, rx, buffer)
@@ -661,13 +661,13 @@ def test_what_comes_after_a_loss_is_used_and_refused_alike():
     assert rx.values[signal] == pytest.approx(2.0, abs=0.01)
 
 
-def test_values_may_be_somebody_elses():
+def test_given_array_is_used_for_the_values():
     values = np.zeros(ReceiveImage(CYCLIC).codec.size)
     rx = ReceiveImage(CYCLIC, values)
     assert rx.values is values
 
 
-def test_the_last_good_frames_are_kept():
+def test_last_good_frames_are_kept():
     tx, rx, buffer = pair()
     deliver(tx, rx, buffer)
     deliver(tx, rx, buffer)
@@ -680,14 +680,14 @@ def test_the_last_good_frames_are_kept():
     assert np.delete(rx.frames, 2).tobytes() == np.delete(before, 2).tobytes()
 
 
-def test_one_row_is_one_frame():
+def test_sealed_row_is_one_frame():
     tx = TransmitImage(CYCLIC)
     assert (tx.counter, tx.frames["data"][0, 2]) == (0xFF, 0xFF)
     for row in range(ROWS):
         assert [frame["can_id"] for frame in tx.seal_row(row)] == [CYCLIC[row].frame_id]
 
 
-def test_what_has_no_code_cannot_be_sealed():
+def test_nan_without_an_invalid_code_cannot_be_sealed():
     tx = TransmitImage(CYCLIC)
     tx.values[tx.codec.index("PENDANT_STATE", "DeadMan")] = np.nan
     before = tx.frames.copy()
