@@ -168,7 +168,9 @@ class RingWriter(_Ring, Closing):
         meta: Mapping[str, Any] | None = None,
     ) -> None:
         if record_size < 1 or slots < 2:
-            raise RingError(f"a ring must have at least 2 slots of at least 1 byte, got {slots} slots of {record_size} bytes")
+            raise RingError(
+                f"a ring must have at least 2 slots of at least 1 byte, got {slots} slots of {record_size} bytes"
+            )
         packed = json.dumps(dict(meta or {})).encode()
         stride = -(-record_size // 8) * 8
         data = -(-(_HEADER_BYTES + len(packed) + NOTES_BYTES) // mmap.PAGESIZE) * mmap.PAGESIZE
