@@ -310,7 +310,7 @@ class Emulator:
         if lost:
             for leg in range(len(SIDES)):
                 self.drives.miss_sync(leg, self.cycle)
-            self._run_without_sync()
+            self.run_without_sync()
         return lost
 
     def _send(self, parts: Sequence[Frames]) -> None:
@@ -425,9 +425,9 @@ class Emulator:
         """Run one millisecond without a HAL. Enabled drives start their local hold, and the nodes send only slow messages."""
         for leg in range(len(SIDES)):
             self.drives.hold(leg, LIFE_GUARD)
-        self._run_without_sync()
+        self.run_without_sync()
 
-    def _run_without_sync(self) -> None:
+    def run_without_sync(self) -> None:
         """Run one millisecond without SYNC. The nodes send only slow messages and emergencies."""
         drives = self.drives
         self._rx.new_cycle()

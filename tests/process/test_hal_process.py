@@ -154,14 +154,14 @@ def robot_on(bus: SharedBus, robot: Robot, urdf_text: str) -> Iterator[Emulator]
 
 
 class Listener(Operator):
-    """Knows what state the HAL says it is in, and is quick to start it."""
+    """Operator that keeps the HAL state from SYNC, and presses START after 5 cycles."""
 
     REACTION = 5
     hal_state = SupervisorState.OFF
 
-    def hear(self, hal_state: int) -> None:
+    def receive(self, hal_state: int) -> None:
         self.hal_state = SupervisorState(hal_state)
-        super().hear(hal_state)
+        super().receive(hal_state)
 
 
 def enabled(emulator: Emulator) -> bool:
@@ -179,7 +179,7 @@ def test_f41_killed_at_twenty_phases_of_the_gait_every_drive_holds_within_five_c
                 moving_at = emulator.body.velocity.copy()
                 for _ in range(WATCHDOG):
                     assert enabled(emulator), phase
-                    emulator._alone()  # a millisecond without SYNC
+                    emulator.run_without_sync()  # a millisecond without SYNC
                 assert set(emulator.drives.state) == {DriveState.QUICK_STOP_ACTIVE}, phase
                 assert all(emulator.drives.latched), phase
                 held = emulator.body.position.copy()
@@ -230,7 +230,7 @@ class World:
         """Time goes by and the HAL does nothing."""
         self._clock[0] += milliseconds * 1e-3
         for _ in range(milliseconds):
-            self.emulator._alone()
+            self.emulator.run_without_sync()
 
 
 @pytest.mark.parametrize("milliseconds", [3, 20, 2000])
