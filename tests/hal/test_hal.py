@@ -68,8 +68,7 @@ def test_record_contains_the_values_of_the_state(rig):
     assert hal.record[hal.layout["cycle"]] == state.cycle
     assert hal.record[hal.layout["supervisor"]] == S.ACTIVE
     assert hal.record[hal.layout["frames"]] > 19 * state.cycle
-    assert np.array_equal(hal.record[hal.layout["torque_command"]], torques(rig)) or np.abs(
-        hal.record[hal.layout["torque_command"]] - torques(rig)).max() < 0.00626  # fmt: skip
+    assert np.abs(hal.record[hal.layout["torque_command"]] - torques(rig)).max() < 0.00626  # resolution on the wire
 
 
 def test_joint_position_is_motor_position_over_gear(rig):
@@ -203,9 +202,7 @@ def test_record_lists_diagnostics_and_status_the_most_severe(rig):
     assert rig.hal.record[diagnostics] == 0
     rig.bus.to_hal = rig.drop(0x183)
     rig.run(5)
-    assert dtcs_of(int(rig.hal.record[diagnostics][0])) == (Dtc.NODE_TIMEOUT,) or Dtc.NODE_TIMEOUT in dtcs_of(
-        int(rig.hal.record[diagnostics][0])
-    )
+    assert Dtc.NODE_TIMEOUT in dtcs_of(int(rig.hal.record[diagnostics][0]))
     rig.run(100)
     status = next(f for f in reversed(rig.sent) if f["can_id"][0] == 0x700)
     said = database().decode_message(0x700, status["data"][0, :24].tobytes(), decode_choices=False)
