@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from atalante_hal import compiled as module
-from atalante_hal.compiled import compiled
+from atalante_hal.compiled import compiled, specialised
 
 GAIN = 2.0
 
@@ -37,6 +37,15 @@ def beyond(values: Any, place: int) -> float:
 def test_compiled_function_returns_the_same_as_python() -> None:
     values = np.random.default_rng(0).standard_normal(100)
     assert compiled(total)(values, 1.5) == total(values, 1.5)
+
+
+def test_specialised_function_gives_the_same_result_and_checks_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.random.default_rng(0).standard_normal(100)
+    assert specialised(total, values, 0.0)(values, 1.5) == total(values, 1.5)
+    with pytest.raises(IndexError):
+        specialised(beyond, values, 0)(values, 100)
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    assert specialised(total, values, 1.5) is total
 
 
 def test_function_is_compiled_only_once() -> None:

@@ -23,109 +23,52 @@ decided as follows:
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
-from typing import Any
-
 import numpy as np
 
-from atalante_control.airwalk.kernel import STEP, hand_over, run
-from atalante_control.airwalk.telemetry import TELEMETRY, AirwalkStatistics
+from atalante_control.airwalk.assistance import Assistance
+from atalante_control.airwalk.carry_over import CarryOver, add_carried
+from atalante_control.airwalk.config import AirwalkConfig, baseline_share
+from atalante_control.airwalk.kernel import Measured, Outputs, Parts, run
+from atalante_control.airwalk.reference import Deviation, GaitReference, StartMotion
+from atalante_control.airwalk.step_guides import StepGuides, backup_torque_limits
+from atalante_control.airwalk.telemetry import TELEMETRY_FIELDS, AirwalkStatistics, Step, Telemetry
 from atalante_control.dynamics.gravity import Gravity
 from atalante_control.dynamics.suspended import check_hung
-from atalante_control.gait.gait import PERIOD, Gait, bezier, step_over
+from atalante_control.gait.gait import Gait, step_over
 from atalante_control.gait.recentering import Deadbeat
-from atalante_control.guide.backup_policy import BackupPolicy
-from atalante_control.guide.certificate import Certificate, HandOver, certify, largest_assistance
-from atalante_control.guide.filter import GuideConfig, GuideFilter
+from atalante_control.guide.certificate import Certificate
+from atalante_control.guide.filter import GuideFilter
 from atalante_control.guide.shapes import GuideShape
 from atalante_control.joint.flat_foot import LevelFeet
 from atalante_control.joint.haptics import intensity
-from atalante_control.joint.idealization import AssistedInertia, Friction, law_of
-from atalante_control.joint.pid import AIR_GAINS, LEFT, RIGHT, Pid, PidGains
+from atalante_control.joint.idealization import AssistedInertia
+from atalante_control.joint.pid import LEFT, RIGHT, Pid
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
-from atalante_hal.compiled import compiled
-from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, MOTORS, Robot
+from atalante_control.structured import Records, zeros
+from atalante_hal.compiled import specialised
+from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, Robot
 from atalante_hal.types import Command, State, Vector
 
-Pair = tuple[float, float]
+__all__ = ["AirwalkConfig", "AirwalkController", "baseline_share"]
 
-_LEG = len(LEG_JOINTS)
-_SH, _SK, _SA = (LEG_JOINTS.index(joint) for joint in ("SH", "SK", "SA"))
+_N, _LEG = len(JOINTS), len(LEG_JOINTS)
+_SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 _PELVIS = IMUS.index("pelvis")
-
-
-@dataclass(frozen=True)
-class AirwalkConfig:
-    """Parameters of the airwalk controller.
-
-    Raises:
-        ValueError: If a parameter is out of range.
-    """
-
-    gains: PidGains = AIR_GAINS
-    friction: Friction = field(default_factory=Friction)
-    alpha: float = 0.4  # fraction of the step after which re-centring reaches the nominal trajectory
-    guide_rate: Pair = (28.0, 44.0)  # rad/s, natural frequency of the stiffest backup policy on SH and SK
-    gentler: tuple[float, ...] = (0.5, 0.7)  # fractions of guide_rate tried first, ascending
-    guide_margin: float = 0.25  # smallest certificate margin, as a fraction of the guide, at which lower gains are used
-    guide_damping: float = 1.05  # damping ratio of the backup policy; monotone from 1 on
-    # Nm, bounds of u_ext of SH and SK as separate inertias (see `certificate`). Measured in PyBullet, 95 % of the cycles:
-    # coupling to other joints, delay and residual friction cause 14 and 20 Nm; a friction error of 20 % causes 43 and 26 Nm.
-    disturbance: tuple[Pair, Pair] = ((-30.0, 30.0), (-20.0, 20.0))
-    points: int = 100  # intervals of the horizon grid
-    overlap: float = 0.1  # s, length of the horizon after the end of the step
-    zeta: float = 0.01  # s, derivative gain of the guide
-    hand_over: HandOver = field(default_factory=HandOver)
-    decoupled: bool = (
-        True  # convert u_v through the mass matrix of SH and SK; False: apply u_v directly, as in the paper
-    )
-    feedforward: bool = False  # apply u_f of the gait to the assisted joints; off in the air
-    flat_foot: bool = True  # hold the swing sole level
-    ankle_offset: float = math.radians(1.0)  # rad, added to both sagittal ankles
-    fade: float = 0.9  # Xi above which the baseline is blended in
-    startup: float = 2.0  # s, duration of the motion from the measured pose to the first pose of the gait
-    blend: float = 0.03  # s, time in which a torque step at the step change fades out
-    active: float = 0.05  # gate above which the filter counts as active
-
-    def __post_init__(self) -> None:
-        for name in ("startup", "blend"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= PERIOD):
-                raise ValueError(f"{name} must be at least one cycle ({PERIOD} s), got {getattr(self, name)!r}")
-        if not 0.0 <= self.fade < 1.0:
-            raise ValueError(f"fade must be an assistance factor in [0, 1), got {self.fade!r}")
-        if not (min(self.guide_rate) > 0.0 and self.guide_damping > 0.0):
-            raise ValueError(
-                f"guide_rate and guide_damping must be positive, got {self.guide_rate!r} and {self.guide_damping!r}"
-            )
-        if list(self.gentler) != sorted(self.gentler) or not all(0.0 < part < 1.0 for part in self.gentler):
-            raise ValueError(f"gentler must be ascending fractions of guide_rate in (0, 1), got {self.gentler!r}")
-
-
-def baseline_share(xi: float, fade: float) -> float:
-    """Return the weight w(Xi) of the baseline torque: 0 up to `fade`, then a smoothstep to exactly 1 at Xi = 1.
-
-    Args:
-        xi: assistance factor in [0, 1].
-        fade: `AirwalkConfig.fade`, in [0, 1).
-    """
-    x = (xi - fade) / (1.0 - fade)
-    return 0.0 if x <= 0.0 else 1.0 if x >= 1.0 else x * x * (3.0 - 2.0 * x)
 
 
 class AirwalkController:
     """Airwalk controller. It implements `atalante_hal.types.Controller`.
 
     Attributes:
+        reference: desired trajectories of both steps.
+        pid: PIDs of the baseline controller.
         guide: virtual guide filter of this step, one of `guides`.
-        guides: guide filters in ascending order of their gains.
         statistics: statistics of the guide since `reset`.
         telemetry: telemetry of the last cycle, for the recording.
-        telemetry_fields: name and width of each field of `telemetry`, see `telemetry.TELEMETRY`.
+        telemetry_fields: name and width of each field of `telemetry`, see `telemetry.Telemetry`.
     """
 
-    telemetry_fields = tuple((name, TELEMETRY[name].itemsize // 8) for name in TELEMETRY.names or ())
+    telemetry_fields = TELEMETRY_FIELDS
 
     def __init__(
         self,
@@ -135,7 +78,7 @@ class AirwalkController:
         config: AirwalkConfig | None = None,
         exoskeleton: ExoskeletonParameters | None = None,
     ) -> None:
-        """Prepare every table, so that the control loop allocates no memory.
+        """Build the parts and prepare every table, so that the control loop allocates no memory.
 
         Args:
             robot: limits of the joints.
@@ -152,75 +95,67 @@ class AirwalkController:
         articulated = pinocchio_model(urdf(exoskeleton, robot))
         self._gravity = Gravity(articulated)
         check_hung(gait, robot, articulated, self._gravity, config.ankle_offset)
-        self._cycles = gait.cycles
-        self._deadbeat = Deadbeat(gait.duration, config.alpha)
-        self._pid = Pid(config.gains)
+        deadbeat, poses = Deadbeat(gait.duration, config.alpha), gait.tables().q
 
-        gaits = {RIGHT: gait, LEFT: gait.mirrored()}
-        tables = {stance: step.tables() for stance, step in gaits.items()}
-        ankles = [_SA, _LEG + _SA]
-        #: Rows (q_nom, q_nom') of a step; re-centring is added to the copy in `_reference`.
-        self._nominal = {}
-        for stance, table in tables.items():
-            rows = np.hstack([table.q, table.qd])
-            rows[:, ankles] += config.ankle_offset
-            self._nominal[stance] = rows
-        swinging = [self._nominal[RIGHT], self._nominal[LEFT]]  # left leg, right leg
-        self._feet = LevelFeet(robot, exoskeleton, articulated, self._deadbeat, swinging, config.ankle_offset)
-        self._reference = {stance: rows.copy() for stance, rows in self._nominal.items()}
-        time: Vector = np.arange(self._cycles + 1, dtype=np.float64) * PERIOD
-        (c0, c1), (c0d, c1d), _ = self._deadbeat.basis(time)
-        self._fading = int(np.searchsorted(time, self._deadbeat.end))
-        n = len(JOINTS)
-        self._basis = np.zeros((2, self._fading, 2 * n))  # rows to add per unit of s(0) and of s'(0)
-        self._basis[0, :, :n], self._basis[0, :, n:] = c0[: self._fading, None], c0d[: self._fading, None]
-        self._basis[1, :, :n], self._basis[1, :, n:] = c1[: self._fading, None], c1d[: self._fading, None]
+        self.reference = GaitReference(gait, deadbeat, config.ankle_offset)
+        nominal = self.reference.nominal
+        self._start_motion = StartMotion(nominal[RIGHT][0], config.startup)
+        swinging = [nominal[RIGHT], nominal[LEFT]]  # left leg, right leg
+        self._feet = LevelFeet(robot, exoskeleton, articulated, deadbeat, swinging, config.ankle_offset)
+        self.pid = Pid(config.gains)
+        self._assistance = Assistance(
+            AssistedInertia(articulated, poses),
+            gait,
+            config.friction,
+            decoupled=config.decoupled,
+            feedforward=config.feedforward,
+        )
+        torque_limits = backup_torque_limits(robot, config, self._gravity, poses)
+        self._guides = StepGuides(config, shape, gait, deadbeat, self._assistance, torque_limits)
+        self.guide = self._guides.filters[-1]
+        self._carry = CarryOver(config.blend)
 
-        self._inertia = AssistedInertia(articulated, tables[RIGHT].q)
-        feedforward = self._ideal_feedforward(gait) if config.feedforward else None
-        uf: Vector = np.zeros((len(time), 2)) if feedforward is None else bezier(feedforward, time / gait.duration)
-        swing = [_SH, _SK]
-        self.guides = [
-            GuideFilter(
-                guide_config,
-                shape,
-                self._deadbeat,
-                gait.coefficients[swing],
-                gaits[LEFT].coefficients[swing],
-                feedforward,
-            )
-            for guide_config in self._guide_configs(robot, tables[RIGHT].q)
-        ]
-        self.guide = self.guides[-1]
-        gentler = self.guides[:-1]
-        #: Largest assistance factor at which each guide is used; the stiffest guide has no entry.
-        self._taken_to = [largest_assistance(guide, config.guide_margin, config.hand_over) for guide in gentler]
-
-        ramp = np.arange(round(config.blend / PERIOD)) * (PERIOD / config.blend)
-        self._blend: Vector = 0.5 + 0.5 * np.cos(math.pi * ramp)
-        self._startup_cycles = round(config.startup / PERIOD)
-
-        self._last, self._carried, self._share = np.zeros(n), np.zeros(n), np.ones(n)
-        self._start_pose, self._start_row = np.zeros(n), np.zeros(2 * n)
-        self._deviation, self._rate, self._added = np.zeros(2 * n), np.zeros(2 * n), np.zeros_like(self._basis)
-        self._command = Command(self._pid.torque, np.zeros(len(MOTORS)))
-        telemetry = np.zeros(1, TELEMETRY)
-        self.telemetry = telemetry.view(np.float64)
-        self._step = np.zeros(1, STEP)
-        self._step["cycles"], self._step["acting"] = self._cycles, config.active
-        pid, feet, law = self._pid, self._feet, law_of(config.friction, self._inertia, config.decoupled)
-        #: Arguments of `kernel.run` from `steps` on, without the guide tables of the step, which are the last arguments.
-        self._kept: tuple[Any, ...] = (
-            self._step, feet.ankles, feet.cubics, self._gravity.links, np.zeros(n),
-            pid.gains, pid.limit, pid.integral, pid.torque, np.ascontiguousarray(uf), law,
-            self._last, self._carried, self._blend, self._command.vibration, telemetry,
-        )  # fmt: skip
-        self._run = compiled(run)
-        self._tables: tuple[Any, ...] = (*self._kept, *self.guide.tables)
-        still, attitudes, gyros = self._start_pose, np.zeros((len(IMUS), 4)), np.zeros((len(IMUS), 3))
-        self._run(0, False, self._start_row, still, still, attitudes, gyros, still, *self._tables)
-        self.statistics = AirwalkStatistics()
+        self._cycles, self._share = gait.cycles, np.ones(_N)
+        steps: Records[Step] = zeros(Step, 1)
+        outputs: Records[Outputs] = zeros(Outputs, 1)
+        telemetry = zeros(Telemetry, 1)
+        self.telemetry: Vector = telemetry.view(np.float64)
+        self._step, self._outputs = steps[0], outputs[0]
+        self._step.cycles, self._step.active = gait.cycles, config.active
+        self._command = Command(self._outputs.torque, self._outputs.vibration)
+        self._measured = Measured(
+            np.zeros(_N), np.zeros(_N), np.zeros((len(IMUS), 4)), np.zeros((len(IMUS), 3)), np.zeros(_N)
+        )
+        self._parts = Parts(
+            steps=steps,
+            links=self._gravity.links,
+            pids=self.pid.records,
+            ankles=self._feet.ankles,
+            cubics=self._feet.cubics,
+            laws=self._assistance.laws,
+            feedforward=self._assistance.rows,
+            carries=self._carry.records,
+            blend=self._carry.blend,
+            outputs=outputs,
+            telemetry=telemetry,
+        )
+        self._compile()
         self._forget()
+
+    def _compile(self) -> None:
+        """Compile the kernel by a call whose results are discarded."""
+        inputs = 0, False, np.zeros(2 * _N), self._measured, self.guide.tables, self._parts
+        self._run = specialised(run, *inputs)
+
+    @property
+    def guides(self) -> list[GuideFilter]:
+        """Return the guide filters in ascending order of their gains."""
+        return self._guides.filters
+
+    @property
+    def desired(self) -> Vector:
+        """Return q_des [rad], then q_des' [rad/s] of the last cycle of a step, shape (24,)."""
+        return self._outputs.desired
 
     def guide_at(self, xi: float) -> GuideFilter:
         """Return the guide of lowest gains that is certified at Xi with `guide_margin`, or else the stiffest guide.
@@ -228,31 +163,15 @@ class AirwalkController:
         Args:
             xi: assistance factor in [0, 1].
         """
-        return next(
-            (guide for guide, to in zip(self.guides, self._taken_to, strict=False) if xi <= to), self.guides[-1]
-        )
+        return self._guides.at(xi)
 
     def certificate(self, xi: float) -> Certificate:
-        """Return the certificate of the guide used at an assistance factor.
-
-        The guide is not certified where the running control law differs from the certified one: while the baseline fades in,
-        at Xi = 1, and with `AirwalkConfig.decoupled` off.
+        """Return the certificate of the guide used at an assistance factor, see `StepGuides.certificate`.
 
         Args:
             xi: assistance factor in [0, 1].
         """
-        config = self.config
-        certificate = certify(self.guide_at(xi), xi, config.hand_over, self._inertia)
-        share = baseline_share(xi, config.fade)
-        if share == 1.0:
-            reason = "at Xi = 1 only the baseline controller drives the joints"
-        elif share > 0.0:
-            reason = f"fade: the certificate does not cover Xi {config.fade:g} to 1, where the baseline is blended in"
-        elif not config.decoupled:
-            reason = "the certificate holds for separate inertias, but hip and knee are coupled (decoupled=False)"
-        else:
-            return certificate
-        return replace(certificate, certified=False, reason=reason, joint_torque=None)
+        return self._guides.certificate(xi)
 
     def reset(self, state: State) -> None:
         """Restart the motion from the measured pose and torque of the joints.
@@ -262,58 +181,22 @@ class AirwalkController:
         """
         self._forget()
         self._changed_at = state.cycle
-        self._start_pose[:] = state.position
-        self._last[:] = state.torque
+        self._start_motion.start(state.position)
+        self._carry.start(state.torque)
         if state.torque_sent is not None:
-            self._pid.torque[:] = state.torque_sent
-        self._step["carry"] = True
+            self.pid.store_request(state.torque_sent)
 
     def _forget(self) -> None:
-        self._walking, self._stance, self._w, self._changed_at = False, RIGHT, 1.0, 0
-        self._step["carry"] = False
-        self._pid.reset()
+        """Clear every memory of the last motion."""
+        self._walking, self._assisting, self._stance, self._changed_at = False, False, RIGHT, 0
+        self._carry.cancel()
+        self.pid.reset()
         self._share.fill(1.0)
-        self._pid.start_step(RIGHT, self._share)
+        self.pid.start_step(RIGHT, self._share)
         self._command.vibration.fill(0.0)
         self._command.outside = False
         self.telemetry.fill(0.0)
         self.statistics = AirwalkStatistics()
-
-    def _guide_configs(self, robot: Robot, q: Vector) -> Iterator[GuideConfig]:
-        """Yield the configuration of each guide, lowest gains first.
-
-        The gains follow from the inertia of the swing leg along the step. The torque limit is what gravity and friction leave.
-        """
-        config = self.config
-        level = (1.0, 0.0, 0.0, 0.0)
-        weight = np.array([np.abs(self._gravity.torque(pose, level)) for pose in q[::20].copy()]).max(axis=0)
-        limits = [
-            float(robot.torque_max[joint] - weight[joint]) - config.friction.torque(joint, 2.0) for joint in (_SH, _SK)
-        ]
-        for part in (*config.gentler, 1.0):
-            hip, knee = (
-                BackupPolicy(j * (part * rate) ** 2, 2.0 * config.guide_damping * j * part * rate, j, limit)
-                for j, rate, limit in zip(self._inertia.inertias, config.guide_rate, limits, strict=True)
-            )
-            yield GuideConfig((hip, knee), config.disturbance, config.points, config.overlap, config.zeta)
-
-    def _ideal_feedforward(self, gait: Gait) -> Vector | None:
-        """Return u_f of SH and SK of the swing leg for the separate inertias: Bezier control points (2, 8) [Nm].
-
-        The feedforward of the gait applies to the coupled pair. It is converted with the mass matrix along the nominal
-        trajectory and fitted again.
-        """
-        swing = [_SH, _SK]
-        if gait.feedforward is None or not self.config.decoupled:
-            return None if gait.feedforward is None else gait.feedforward[swing]
-        table = gait.tables()
-        ideal = [
-            self._inertia.ideal(float(q[_SK]), float(qd[_SH]), float(qd[_SK]), (float(uf[_SH]), float(uf[_SK])))
-            for q, qd, uf in zip(table.q, table.qd, table.uf, strict=True)
-        ]
-        degree = gait.feedforward.shape[1] - 1
-        basis = bezier(np.eye(degree + 1), np.arange(self._cycles + 1) / self._cycles)
-        return np.asarray(np.linalg.lstsq(basis, np.array(ideal), rcond=None)[0].T)
 
     # -- one cycle ---------------------------------------------------------------------------------------------------
 
@@ -333,72 +216,66 @@ class AirwalkController:
                     self.statistics.steps += 1
                 self._change_step(state, LEFT if self._stance == RIGHT else RIGHT)
                 cycle = 0
-        elif cycle < self._startup_cycles:
+        elif cycle < self._start_motion.cycles:
             return self._move_to_start(state, cycle)
         else:
             self._walking = True
             self._change_step(state, RIGHT)
             cycle = 0
-        row, side = self._reference[self._stance][cycle], 1 - self._stance
-        level = self.config.flat_foot and self._feet.heard(state, side)
+        row, side = self.reference.row(self._stance, cycle), 1 - self._stance
+        level = self.config.flat_foot and self._feet.imu_valid(state, side)
         if self.config.flat_foot and not level:
-            self._feet.put(state, side, cycle, row)
-        sent = self._pid.torque if state.torque_sent is None else state.torque_sent
-        sensed = state.position, state.velocity, state.imu_quaternion, state.imu_gyro, sent
-        ratio, h, acting = self._run(cycle, level, row, *sensed, *self._tables)
-        self.statistics.count(cycle, ratio, h, acting)
-        self._command.outside = self._w < 1.0 and h < 0.0
+            row = self._feet.without_imu(state, side, cycle, row)
+        measured = self._measured
+        measured.q[:], measured.qd[:] = state.position, state.velocity
+        measured.attitudes[:], measured.gyros[:] = state.imu_quaternion, state.imu_gyro
+        measured.sent[:] = self.pid.requested if state.torque_sent is None else state.torque_sent
+        ratio, h, active = self._run(cycle, level, row, measured, self.guide.tables, self._parts)
+        self.statistics.count(cycle, ratio, h, active)
+        self._command.outside = self._assisting and h < 0.0
         return self._command
 
     def _move_to_start(self, state: State, cycle: int) -> Command:
-        """Move along a quintic from rest at the pose of `reset` to the first pose and speed of the gait, baseline only."""
-        x, duration = cycle / self._startup_cycles, self.config.startup
-        row, n = self._start_row, len(JOINTS)
-        first = self._nominal[RIGHT][0]
-        gap, speed = first[:n] - self._start_pose, first[n:]
-        row[:n] = self._start_pose + gap * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x))
-        row[:n] += speed * (duration * x**3 * (-4.0 + 7.0 * x - 3.0 * x * x))
-        row[n:] = gap * (30.0 * x * x * (1.0 - x) ** 2 / duration) + speed * (x * x * (-12.0 + 28.0 * x - 15.0 * x * x))
-        torque = self._pid.update(row, state.position, state.velocity, state.torque_sent)
-        torque += self._gravity.torque(state.position, state.imu_quaternion[_PELVIS].tolist())
-        hand_over(self._step, cycle, torque, self._last, self._carried, self._blend)
-        self.telemetry[:n] = row[:n]
+        """Follow the start motion with the baseline controller only."""
+        row, torque = self._start_motion.row(cycle), self._command.torque
+        tracking = self.pid.update(row, state.position, state.velocity, state.torque_sent)
+        holding = self._gravity.torque(state.position, state.imu_quaternion[_PELVIS].tolist())
+        np.add(tracking, holding, out=torque)
+        add_carried(self._carry.records, self._carry.blend, cycle, torque)
+        self.pid.store_request(torque)
+        self.telemetry[:_N] = row[:_N]
         return self._command
 
     def _change_step(self, state: State, stance: int) -> None:
+        """Start a step: re-centre the reference, then hand the assisted joints and the torque over."""
         self._changed_at, self._stance = state.cycle, stance
         self._command.step = (self._command.step or 0) + 1
-        config, n = self.config, len(JOINTS)
         xi = min(1.0, max(0.0, state.assistance_factor))
+        share = baseline_share(xi, self.config.fade)
+        self._assisting = share < 1.0
         self.statistics.factors.add(xi)
-        self._w = baseline_share(xi, config.fade)
-        leg = _LEG if stance == LEFT else 0
-        self._share.fill(1.0)
-        self._share[[leg + _SH, leg + _SK]] = self._w
-        self._pid.start_step(stance, self._share)
-
-        nominal, deviation, rate = self._nominal[stance], self._deviation, self._rate
-        np.subtract(state.position, nominal[0, :n], out=deviation[:n])
-        np.subtract(state.velocity, nominal[0, n:], out=rate[:n])
-        deviation[n:], rate[n:] = deviation[:n], rate[:n]
-        np.multiply(self._basis[0], deviation, out=self._added[0])
-        np.multiply(self._basis[1], rate, out=self._added[1])
-        np.add(self._added[0], self._added[1], out=self._added[0])
-        np.add(nominal[: self._fading], self._added[0], out=self._reference[stance][: self._fading])
-
+        leg = _LEG * (1 - stance)
         hip, knee = leg + _SH, leg + _SK
-        deviations, rates = (float(deviation[hip]), float(deviation[knee])), (float(rate[hip]), float(rate[knee]))
-        self.guide = self.guide_at(xi)
-        self.guide.start_step(xi, deviations, rates)
-        self._tables = (*self._kept, *self.guide.tables)
-        largest = config.hand_over
-        exceeded = max(map(abs, deviations)) > largest.deviation or max(map(abs, rates)) > largest.rate
+        self._share.fill(1.0)
+        self._share[[hip, knee]] = share
+        self.pid.start_step(stance, self._share)
+        self._start_guide(xi, self.reference.start_step(stance, state.position, state.velocity), (hip, knee))
+        if self.config.flat_foot:
+            self._feet.start_step(state, 1 - stance)
+        if not self._carry.pending:
+            self._carry.start(self.pid.requested)
+        step = self._step
+        step.stance, step.completed = stance, self.statistics.steps
+        step.xi, step.share, step.intensity = xi, share, intensity(xi)
+
+    def _start_guide(self, xi: float, deviation: Deviation, joints: tuple[int, int]) -> None:
+        """Start the guide of a step for the two assisted joints, and count a deviation beyond the certified hand-over."""
+        hip, knee = joints
+        angles = float(deviation.angle[hip]), float(deviation.angle[knee])
+        rates = float(deviation.rate[hip]), float(deviation.rate[knee])
+        self.guide = self._guides.at(xi)
+        self.guide.start_step(xi, angles, rates)
+        largest = self.config.hand_over
+        exceeded = max(map(abs, angles)) > largest.deviation or max(map(abs, rates)) > largest.rate
         if exceeded and self.statistics.steps:
             self.statistics.hand_overs_exceeded += 1
-        if config.flat_foot:
-            self._feet.start_step(state, 1 - stance)
-        step = self._step[0]
-        if not step["carry"]:
-            self._last[:] = self._pid.torque
-        step["stance"], step["completed"], step["carry"] = stance, self.statistics.steps, True
-        step["xi"], step["share"], step["intensity"] = xi, self._w, intensity(xi)

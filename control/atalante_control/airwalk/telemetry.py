@@ -3,31 +3,49 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
-import numpy as np
-import numpy.typing as npt
-
+from atalante_control.guide.kernel import Joint
+from atalante_control.structured import Records, dtype_of
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Telemetry of a cycle; angles in rad, pairs are SH and SK of the swing leg.
-TELEMETRY = np.dtype(
-    [
-        ("q_des", np.float64, len(JOINTS)),
-        ("error", np.float64, 2),  # q - q_des
-        ("q_bound", np.float64, 2),  # distance to the guide on the side of the error
-        ("guide", np.float64, 2),  # distances to the guide, upper and lower
-        ("h", np.float64, 2),  # safe backward image function
-        ("lambda", np.float64, 2),  # lambda + (1 - lambda) lambda_d
-        ("filter_active", np.float64, 2),  # 1 where the filter is active
-        ("step", np.float64),  # number of completed right-stance steps
-        ("phase", np.float64),  # t / T
-        ("stance", np.float64),  # 0 left, 1 right
-        ("assistance_factor", np.float64),  # Xi of this step
-    ]
+
+class Telemetry:
+    """Record of the telemetry of a cycle. Pairs are SH and SK of the swing leg."""
+
+    q_des: Annotated[Vector, len(JOINTS)]  # rad
+    error: Annotated[Vector, 2]  # rad, q - q_des
+    q_bound: Annotated[Vector, 2]  # rad, distance to the guide on the side of the error
+    guide: Annotated[Vector, 2]  # rad, distances to the guide of SH, upper and lower
+    h: Annotated[Vector, 2]  # safe backward image function
+    gate: Annotated[Vector, 2]  # lambda + (1 - lambda) lambda_d, published as `lambda`
+    filter_active: Annotated[Vector, 2]  # 1 where the filter is active
+    step: float  # number of completed right-stance steps
+    phase: float  # t / T
+    stance: float  # 0 left, 1 right
+    assistance_factor: float  # Xi of this step
+
+
+_DTYPE = dtype_of(Telemetry)
+#: Name and width of each published field, in the order of the record.
+TELEMETRY_FIELDS = tuple(
+    ({"gate": "lambda"}.get(name, name), _DTYPE[name].itemsize // 8) for name in _DTYPE.names or ()
 )
+
+
+class Step:
+    """Record of the values that are constant during a step."""
+
+    stance: int  # 0 left, 1 right
+    completed: int  # right-stance steps completed before this step
+    cycles: int  # cycles of a step
+    xi: float  # assistance factor
+    share: float  # w, weight of the baseline torque
+    intensity: float  # factor of the haptic levels
+    active: float  # gate above which the filter counts as active
 
 
 @dataclass
@@ -72,45 +90,33 @@ class AirwalkStatistics:
 
 
 def write_telemetry(
-    telemetry: npt.NDArray[np.void],
-    row: Vector,
-    joints: npt.NDArray[np.void],
-    errors: Pair,
-    active: float,
-    step: int,
-    phase: float,
-    stance: int,
-    xi: float,
+    telemetry: Records[Telemetry], step: Step, joints: Records[Joint], cycle: int, desired: Vector, errors: Pair
 ) -> tuple[Pair, float, float, bool]:
     """Write the telemetry of a cycle.
 
     Args:
-        telemetry: record to write, shape (1,), dtype TELEMETRY.
-        row: q_des [rad], then q_des' [rad/s], shape (24,).
-        joints: `GuideFilter.joints` after the tick of the cycle.
+        telemetry: record to write, shape (1,).
+        step: values of the step.
+        joints: `GuideTables.joints` after the tick of the cycle.
+        cycle: cycles since the step change.
+        desired: q_des [rad], then q_des' [rad/s], shape (24,).
         errors: q - q_des of SH and SK of the swing leg [rad].
-        active: gate above which the filter counts as active.
-        step: completed right-stance steps.
-        phase: time in the step over its duration, t / T.
-        stance: stance leg, 0 left, 1 right.
-        xi: assistance factor of the step.
 
     Returns:
         Distances to the guide on the sides of the errors [rad], the larger |e| / q_bound, the smaller h, and whether the filter
         is active on either joint.
     """
     record, hip, knee = telemetry[0], joints[0], joints[1]
-    for i in range(len(record["q_des"])):
-        record["q_des"][i] = row[i]
-    bounds = (
-        hip["upper"] if errors[0] > 0.0 else hip["lower"],
-        knee["upper"] if errors[1] > 0.0 else knee["lower"],
-    )
+    for i in range(len(record.q_des)):
+        record.q_des[i] = desired[i]
+    bounds = hip.upper if errors[0] > 0.0 else hip.lower, knee.upper if errors[1] > 0.0 else knee.lower
     for i in range(2):
-        record["error"][i], record["q_bound"][i] = errors[i], bounds[i]
-        record["h"][i], record["lambda"][i] = joints[i]["h"], joints[i]["gate"]
-        record["filter_active"][i] = joints[i]["gate"] > active
-    record["guide"][0], record["guide"][1] = hip["upper"], hip["lower"]
-    record["step"], record["phase"], record["stance"], record["assistance_factor"] = step, phase, stance, xi
+        joint = joints[i]
+        record.error[i], record.q_bound[i] = errors[i], bounds[i]
+        record.h[i], record.gate[i] = joint.h, joint.gate
+        record.filter_active[i] = joint.gate > step.active
+    record.guide[0], record.guide[1] = hip.upper, hip.lower
+    record.step, record.phase = step.completed, cycle / step.cycles
+    record.stance, record.assistance_factor = step.stance, step.xi
     ratio = max(abs(errors[0]) / bounds[0], abs(errors[1]) / bounds[1])
-    return bounds, ratio, min(hip["h"], knee["h"]), max(hip["gate"], knee["gate"]) > active
+    return bounds, ratio, min(hip.h, knee.h), max(hip.gate, knee.gate) > step.active

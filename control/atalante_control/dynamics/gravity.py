@@ -10,43 +10,43 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 import pinocchio
 
 from atalante_control.model import GRAVITY, ArticulatedModel
+from atalante_control.structured import Records, zeros
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
 
 Vector3 = tuple[float, float, float]
+Attitude = tuple[float, float, float, float]  # unit quaternion wxyz
 
-#: Data of one link, in the frame of its joint. The last four fields depend on the pose, the others are constant.
-LINK = np.dtype(
-    [
-        ("joint", np.int64),  # index in JOINTS
-        ("parent", np.int64),  # index of the parent link
-        ("offset", np.float64, 3),  # m, position of the joint in the frame of the parent link
-        # The rotation matrix from link to parent is turn[0] + sin(q) turn[1] + (1 - cos(q)) turn[2].
-        ("turn", np.float64, (3, 3, 3)),
-        ("axis", np.float64, 3),  # unit vector of the joint axis
-        ("mass", np.float64),  # kg
-        ("lever", np.float64, 3),  # m, centre of mass
-        ("rotation", np.float64, (3, 3)),  # rotation matrix from link to parent
-        ("down", np.float64, 3),  # m/s2, gravitational acceleration
-        ("force", np.float64, 3),  # N, force that holds the link and its descendants
-        ("moment", np.float64, 3),  # Nm, moment about the joint that holds the link and its descendants
-    ],
-    align=True,
-)
+
+class LinkRecord:
+    """Data of one link, in the frame of its joint. The last four fields depend on the pose, the others are constant."""
+
+    joint: int  # index in JOINTS
+    parent: int  # index of the parent link
+    offset: Annotated[Vector, 3]  # m, position of the joint in the frame of the parent link
+    # The rotation matrix from link to parent is turn[0] + sin(q) turn[1] + (1 - cos(q)) turn[2].
+    turn: Annotated[Vector, (3, 3, 3)]
+    axis: Annotated[Vector, 3]  # unit vector of the joint axis
+    mass: float  # kg
+    lever: Annotated[Vector, 3]  # m, centre of mass
+    rotation: Annotated[Vector, (3, 3)]  # rotation matrix from link to parent
+    down: Annotated[Vector, 3]  # m/s2, gravitational acceleration
+    force: Annotated[Vector, 3]  # N, force that holds the link and its descendants
+    moment: Annotated[Vector, 3]  # Nm, moment about the joint that holds the link and its descendants
 
 
 class Gravity:
     """Gravity torques u_g of the empty exoskeleton, suspended at its pelvis.
 
     Attributes:
-        links: tree of links for `hold`, dtype LINK, parents first.
+        links: data of the pelvis and the links for `hold`, parents first.
     """
 
     def __init__(self, articulated: ArticulatedModel) -> None:
@@ -70,63 +70,61 @@ class Gravity:
             Torques, shape (12,) [Nm], overwritten by the next call.
         """
         w, x, y, z = pelvis
-        self._hold(self.links, position, w, x, y, z, self._torque)
+        self._hold(self.links, position, (w, x, y, z), self._torque)
         return self._torque
 
 
-def _links(articulated: ArticulatedModel) -> npt.NDArray[np.void]:
+def _links(articulated: ArticulatedModel) -> Records[LinkRecord]:
     """Return the data of the links of a model, parents first. Row 0 is the pelvis."""
     model, into, _ = articulated
     data, neutral = model.createData(), pinocchio.neutral(model)
     joint_of = {int(q): joint for joint, q in enumerate(into)}
-    links = np.zeros(model.njoints, LINK)
+    links: Records[LinkRecord] = zeros(LinkRecord, model.njoints)
     for i in range(1, model.njoints):
         link, placement, inertia = links[i], model.jointPlacements[i], model.inertias[i]
         axis = pinocchio.computeJointJacobian(model, data, neutral, i)[3:, model.idx_vs[i]]
         cross = pinocchio.skew(axis)
-        link["joint"], link["parent"] = joint_of[model.idx_qs[i]], model.parents[i]
-        link["offset"], link["axis"] = placement.translation, axis
-        link["turn"] = [placement.rotation @ part for part in (np.eye(3), cross, cross @ cross)]
-        link["mass"], link["lever"] = inertia.mass, inertia.lever
+        link.joint, link.parent = joint_of[model.idx_qs[i]], model.parents[i]
+        link.offset[:], link.axis[:] = placement.translation, axis
+        link.turn[:] = [placement.rotation @ part for part in (np.eye(3), cross, cross @ cross)]
+        link.mass, link.lever[:] = inertia.mass, inertia.lever
     return links
 
 
-def hold(links: npt.NDArray[np.void], position: Vector, w: float, x: float, y: float, z: float, torque: Vector) -> None:
+def hold(links: Records[LinkRecord], position: Vector, pelvis: Attitude, torque: Vector) -> None:
     """Compute the gravity torques u_g and write them into `torque`.
 
     Args:
-        links: tree of links, dtype LINK, parents first; the fields that depend on the pose are overwritten.
+        links: `Gravity.links`; the fields that depend on the pose are overwritten.
         position: joint angles, shape (12,) [rad].
-        w: first component of the pelvis attitude, a unit quaternion, pelvis to world.
-        x: second component of the pelvis attitude.
-        y: third component of the pelvis attitude.
-        z: fourth component of the pelvis attitude.
+        pelvis: attitude of the pelvis IMU, unit quaternion wxyz, pelvis to world.
         torque: u_g, shape (12,) [Nm], overwritten.
     """
-    down = links[0]["down"]
+    w, x, y, z = pelvis
+    down = links[0].down
     down[0], down[1] = -GRAVITY * 2.0 * (x * z - w * y), -GRAVITY * 2.0 * (y * z + w * x)
     down[2] = -GRAVITY * (1.0 - 2.0 * (x * x + y * y))
     for i in range(1, len(links)):
         link = links[i]
-        angle, turn, rotation = position[link["joint"]], link["turn"], link["rotation"]
+        angle, turn, rotation = position[link.joint], link.turn, link.rotation
         sine, versine = math.sin(angle), 1.0 - math.cos(angle)
         for j in range(3):
             for k in range(3):
                 rotation[j, k] = turn[0, j, k] + sine * turn[1, j, k] + versine * turn[2, j, k]
-        down, force, moment, mass = link["down"], link["force"], link["moment"], link["mass"]
-        down[0], down[1], down[2] = _product(rotation.T, links[link["parent"]]["down"])
+        down, force, moment, mass = link.down, link.force, link.moment, link.mass
+        down[0], down[1], down[2] = _product(rotation.T, links[link.parent].down)
         force[0], force[1], force[2] = -mass * down[0], -mass * down[1], -mass * down[2]
-        moment[0], moment[1], moment[2] = _cross(link["lever"], force)
+        moment[0], moment[1], moment[2] = _cross(link.lever, force)
     for i in range(len(links) - 1, 0, -1):
         link = links[i]
-        axis, moment = link["axis"], link["moment"]
-        torque[link["joint"]] = axis[0] * moment[0] + axis[1] * moment[1] + axis[2] * moment[2]
-        pull, twist = _product(link["rotation"], link["force"]), _product(link["rotation"], moment)
-        arm = _cross(link["offset"], pull)
-        parent = links[link["parent"]]
+        axis, moment = link.axis, link.moment
+        torque[link.joint] = axis[0] * moment[0] + axis[1] * moment[1] + axis[2] * moment[2]
+        pull, twist = _product(link.rotation, link.force), _product(link.rotation, moment)
+        arm = _cross(link.offset, pull)
+        parent = links[link.parent]
         for j in range(3):
-            parent["force"][j] += pull[j]
-            parent["moment"][j] += twist[j] + arm[j]
+            parent.force[j] += pull[j]
+            parent.moment[j] += twist[j] + arm[j]
 
 
 def _product(matrix: Vector, v: Vector) -> Vector3:

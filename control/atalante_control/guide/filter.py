@@ -17,14 +17,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from atalante_control.gait.gait import PERIOD
 from atalante_control.gait.recentering import Deadbeat
 from atalante_control.guide.backup_policy import BackupPolicy, ForcedResponse, forced_response, free_drift
-from atalante_control.guide.kernel import BOUND, JOINT, P, errors_ahead, tick
+from atalante_control.guide.kernel import BOUND, GuideTables, Joint, P, errors_ahead, tick
 from atalante_control.guide.shapes import GuideShape
-from atalante_hal.compiled import compiled
+from atalante_control.structured import Records, zeros
+from atalante_hal.compiled import specialised
 from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
@@ -67,9 +67,7 @@ class GuideFilter:
     Call `start_step` at each step change, then `tick` once a cycle.
 
     Attributes:
-        joints: records of SH and SK for `kernel`, dtype JOINT; h, gate and guide are those of the last tick.
-        flow: table `flow` of `kernel` for SH and SK, shape (2, horizon + 1, 9).
-        step: table `step` of `kernel` for SH and SK, shape (2, horizon + 1, 6).
+        tables: tables of `kernel` for SH and SK; h, gate and guide of `tables.joints` are those of the last tick.
         nominal: Bezier control points of SH and SK, shape (2, 8) [rad].
         cycles: cycles of a step.
         stride: cycles of a grid interval.
@@ -119,12 +117,12 @@ class GuideFilter:
             tables.append(np.concatenate([self.forced[joint], free_drift(*curve)], axis=2))
         #: First columns of `step` for the nominal, per unit of deviation and per unit of rate. Shape (3, 2, horizon + 1, 4).
         self._parts = np.stack(tables, axis=1)
-        self.flow = np.array([_flow(config, joint, self.time) for joint in (0, 1)])
-        self.step = np.empty((2, self.horizon + 1, 6))
-        self.joints = _joints(config, int(self.grid[0]), self.stride)
-        self._tick = compiled(tick)
+        first = int(self.grid[0])
+        flow = np.array([_flow(config, joint, self.time) for joint in (0, 1)])
+        self.tables = GuideTables(_joints(config, first, self.stride), flow, np.empty((2, self.horizon + 1, 6)))
         self.start_step(0.0, (0.0, 0.0), (0.0, 0.0))
-        self._tick(self.joints.copy(), self.flow, self.step, 0, 0.0, 0.0, 0.0, 0.0)
+        discarded = self.tables._replace(joints=_joints(config, first, self.stride))
+        self._tick = specialised(tick, discarded, 0, 0.0, 0.0, 0.0, 0.0)
 
     def start_step(self, xi: float, deviation: Pair, rate: Pair) -> None:
         """Start a step: compute the width from Xi and P from the deviations at the step change.
@@ -134,12 +132,13 @@ class GuideFilter:
             deviation: s(0) of SH and SK [rad].
             rate: s'(0) of SH and SK [rad/s].
         """
-        joints, (nominal, per_deviation, per_rate) = self.joints, self._parts
-        if xi != joints["xi"][0]:
-            self.step[:, :, BOUND:] = self.shape.bounds(self.time / self.deadbeat.duration, xi)
+        (joints, _, step), (nominal, per_deviation, per_rate) = self.tables, self._parts
+        if xi != joints[0].xi:
+            step[:, :, BOUND:] = self.shape.bounds(self.time / self.deadbeat.duration, xi)
         moved = per_deviation * np.reshape(deviation, (2, 1, 1)) + per_rate * np.reshape(rate, (2, 1, 1))
-        np.add(moved, nominal, out=self.step[:, :, :BOUND])
-        joints["xi"], joints["fresh"] = xi, True
+        np.add(moved, nominal, out=step[:, :, :BOUND])
+        for i in (0, 1):
+            joints[i].xi, joints[i].fresh = xi, True
 
     def tick(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Pair:
         """Return u_v of SH and SK [Nm].
@@ -152,32 +151,28 @@ class GuideFilter:
             ed_knee: q' - q_des' of SK [rad/s].
         """
         cycle = min(cycle, self.cycles)
-        return self._tick(self.joints, self.flow, self.step, cycle, e_hip, ed_hip, e_knee, ed_knee)
-
-    @property
-    def tables(self) -> tuple[npt.NDArray[np.void], Vector, Vector]:
-        """Return `joints`, `flow` and `step`, the tables of `kernel`."""
-        return self.joints, self.flow, self.step
+        return self._tick(self.tables, cycle, e_hip, ed_hip, e_knee, ed_knee)
 
     @property
     def h(self) -> list[float]:
         """Return the safe backward image function h of SH and SK at the last tick; it is at least 0 inside the image."""
-        return list(self.joints["h"].tolist())
+        return [float(self.tables.joints[i].h) for i in (0, 1)]
 
     @property
     def gates(self) -> list[float]:
         """Return lambda + (1 - lambda) lambda_d of SH and SK at the last tick."""
-        return list(self.joints["gate"].tolist())
+        return [float(self.tables.joints[i].gate) for i in (0, 1)]
 
     @property
     def bounds(self) -> list[float]:
         """Return the upper and the lower distance to the guide at the last tick [rad]."""
-        return [float(self.joints[side][0]) for side in ("upper", "lower")]
+        hip = self.tables.joints[0]
+        return [float(hip.upper), float(hip.lower)]
 
     @property
     def stepped(self) -> int:
         """Return the number of rollouts computed cycle by cycle, because the backup policy saturates along them."""
-        return int(self.joints["stepped"].sum())
+        return sum(int(self.tables.joints[i].stepped) for i in (0, 1))
 
     def rollouts(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Vector:
         """Predict the errors under the unsaturated backup policy at the remaining grid points, from the exact flow.
@@ -195,30 +190,32 @@ class GuideFilter:
         points = self.grid[self.grid >= cycle].tolist()
         rolled = []
         for joint, (e, ed) in enumerate(((e_hip, ed_hip), (e_knee, ed_knee))):
-            flow, step = self.flow[joint], self.step[joint]
+            flow, step = self.tables.flow[joint], self.tables.step[joint]
             y, yd = e - step[cycle, P], ed - step[cycle, P + 1]
             rolled.append([errors_ahead(flow[point - cycle], step[point], y, yd) for point in points])
         return np.array(rolled).swapaxes(1, 2).reshape(4, len(points))
 
     def solution(self) -> Vector:
         """Return P of this step at every cycle, (e, e') of SH, then of SK. Shape (horizon + 1, 4) [rad, rad/s]."""
-        hip, knee = self.step[:, :, P : P + 2]
+        hip, knee = self.tables.step[:, :, P : P + 2]
         return np.hstack([hip, knee])
 
 
-def _joints(config: GuideConfig, first: int, stride: int) -> npt.NDArray[np.void]:
-    joints, one = np.zeros(2, JOINT), np.array([PERIOD])
+def _joints(config: GuideConfig, first: int, stride: int) -> Records[Joint]:
+    """Return the records of SH and SK before the first step."""
+    one = np.array([PERIOD])
+    joints: Records[Joint] = zeros(Joint, 2)
     for i, policy in enumerate(config.policies):
         joint, (low, high) = joints[i], config.disturbance[i]
-        joint["kp"], joint["kd"], joint["inertia"] = policy.kp, policy.kd, policy.inertia
-        joint["limit"], joint["counted"] = policy.torque_limit, (1.0 - config.reserve) * policy.torque_limit
-        joint["up"], joint["down"] = high, low
-        (joint["phi11"], joint["phi12"]), (joint["phi21"], joint["phi22"]) = policy.transition(one)[0]
-        joint["s1"], joint["s2"] = policy.step_response(one)[0]
-    joints["monotone"] = all(policy.monotone for policy in config.policies)
-    joints["first"], joints["stride"] = first, stride
-    joints["zeta"], joints["smoothing"] = config.zeta, PERIOD / (config.derivative_time + PERIOD)
-    joints["xi"], joints["h"], joints["upper"], joints["lower"] = math.nan, 1.0, math.inf, math.inf
+        joint.kp, joint.kd, joint.inertia = policy.kp, policy.kd, policy.inertia
+        joint.limit, joint.counted = policy.torque_limit, (1.0 - config.reserve) * policy.torque_limit
+        joint.up, joint.down = high, low
+        (joint.phi11, joint.phi12), (joint.phi21, joint.phi22) = policy.transition(one)[0]
+        joint.s1, joint.s2 = policy.step_response(one)[0]
+        joint.monotone = all(policy.monotone for policy in config.policies)
+        joint.first, joint.stride = first, stride
+        joint.zeta, joint.smoothing = config.zeta, PERIOD / (config.derivative_time + PERIOD)
+        joint.xi, joint.h, joint.upper, joint.lower = math.nan, 1.0, math.inf, math.inf
     return joints
 
 

@@ -4,46 +4,60 @@
 within the limit of the drive (`_linear`). Beyond the limit the rollout is computed cycle by cycle (`limited`): the torque is
 constant, and the error is a known drift plus a parabola. When the torque is within the limit again, the flow is linear.
 
-Three tables describe a joint: its record of dtype JOINT; `flow`, one row for each cycle ahead, shape (horizon + 1, 9); and
-`step`, one row for each cycle since the step change, shape (horizon + 1, 6).
+`GuideTables` names the tables, `Joint` the constants and results of a joint.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
-
-import numpy as np
-import numpy.typing as npt
+from typing import NamedTuple
 
 from atalante_control.gait.gait import PERIOD
+from atalante_control.structured import Records
 from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Record of a joint: constants, values of the step and results of the last tick.
-JOINT = np.dtype(
-    [
-        *((name, np.float64) for name in ("kp", "kd", "inertia", "limit")),  # of the backup policy
-        ("counted", np.float64),  # Nm, torque limit less the reserve, used by the rollouts
-        ("up", np.float64),  # Nm, u_ext_max
-        ("down", np.float64),  # Nm, u_ext_min
-        *((name, np.float64) for name in ("phi11", "phi12", "phi21", "phi22", "s1", "s2")),  # Phi and S of one cycle
-        ("monotone", np.bool_),  # see `BackupPolicy.monotone`
-        ("first", np.int64),  # cycle of the first point of the grid
-        ("stride", np.int64),  # cycles between two points of the grid
-        ("zeta", np.float64),  # s, gain of the derivative term
-        ("smoothing", np.float64),  # weight of a new value in the low-pass filter of dh/dt
-        ("xi", np.float64),  # assistance factor of the step
-        ("fresh", np.bool_),  # true before the first tick of a step, when dh/dt is not defined
-        ("h", np.float64),  # safe backward image function
-        ("rate", np.float64),  # 1/s, dh/dt
-        ("gate", np.float64),  # lambda + (1 - lambda) lambda_d
-        ("upper", np.float64),  # rad, distance to the guide above
-        ("lower", np.float64),  # rad, distance to the guide below
-        ("stepped", np.int64),  # number of rollouts computed cycle by cycle
-    ]
-)
+
+class Joint:
+    """Record of an assisted joint: constants, values of the step, and results of the last tick."""
+
+    kp: float  # Nm/rad, of the backup policy
+    kd: float  # Nm s/rad, of the backup policy
+    inertia: float  # kg m2
+    limit: float  # Nm, torque limit of the backup policy
+    counted: float  # Nm, torque limit less the reserve, used by the rollouts
+    up: float  # Nm, u_ext_max
+    down: float  # Nm, u_ext_min
+    phi11: float  # error after one cycle per unit of e
+    phi12: float  # s, error after one cycle per unit of e'
+    phi21: float  # 1/s, rate of the error after one cycle per unit of e
+    phi22: float  # rate of the error after one cycle per unit of e'
+    s1: float  # rad/Nm, error after one cycle per unit of disturbance
+    s2: float  # rad/(Nm s), rate of the error after one cycle per unit of disturbance
+    monotone: bool  # see `BackupPolicy.monotone`
+    first: int  # cycle of the first point of the grid
+    stride: int  # cycles between two points of the grid
+    zeta: float  # s, gain of the derivative term
+    smoothing: float  # weight of a new value in the low-pass filter of dh/dt
+    xi: float  # assistance factor of the step
+    fresh: bool  # true before the first tick of a step, when dh/dt is not defined
+    h: float  # safe backward image function
+    rate: float  # 1/s, dh/dt
+    gate: float  # lambda + (1 - lambda) lambda_d
+    upper: float  # rad, distance to the guide above
+    lower: float  # rad, distance to the guide below
+    stepped: int  # number of rollouts computed cycle by cycle
+
+
+class GuideTables(NamedTuple):
+    """Tables of the guide filter for SH and SK of the swing leg, index 0 and 1 of the first axis."""
+
+    joints: Records[Joint]  # (2,) `tick` writes its results to them
+    flow: Vector  # (2, horizon + 1, 9) flow of the backup policy, one row for each cycle ahead; columns see `ERROR`
+    step: Vector  # (2, horizon + 1, 6) one row for each cycle since the step change; columns see `P`
+
+
 #: Columns of `flow`: error per unit of e and of e', then the largest error added by the disturbance, up and down; the same four
 #: columns for the torque Kp e + Kd e'; then the error under a constant torque of 1 Nm.
 ERROR, ERROR_ADDED, TORQUE, TORQUE_ADDED, STEADY = 0, 2, 4, 6, 8
@@ -53,22 +67,11 @@ P, DRIFT, BOUND = 0, 2, 4
 _HOPELESS = 2.0  # |e| / q_bound at which a rollout ends early; lambda is 1 for every value above 1
 
 
-def tick(
-    joints: npt.NDArray[np.void],
-    flow: Vector,
-    step: Vector,
-    cycle: int,
-    e_hip: float,
-    ed_hip: float,
-    e_knee: float,
-    ed_knee: float,
-) -> Pair:
+def tick(guide: GuideTables, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Pair:
     """Compute u_v of SH and SK of one cycle.
 
     Args:
-        joints: records of SH and SK, shape (2,), dtype JOINT; the results of the tick are written to them.
-        flow: tables `flow` of SH and SK, shape (2, horizon + 1, 9).
-        step: tables `step` of SH and SK, shape (2, horizon + 1, 6).
+        guide: tables of the guide filter; the results of the tick are written to `joints`.
         cycle: cycles since the step change, at most the length of the step.
         e_hip: q - q_des of SH [rad].
         ed_hip: q' - q_des' of SH [rad/s].
@@ -79,20 +82,20 @@ def tick(
         u_v of SH and SK [Nm].
     """
     return (
-        _act(joints[0], flow[0], step[0], cycle, e_hip, ed_hip),
-        _act(joints[1], flow[1], step[1], cycle, e_knee, ed_knee),
+        _act(guide.joints[0], guide.flow[0], guide.step[0], cycle, e_hip, ed_hip),
+        _act(guide.joints[1], guide.flow[1], guide.step[1], cycle, e_knee, ed_knee),
     )
 
 
-def _act(joint: Any, flow: Vector, step: Vector, cycle: int, e: float, ed: float) -> float:
+def _act(joint: Joint, flow: Vector, step: Vector, cycle: int, e: float, ed: float) -> float:
     ratio = _largest_ratio(joint, flow, step, cycle, e, ed)
     h, rate = 1.0 - ratio * ratio, 0.0
-    if not joint["fresh"]:
-        rate = joint["rate"] + joint["smoothing"] * ((h - joint["h"]) / PERIOD - joint["rate"])
-    weight = damped_gate(gate(h, joint["xi"]), rate, joint["zeta"])
-    joint["h"], joint["rate"], joint["gate"], joint["fresh"] = h, rate, weight, False
-    joint["upper"], joint["lower"] = step[cycle, BOUND], step[cycle, BOUND + 1]
-    u, limit = -joint["kp"] * e - joint["kd"] * ed, joint["limit"]
+    if not joint.fresh:
+        rate = joint.rate + joint.smoothing * ((h - joint.h) / PERIOD - joint.rate)
+    weight = damped_gate(gate(h, joint.xi), rate, joint.zeta)
+    joint.h, joint.rate, joint.gate, joint.fresh = h, rate, weight, False
+    joint.upper, joint.lower = step[cycle, BOUND], step[cycle, BOUND + 1]
+    u, limit = -joint.kp * e - joint.kd * ed, joint.limit
     return weight * float(limit if u > limit else -limit if u < -limit else u)
 
 
@@ -123,35 +126,35 @@ def damped_gate(gate: float, rate: float, zeta: float) -> float:
     return gate + (1.0 - gate) * damping if damping < 1.0 else 1.0
 
 
-def _largest_ratio(joint: Any, flow: Vector, step: Vector, cycle: int, e: float, ed: float) -> float:
+def _largest_ratio(joint: Joint, flow: Vector, step: Vector, cycle: int, e: float, ed: float) -> float:
     """Return the largest |e| / q_bound now and ahead, under both extreme disturbances.
 
     A rollout is computed cycle by cycle only if the drive saturates while it pushes away from the side of the rollout. A
     rollout of a monotone loop that saturates in the other direction stays below the linear rollout, which then is its bound.
     """
     worst = float(e / step[cycle, BOUND] if e > 0.0 else -e / step[cycle, BOUND + 1])
-    asked = (joint["kp"] * e + joint["kd"] * ed) / joint["counted"]
+    asked = (joint.kp * e + joint.kd * ed) / joint.counted
     ratios, torques = _linear(joint, flow, step, cycle, e, ed)
     for side in range(2):
-        against = abs(asked) if not joint["monotone"] else -asked if side else asked
+        against = abs(asked) if not joint.monotone else -asked if side else asked
         if against > 1.0 or torques[side] > 1.0:
-            joint["stepped"] += 1
+            joint.stepped += 1
             worst = max(worst, limited(joint, flow, step, side, cycle, e, ed))
         else:
             worst = max(worst, ratios[side])
     return worst
 
 
-def _linear(joint: Any, flow: Vector, step: Vector, cycle: int, e: float, ed: float) -> tuple[Pair, Pair]:
+def _linear(joint: Joint, flow: Vector, step: Vector, cycle: int, e: float, ed: float) -> tuple[Pair, Pair]:
     """Return the largest |e| / q_bound and the largest torque over `counted` of the linear rollouts.
 
     Each is a pair: rollout under the upper extreme disturbance, then under the lower one.
     """
-    kp, kd, monotone = joint["kp"], joint["kd"], joint["monotone"]
+    kp, kd, monotone = joint.kp, joint.kd, joint.monotone
     y, yd = e - step[cycle, P], ed - step[cycle, P + 1]
     above = below = torque_above = torque_below = -math.inf
-    first = cycle + int((joint["first"] - cycle) % joint["stride"])
-    for point in range(first, len(step), joint["stride"]):
+    first = cycle + int((joint.first - cycle) % joint.stride)
+    for point in range(first, len(step), joint.stride):
         now, ahead = step[point], flow[point - cycle]
         e_up, e_down = errors_ahead(ahead, now, y, yd)
         torque = ahead[TORQUE] * y + ahead[TORQUE + 1] * yd + kp * now[P] + kd * now[P + 1]
@@ -160,7 +163,7 @@ def _linear(joint: Any, flow: Vector, step: Vector, cycle: int, e: float, ed: fl
             up, down = abs(up), abs(down)
         above, below = max(above, e_up / now[BOUND]), max(below, e_down / now[BOUND + 1])
         torque_above, torque_below = max(torque_above, up), max(torque_below, down)
-    return (above, below), (torque_above / joint["counted"], torque_below / joint["counted"])
+    return (above, below), (torque_above / joint.counted, torque_below / joint.counted)
 
 
 def errors_ahead(flow: Vector, step: Vector, y: float, yd: float) -> Pair:
@@ -176,11 +179,11 @@ def errors_ahead(flow: Vector, step: Vector, y: float, yd: float) -> Pair:
     return error + flow[ERROR_ADDED], flow[ERROR_ADDED + 1] - error
 
 
-def limited(joint: Any, flow: Vector, step: Vector, side: int, cycle: int, e: float, ed: float) -> float:
+def limited(joint: Joint, flow: Vector, step: Vector, side: int, cycle: int, e: float, ed: float) -> float:
     """Return the largest |e| / q_bound ahead of a rollout along which the drive saturates.
 
     Args:
-        joint: record of the joint, dtype JOINT.
+        joint: record of the joint.
         flow: table `flow` of the joint.
         step: table `step` of the joint.
         side: 0: e under the upper extreme disturbance; 1: -e under the lower extreme disturbance.
@@ -188,10 +191,10 @@ def limited(joint: Any, flow: Vector, step: Vector, side: int, cycle: int, e: fl
         e: error at the start [rad].
         ed: rate of the error at the start [rad/s].
     """
-    sign, external = (-1.0, joint["down"]) if side else (1.0, joint["up"])
-    limit, horizon, start, worst, linear = joint["counted"], len(step) - 1, cycle, 0.0, False
+    sign, external = (-1.0, joint.down) if side else (1.0, joint.up)
+    limit, horizon, start, worst, linear = joint.counted, len(step) - 1, cycle, 0.0, False
     while cycle < horizon and worst < _HOPELESS:
-        u, now, then = -joint["kp"] * e - joint["kd"] * ed, step[cycle], step[cycle + 1]
+        u, now, then = -joint.kp * e - joint.kd * ed, step[cycle], step[cycle + 1]
         if -limit <= u <= limit:
             if not linear:
                 ratios, torques = _linear(joint, flow, step, cycle, e, ed)
@@ -199,11 +202,11 @@ def limited(joint: Any, flow: Vector, step: Vector, side: int, cycle: int, e: fl
                     return max(worst, ratios[side])
             linear = True
             y, yd = e - now[P], ed - now[P + 1]
-            e = then[P] + joint["phi11"] * y + joint["phi12"] * yd + joint["s1"] * external
-            ed = then[P + 1] + joint["phi21"] * y + joint["phi22"] * yd + joint["s2"] * external
+            e = then[P] + joint.phi11 * y + joint.phi12 * yd + joint.s1 * external
+            ed = then[P + 1] + joint.phi21 * y + joint.phi22 * yd + joint.s2 * external
         else:
             linear = False
-            gained = (math.copysign(limit, u) + external) / joint["inertia"] * PERIOD
+            gained = (math.copysign(limit, u) + external) / joint.inertia * PERIOD
             y, yd = e - now[DRIFT], ed - now[DRIFT + 1]
             e = then[DRIFT] + y + (yd + 0.5 * gained) * PERIOD
             ed = then[DRIFT + 1] + yd + gained

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,7 @@ import pinocchio
 from atalante_control.gait.gait import PERIOD
 from atalante_control.gait.recentering import Deadbeat
 from atalante_control.model import ArticulatedModel, ExoskeletonParameters, imu_link
+from atalante_control.structured import Records, zeros
 from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, SIDES, Robot
 from atalante_hal.types import State, Vector
 
@@ -33,19 +34,17 @@ _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 _IMU_AGE = 10  # largest age of a valid IMU message in cycles, its timeout in the DBC
 
-#: Record of an ankle: constants, then the deviations at the step change for the re-centring.
-ANKLE = np.dtype(
-    [
-        ("geometry", np.float64, 4),  # `FlatFoot.geometry`
-        ("offset", np.float64),  # rad, added to SA
-        ("joints", np.int64, 2),  # indices of SA and HA in JOINTS
-        ("low", np.float64, 2),  # rad, smallest targets
-        ("high", np.float64, 2),  # rad, largest targets
-        ("deviation", np.float64, 2),  # rad, from the target at the step change
-        ("rate", np.float64, 2),  # rad/s
-    ],
-    align=True,
-)
+
+class Ankle:
+    """Record of an ankle: constants, then the deviations at the step change for the re-centring."""
+
+    geometry: Annotated[Vector, 4]  # `FlatFoot.geometry`
+    offset: float  # rad, added to SA
+    joints: Annotated[npt.NDArray[np.int64], 2]  # indices of SA and HA in JOINTS
+    low: Annotated[Vector, 2]  # rad, smallest targets of SA and HA
+    high: Annotated[Vector, 2]  # rad, largest targets of SA and HA
+    deviation: Annotated[Vector, 2]  # rad, of SA and HA from the target at the step change
+    rate: Annotated[Vector, 2]  # rad/s, of SA and HA from the target at the step change
 
 
 @dataclass(frozen=True)
@@ -121,11 +120,12 @@ def flat_feet(parameters: ExoskeletonParameters) -> tuple[FlatFoot, FlatFoot]:
 class LevelFeet:
     """Flat-foot targets that replace the nominal ones of the swing ankle, with their own re-centring.
 
-    Call `start_step` at each step change, then `put_level` once a cycle, or `put` while the tibia IMU is lost.
+    Call `start_step` at each step change. Then call `write_level_ankle` once a cycle, or `without_imu` while the tibia IMU is
+    lost.
 
     Attributes:
-        ankles: records of the left and the right ankle, dtype ANKLE.
-        cubics: c0 and c1 of the re-centring, then their derivatives, one row for each cycle until it ends.
+        ankles: records of the left and the right ankle.
+        cubics: c0 and c1 of the re-centring, then their derivatives, one row for each cycle until it ends, shape (n, 4).
     """
 
     def __init__(
@@ -148,16 +148,15 @@ class LevelFeet:
             offset: angle added to SA [rad].
         """
         self._nominal, self._tibiae = nominal, Tibiae(articulated)
-        self.ankles = np.zeros(len(SIDES), ANKLE)
-        self.ankles["offset"] = offset
-        for side, (ankle, foot) in enumerate(zip(self.ankles, flat_feet(exoskeleton), strict=True)):
-            joints = [side * len(LEG_JOINTS) + joint for joint in (_SA, _HA)]
-            ankle["geometry"], ankle["joints"] = foot.geometry, joints
-            ankle["low"] = robot.position_min[joints] + _STOP_MARGIN
-            ankle["high"] = robot.position_max[joints] - _STOP_MARGIN
+        self.ankles: Records[Ankle] = zeros(Ankle, len(SIDES))
+        for side, foot in enumerate(flat_feet(exoskeleton)):
+            ankle, joints = self.ankles[side], [side * len(LEG_JOINTS) + joint for joint in (_SA, _HA)]
+            ankle.geometry[:], ankle.offset, ankle.joints[:] = foot.geometry, offset, joints
+            ankle.low[:] = robot.position_min[joints] + _STOP_MARGIN
+            ankle.high[:] = robot.position_max[joints] - _STOP_MARGIN
         time: Vector = np.arange(len(nominal[0]), dtype=np.float64) * PERIOD
         (c0, c1), (c0d, c1d), _ = deadbeat.basis(time[: np.searchsorted(time, deadbeat.end)])
-        self.cubics = np.column_stack([c0, c1, c0d, c1d])
+        self.cubics: Vector = np.column_stack([c0, c1, c0d, c1d])
 
     def start_step(self, state: State, side: int) -> None:
         """Store the deviation of the swing ankle from its target for the re-centring.
@@ -167,11 +166,11 @@ class LevelFeet:
             side: leg that swings now, 0 left, 1 right.
         """
         ankle, (angles, rates) = self.ankles[side], self._target(state, side, 0)
-        ankle["deviation"] = state.position[ankle["joints"]] - angles
-        ankle["rate"] = state.velocity[ankle["joints"]] - rates
+        ankle.deviation[:] = state.position[ankle.joints] - angles
+        ankle.rate[:] = state.velocity[ankle.joints] - rates
 
-    def heard(self, state: State, side: int) -> bool:
-        """Return whether the IMU of a tibia is valid, so that `put_level` can use it.
+    def imu_valid(self, state: State, side: int) -> bool:
+        """Return whether the IMU of a tibia is valid, so that `write_level_ankle` can use it.
 
         Args:
             state: measured state of the robot.
@@ -179,8 +178,8 @@ class LevelFeet:
         """
         return not state.imu_rows or bool(state.age[state.imu_rows[_TIBIAE[side]]] <= _IMU_AGE)
 
-    def put(self, state: State, side: int, cycle: int, row: Vector) -> None:
-        """Write the targets of the swing ankle into a row without the tibia IMU.
+    def without_imu(self, state: State, side: int, cycle: int, row: Vector) -> Vector:
+        """Return the desired row with the targets of the swing ankle, computed without the tibia IMU.
 
         The attitude of the tibia is computed from the joints and the pelvis IMU. If the pelvis IMU is lost too, the targets are
         the nominal ones.
@@ -189,56 +188,54 @@ class LevelFeet:
             state: measured state of the robot.
             side: swing leg, 0 left, 1 right.
             cycle: cycles since the step change.
-            row: q_des [rad], then q_des' [rad/s], shape (24,); the entries of the swing ankle are overwritten.
+            row: q_des [rad], then q_des' [rad/s], shape (24,); not changed.
         """
-        _put(row, self.ankles[side], self.cubics, cycle, *self._target(state, side, cycle))
+        desired = row.copy()
+        _write_targets(self.ankles[side], self.cubics, cycle, self._target(state, side, cycle), desired)
+        return desired
 
     def _target(self, state: State, side: int, cycle: int) -> tuple[Pair, Pair]:
         ankle, imu = self.ankles[side], _TIBIAE[side]
-        if self.heard(state, side):
+        if self.imu_valid(state, side):
             return _target(ankle, state.imu_quaternion[imu], state.imu_gyro[imu])
         if state.age[state.imu_rows[_PELVIS]] <= _IMU_AGE:
             pelvis = state.imu_quaternion[_PELVIS].tolist(), state.imu_gyro[_PELVIS].tolist()
             return _target(ankle, *self._tibiae.attitude(side, state.position, state.velocity, *pelvis))
-        row, (sa, ha), n = self._nominal[side][cycle].tolist(), ankle["joints"], len(JOINTS)
+        row, (sa, ha), n = self._nominal[side][cycle].tolist(), ankle.joints, len(JOINTS)
         return (row[sa], row[ha]), (row[n + sa], row[n + ha])
 
 
-def put_level(
-    row: Vector, ankles: npt.NDArray[np.void], side: int, cubics: Vector, cycle: int, tibia: Vector, gyro: Vector
-) -> None:
-    """Write the targets of the swing ankle into a row from the tibia IMU.
+def write_level_ankle(ankle: Ankle, cubics: Vector, cycle: int, tibia: Vector, gyro: Vector, desired: Vector) -> None:
+    """Write the targets of the swing ankle from the tibia IMU.
 
     Args:
-        row: q_des [rad], then q_des' [rad/s], shape (24,); the entries of the swing ankle are overwritten.
-        ankles: `LevelFeet.ankles`.
-        side: swing leg, 0 left, 1 right.
+        ankle: record of the swing ankle.
         cubics: `LevelFeet.cubics`.
         cycle: cycles since the step change.
         tibia: attitude of the tibia IMU, as in `level`.
         gyro: angular velocity of the tibia, as in `level`.
+        desired: q_des [rad], then q_des' [rad/s], shape (24,); the entries of the swing ankle are overwritten.
     """
-    angles, rates = _target(ankles[side], tibia, gyro)
-    _put(row, ankles[side], cubics, cycle, angles, rates)
+    _write_targets(ankle, cubics, cycle, _target(ankle, tibia, gyro), desired)
 
 
-def _put(row: Vector, ankle: Any, cubics: Vector, cycle: int, angles: Pair, rates: Pair) -> None:
-    """Write the targets, with re-centring added, into a row (q_des, q_des')."""
-    n = len(row) // 2
+def _write_targets(ankle: Ankle, cubics: Vector, cycle: int, target: tuple[Pair, Pair], desired: Vector) -> None:
+    """Write angles and rates of SA and HA, with the re-centring of the ankle."""
+    (angles, rates), n = target, len(desired) // 2
     for i in range(2):
-        angle, rate, joint = angles[i], rates[i], ankle["joints"][i]
+        angle, rate, joint = angles[i], rates[i], ankle.joints[i]
         if cycle < len(cubics):
-            cubic, deviation, speed = cubics[cycle], ankle["deviation"][i], ankle["rate"][i]
+            cubic, deviation, speed = cubics[cycle], ankle.deviation[i], ankle.rate[i]
             angle = angle + deviation * cubic[0] + speed * cubic[1]
             rate = rate + deviation * cubic[2] + speed * cubic[3]
-        row[joint], row[n + joint] = angle, rate
+        desired[joint], desired[n + joint] = angle, rate
 
 
-def _target(ankle: Any, tibia: Sequence[float] | Vector, gyro: Sequence[float] | Vector) -> tuple[Pair, Pair]:
+def _target(ankle: Ankle, tibia: Sequence[float] | Vector, gyro: Sequence[float] | Vector) -> tuple[Pair, Pair]:
     """Return angles and rates of SA and HA that hold the sole level, with the offset and within the limits."""
-    (sagittal, henke), rates = level(ankle["geometry"], tibia, gyro)
-    low, high = ankle["low"], ankle["high"]
-    sa, sa_rate = _within(sagittal + ankle["offset"], rates[0], low[0], high[0])
+    (sagittal, henke), rates = level(ankle.geometry, tibia, gyro)
+    low, high = ankle.low, ankle.high
+    sa, sa_rate = _within(sagittal + ankle.offset, rates[0], low[0], high[0])
     ha, ha_rate = _within(henke, rates[1], low[1], high[1])
     return (sa, ha), (sa_rate, ha_rate)
 

@@ -15,12 +15,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 import pinocchio
 
 from atalante_control.model import ArticulatedModel
+from atalante_control.structured import Records, zeros
 from atalante_hal.robot import JOINTS, LEG_JOINTS
 from atalante_hal.types import Vector
 
@@ -28,18 +29,16 @@ Pair = tuple[float, float]
 
 _ASSISTED = (LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"))
 
-#: Record of the parameters of `merge` for the assisted joints, SH and SK.
-LAW = np.dtype(
-    [
-        ("fit", np.float64, (3, 3)),  # kg m2, `AssistedInertia.fit`
-        ("inertias", np.float64, 2),  # kg m2, `AssistedInertia.inertias`
-        ("decoupled", np.bool_),  # true: convert the torques with the mass matrix
-        ("coulomb", np.float64, 2),  # Nm
-        ("viscous", np.float64, 2),  # Nm s/rad
-        ("smoothing", np.float64),  # rad/s
-    ],
-    align=True,
-)
+
+class Law:
+    """Record of the parameters of `merge` for the assisted joints, SH and SK."""
+
+    fit: Annotated[Vector, (3, 3)]  # kg m2, `AssistedInertia.fit`
+    inertias: Annotated[Vector, 2]  # kg m2, `AssistedInertia.inertias`
+    decoupled: bool  # true: convert the torques with the mass matrix
+    coulomb: Annotated[Vector, 2]  # Nm
+    viscous: Annotated[Vector, 2]  # Nm s/rad
+    smoothing: float  # rad/s
 
 
 @dataclass(frozen=True)
@@ -156,43 +155,44 @@ class AssistedInertia:
         return np.reshape(self.inertias, (2, 1)) * inverse
 
 
-def law_of(friction: Friction, inertia: AssistedInertia, decoupled: bool) -> npt.NDArray[np.void]:
-    """Return the parameters of `merge`, shape (1,), dtype LAW.
+def law_of(friction: Friction, inertia: AssistedInertia, decoupled: bool) -> Records[Law]:
+    """Return the parameters of `merge`, shape (1,).
 
     Args:
         friction: friction to compensate.
         inertia: mass matrix of SH and SK.
         decoupled: whether u_f + u_v are torques on the separate inertias, which `AssistedInertia.torques` converts.
     """
-    laws = np.zeros(1, LAW)
+    laws: Records[Law] = zeros(Law, 1)
     law = laws[0]
-    law["fit"], law["inertias"], law["decoupled"] = inertia.fit, inertia.inertias, decoupled
-    law["coulomb"], law["viscous"] = ([row[i] for i in _ASSISTED] for row in (friction.coulomb, friction.viscous))
-    law["smoothing"] = friction.smoothing
+    law.fit[:], law.inertias[:], law.decoupled = inertia.fit, inertia.inertias, decoupled
+    law.coulomb[:], law.viscous[:] = ([row[i] for i in _ASSISTED] for row in (friction.coulomb, friction.viscous))
+    law.smoothing = friction.smoothing
     return laws
 
 
 def merge(
-    laws: npt.NDArray[np.void], torque: Vector, gravity: Vector, q: Vector, qd: Vector, leg: int, w: float, u: Pair
+    laws: Records[Law], leg: int, w: float, u: Pair, q: Vector, qd: Vector, gravity: Vector, torque: Vector
 ) -> None:
     """Set the torque of SH and SK of the swing leg to w u_t + (1 - w) (u_i + u_f + u_v).
 
     Args:
         laws: result of `law_of`.
-        torque: u_t, shape (12,) [Nm]; the entries of SH and SK are overwritten.
-        gravity: u_g, shape (12,) [Nm].
-        q: measured angles, shape (12,) [rad].
-        qd: measured speeds, shape (12,) [rad/s].
-        leg: index of the first joint of the swing leg.
+        leg: index in JOINTS of the first joint of the swing leg.
         w: weight of the baseline in [0, 1).
         u: u_f + u_v of SH and SK [Nm].
+        q: measured angles, shape (12,) [rad].
+        qd: measured speeds, shape (12,) [rad/s].
+        gravity: u_g, shape (12,) [Nm].
+        torque: u_t, shape (12,) [Nm]; the entries of SH and SK are overwritten.
     """
-    law, hip, knee = laws[0], leg + _ASSISTED[0], leg + _ASSISTED[1]
-    if law["decoupled"]:
-        u = coupled(law["fit"], law["inertias"], q[knee], qd[hip], qd[knee], u)
+    law = laws[0]
+    hip, knee = leg + _ASSISTED[0], leg + _ASSISTED[1]
+    if law.decoupled:
+        u = coupled(law.fit, law.inertias, q[knee], qd[hip], qd[knee], u)
     for i in range(2):
         joint = leg + _ASSISTED[i]
-        assisted = gravity[joint] + friction(qd[joint], law["coulomb"][i], law["viscous"][i], law["smoothing"]) + u[i]
+        assisted = gravity[joint] + friction(qd[joint], law.coulomb[i], law.viscous[i], law.smoothing) + u[i]
         torque[joint] = w * torque[joint] + (1.0 - w) * assisted
 
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from atalante_control.gait.gait import PERIOD
+from atalante_control.structured import Records, zeros
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, LEG_JOINTS
 from atalante_hal.types import Vector
@@ -72,14 +74,22 @@ AIR_GAINS = PidGains(
 )
 
 
+class PidRecord:
+    """Record of the PIDs of the twelve joints: gains, then the values of the last cycle."""
+
+    gains: Annotated[Vector, (3, len(JOINTS))]  # Kp [Nm/rad], Kd [Nm s/rad], and Ki times the cycle [Nm/rad]
+    limit: float  # Nm, largest absolute value of the integral torque
+    integral: Annotated[Vector, len(JOINTS)]  # Nm, integral torque
+    requested: Annotated[Vector, len(JOINTS)]  # Nm, torque command before the limiter, with all contributions
+
+
 class Pid:
-    """PIDs of the twelve joints. Call `start_step` at each step change, then `update` once a cycle.
+    """PIDs of the twelve joints.
+
+    Call `start_step` at each step change. Then call `update` and `store_request` once a cycle.
 
     Attributes:
-        torque: last result, shape (12,) [Nm], overwritten by the next `update`. The caller adds further torques in place.
-        gains: Kp, Kd and Ki times the cycle, shape (3, 12).
-        integral: integral torque, shape (12,) [Nm].
-        limit: largest absolute value of the integral torque [Nm].
+        records: record of `control`, shape (1,): gains, integral and the last requested torque.
     """
 
     def __init__(self, gains: PidGains) -> None:
@@ -91,15 +101,16 @@ class Pid:
             for s, (left, right) in roles.items()
         }
         n = len(JOINTS)
-        self.limit, self.gains = gains.integral_limit, np.zeros((3, n))
-        self.integral, self.torque = np.zeros(n), np.zeros(n)
+        self.records: Records[PidRecord] = zeros(PidRecord, 1)
+        self.records[0].limit = gains.integral_limit
+        self._torque = np.zeros(n)
         self.start_step(RIGHT, np.ones(n))
         self._kernel = compiled(control)
         self.update(np.zeros(2 * n), np.zeros(n), np.zeros(n))
 
     def reset(self) -> None:
         """Set all integrals to zero."""
-        self.integral[:] = 0.0
+        self.records[0].integral[:] = 0.0
 
     def start_step(self, stance: int, share: Vector) -> None:
         """Set the gains of each leg according to its role.
@@ -108,8 +119,9 @@ class Pid:
             stance: stance leg, LEFT or RIGHT.
             share: share of the baseline in the torque of each joint, shape (12,), in [0, 1]; scales the integral gains.
         """
-        self.gains[:] = self._gains_of[stance]
-        self.gains[2] *= share
+        gains = self.records[0].gains
+        gains[:] = self._gains_of[stance]
+        gains[2] *= share
 
     def update(self, desired: Vector, q: Vector, qd: Vector, sent: Vector | None = None) -> Vector:
         """Compute the tracking torque u_t of one cycle.
@@ -118,35 +130,44 @@ class Pid:
             desired: q_des [rad], then q_des' [rad/s], shape (24,).
             q: measured angles, shape (12,) [rad].
             qd: measured speeds, shape (12,) [rad/s].
-            sent: last `torque` after the limiter, shape (12,) [Nm]; None: not limited.
+            sent: torque command of the last cycle after the limiter, shape (12,) [Nm]; None: not limited.
 
         Returns:
-            `torque`.
+            u_t, shape (12,) [Nm], overwritten by the next call.
         """
-        sent = self.torque if sent is None else sent
-        self._kernel(desired, q, qd, self.gains, self.limit, sent, self.integral, self.torque)
-        return self.torque
+        self._kernel(self.records, desired, q, qd, self.requested if sent is None else sent, self._torque)
+        return self._torque
+
+    @property
+    def requested(self) -> Vector:
+        """Return the torque command that was stored last, shape (12,) [Nm]."""
+        return self.records[0].requested
+
+    def store_request(self, torque: Vector) -> None:
+        """Store the torque command of this cycle for the anti-windup of the next one.
+
+        Args:
+            torque: torque command before the limiter, with all contributions, shape (12,) [Nm]; copied.
+        """
+        self.requested[:] = torque
 
 
-def control(
-    desired: Vector, q: Vector, qd: Vector, gains: Vector, limit: float, sent: Vector, integral: Vector, torque: Vector
-) -> None:
+def control(pids: Records[PidRecord], desired: Vector, q: Vector, qd: Vector, sent: Vector, torque: Vector) -> None:
     """Write u_t into `torque`, as in `Pid.update`.
 
     Args:
+        pids: `Pid.records`; the integral is updated.
         desired: q_des [rad], then q_des' [rad/s], shape (24,).
         q: measured angles, shape (12,) [rad].
         qd: measured speeds, shape (12,) [rad/s].
-        gains: Kp, Kd and Ki times the cycle, shape (3, 12).
-        limit: largest absolute value of the integral torque [Nm].
-        sent: last `torque` after the limiter, shape (12,) [Nm].
-        integral: integral torque, shape (12,) [Nm], updated.
-        torque: last torque command, shape (12,) [Nm]; overwritten with u_t.
+        sent: torque command of the last cycle after the limiter, shape (12,) [Nm].
+        torque: u_t, shape (12,) [Nm], overwritten.
     """
-    n = len(q)
+    pid, n = pids[0], len(q)
+    gains, limit, integral, requested = pid.gains, pid.limit, pid.integral, pid.requested
     for joint in range(n):
         error, rate = desired[joint] - q[joint], desired[n + joint] - qd[joint]
         growth = error * gains[2, joint]
-        if (torque[joint] - sent[joint]) * growth <= 0.0:
+        if (requested[joint] - sent[joint]) * growth <= 0.0:
             integral[joint] = min(max(integral[joint] + growth, -limit), limit)
         torque[joint] = error * gains[0, joint] + rate * gains[1, joint] + integral[joint]

@@ -274,10 +274,9 @@ def test_at_full_assistance_the_command_is_the_baseline_torque_to_the_last_bit()
         torque = controller.update(state).torque.copy()
         if since < 0:
             # The way to the start is the baseline's own; take over its integrals.
-            pid.integral[:] = controller._pid.integral
+            pid.records[0].integral[:] = controller.pid.records[0].integral
         else:
-            row = controller._reference[LEFT if since // STEP % 2 else RIGHT][since % STEP]
-            expected = pid.update(row, state.position, state.velocity)
+            expected = pid.update(controller.desired, state.position, state.velocity)
             expected += gravity.torque(state.position, (1.0, 0.0, 0.0, 0.0))
             if since % STEP >= 30:  # the hand-over of the baseline itself has faded
                 assert torque.tobytes() == expected.tobytes()
@@ -294,7 +293,7 @@ def test_at_full_assistance_the_guide_has_no_say():
     def nonsense(state: State) -> None:
         for guide in wild.guides:
             for name in ("kp", "kd", "limit"):
-                guide.joints[name] = rng.uniform(0.0, 1e6, 2)
+                guide.tables.joints[name] = rng.uniform(0.0, 1e6, 2)
 
     cycles = STARTUP + 2 * STEP + 100
     assert walk(calm, cycles, xi=1.0).tobytes() == walk(wild, cycles, xi=1.0, each=nonsense).tobytes()

@@ -1,4 +1,4 @@
-"""The controller's cycle as machine code against the same source run by Python, and the hand-over."""
+"""The controller's cycle as machine code against the same source run by Python."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
-from atalante_control.airwalk.kernel import STEP, hand_over
 from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
 from atalante_control.guide.shapes import SHAPES
 from atalante_hal.robot import load_robot
@@ -70,17 +69,3 @@ def test_nothing_follows_the_swing_foot_where_that_is_switched_off():
     targets = [one.telemetry[[4, 5, 10, 11]] for one in (level, free)]
     assert (targets[0][:2] != targets[1][:2]).all()  # the left leg swings
     np.testing.assert_array_equal(targets[0][2:], targets[1][2:])
-
-
-def test_a_torque_that_would_jump_goes_on_from_the_last_one():
-    step, blend = np.zeros(1, STEP), np.array([1.0, 0.5, 0.25])
-    last, carried = np.full(12, 7.0), np.zeros(12)
-    step["carry"] = True
-    sent = []
-    for cycle in range(5):
-        torque = np.full(12, 3.0)
-        hand_over(step, cycle, torque, last, carried, blend)
-        assert (torque == torque[0]).all()
-        sent.append(torque[0])
-    assert sent == [7.0, 5.0, 4.0, 3.0, 3.0]
-    assert not step["carry"][0]

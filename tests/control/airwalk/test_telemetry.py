@@ -7,17 +7,19 @@ import math
 import numpy as np
 import pytest
 
-from atalante_control.airwalk.telemetry import TELEMETRY, AirwalkStatistics, write_telemetry
-from atalante_control.guide.kernel import JOINT
+from atalante_control.airwalk.telemetry import AirwalkStatistics, Step, Telemetry, write_telemetry
+from atalante_control.guide.kernel import Joint
+from atalante_control.structured import zeros
 
 ROW = np.arange(24.0)
 
 
 def told(errors: tuple[float, float], active: float = 0.1) -> tuple[np.ndarray, tuple[object, ...]]:
-    joints, telemetry = np.zeros(2, JOINT), np.zeros(1, TELEMETRY)
+    joints, telemetry, step = zeros(Joint, 2), zeros(Telemetry, 1), zeros(Step, 1)
     joints["upper"], joints["lower"] = 0.1, 0.05
     joints["h"], joints["gate"] = (0.7, -0.2), (0.1, 0.4)
-    said = write_telemetry(telemetry, ROW, joints, errors, active, 3, 0.25, 1, 0.5)
+    step["stance"], step["completed"], step["cycles"], step["xi"], step["active"] = 1, 3, 800, 0.5, active
+    said = write_telemetry(telemetry, step[0], joints, 200, ROW, errors)
     return telemetry[0], said
 
 
@@ -25,10 +27,10 @@ def test_every_piece_is_in_its_place():
     telemetry, _ = told((0.02, -0.01))
     expected = {
         "q_des": ROW[:12], "error": (0.02, -0.01), "q_bound": (0.1, 0.05), "guide": (0.1, 0.05), "h": (0.7, -0.2),
-        "lambda": (0.1, 0.4), "filter_active": (0.0, 1.0), "step": 3.0, "phase": 0.25, "stance": 1.0,
+        "gate": (0.1, 0.4), "filter_active": (0.0, 1.0), "step": 3.0, "phase": 0.25, "stance": 1.0,
         "assistance_factor": 0.5,
     }  # fmt: skip
-    assert tuple(expected) == TELEMETRY.names
+    assert tuple(expected) == telemetry.dtype.names
     for name, value in expected.items():
         np.testing.assert_array_equal(telemetry[name], value)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ import pytest
 from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
 from atalante_control.gait.gait import AIRWALK_GAIT, PERIOD, bezier, derivative, load_gait
 from atalante_control.guide.filter import GuideFilter
-from atalante_control.guide.kernel import tick
+from atalante_control.guide.kernel import GuideTables, tick
 from atalante_control.guide.shapes import SHAPES
 from atalante_control.joint.idealization import AssistedInertia
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
@@ -58,32 +59,33 @@ def desired(guide: GuideFilter, deviation: float, rate: float) -> tuple[np.ndarr
 # -- ideal plant -----------------------------------------------------------------------------------------------------
 
 
-def search(
-    joints: np.ndarray,
-    flow: np.ndarray,
-    step: np.ndarray,
-    target: int,
-    q_des: np.ndarray,
-    qd_des: np.ndarray,
-    low: float,
-    high: float,
-    cells: int,
-) -> tuple[float, np.ndarray]:
-    """Search the switching disturbance with the largest error, from the re-centred state; each grid cell keeps one state.
+class Pushed(NamedTuple):
+    """Joint of the ideal plant that is pushed, and the bounds of the push."""
 
-    Every state is reachable, and includes the memory of the filter.
+    target: int  # 0 SH, 1 SK
+    q_des: np.ndarray  # (n,) rad
+    qd_des: np.ndarray  # (n,) rad/s
+    low: float  # Nm, on the separate inertia
+    high: float  # Nm, on the separate inertia
+
+
+def search(guide: GuideTables, pushed: Pushed, cells: int) -> tuple[float, np.ndarray]:
+    """Search the switching pushes that move the joint furthest, from the re-centred state.
+
+    Each kept state is continued with both pushes. One state is kept for each cell of e and e'. Every state can occur, because
+    the memory of the filter is stored with it.
 
     Args:
-        joints, flow, step: tables of the filter.
-        target: joint that is pushed.
-        q_des, qd_des: of it, shape (n,).
-        low, high: Nm on the separate inertia.
-        cells: of e and of e' across three bounds, and +-4 rad/s.
+        guide: tables of the filter.
+        pushed: joint and bounds of the push.
+        cells: number of cells of e across three guide widths, and of e' across +-4 rad/s.
 
     Returns:
-        Largest |e| / q_bound, and its push in each cycle, -1 or 1, shape (n - 1,).
+        Largest |e| / q_bound, and the pushes that lead there: -1 or 1 for each cycle, then 0. Shape (n - 1,).
     """
-    cycles, inertia = len(q_des) - 1, joints[target]["inertia"]
+    joints, step = guide.joints, guide.step
+    target, q_des, qd_des, low, high = pushed
+    cycles, inertia = len(q_des) - 1, joints[target].inertia
     now, then = np.zeros((cells * cells, 4)), np.zeros((cells * cells, 4))
     now[0, 2] = 1.0
     count, worst, worst_cycle, worst_state = 1, 0.0, 0, 0
@@ -98,9 +100,9 @@ def search(
         for state in range(count):
             e, ed = now[state, 0], now[state, 1]
             joint = joints[target]
-            joint["h"], joint["rate"], joint["fresh"] = now[state, 2], now[state, 3], cycle == 0
+            joint.h, joint.rate, joint.fresh = now[state, 2], now[state, 3], cycle == 0
             errors[target], rates[target] = e, ed
-            u = tick(joints, flow, step, cycle, errors[0], rates[0], errors[1], rates[1])[target]
+            u = tick(guide, cycle, errors[0], rates[0], errors[1], rates[1])[target]
             for side in range(2):
                 a = (u + (high if side else low)) / inertia
                 e_then = e + (ed + qd_des[cycle] + 0.5 * a * PERIOD) * PERIOD - (q_des[cycle + 1] - q_des[cycle])
@@ -109,18 +111,18 @@ def search(
                 row = int((ratio if e_then > 0.0 else -ratio) / 3.0 * cells + 0.5 * cells)
                 column = int(ed_then / 8.0 * cells + 0.5 * cells)
                 row, column = min(max(row, 0), cells - 1), min(max(column, 0), cells - 1)
-                place = kept[row, column]
-                if place < 0:
-                    place = added
-                    kept[row, column] = place
+                index = kept[row, column]
+                if index < 0:
+                    index = added
+                    kept[row, column] = index
                     added += 1
-                elif abs(e_then) + 0.02 * abs(ed_then) <= abs(then[place, 0]) + 0.02 * abs(then[place, 1]):
+                elif abs(e_then) + 0.02 * abs(ed_then) <= abs(then[index, 0]) + 0.02 * abs(then[index, 1]):
                     continue
-                then[place, 0], then[place, 1] = e_then, ed_then
-                then[place, 2], then[place, 3] = joints[target]["h"], joints[target]["rate"]
-                parents[cycle, place] = 2 * state + side
+                then[index, 0], then[index, 1] = e_then, ed_then
+                then[index, 2], then[index, 3] = joints[target].h, joints[target].rate
+                parents[cycle, index] = 2 * state + side
                 if ratio > worst:
-                    worst, worst_cycle, worst_state = ratio, cycle, place
+                    worst, worst_cycle, worst_state = ratio, cycle, index
         now, then = then, now
         count = added
     pushes, state = np.zeros(cycles), worst_state
@@ -137,7 +139,7 @@ def worst_switching(guide: GuideFilter, xi: float, target: int, factor: float = 
     for corner, (deviation, rate) in enumerate(BOX):
         guide.start_step(xi, (deviation, deviation), (rate, rate))
         q, qd = (np.ascontiguousarray(rows[:, target]) for rows in desired(guide, deviation, rate))
-        ratio, pushes = compiled(search)(*guide.tables, target, q, qd, low, high, 61)
+        ratio, pushes = compiled(search)(guide.tables, Pushed(target, q, qd, low, high), 61)
         found.append((float(ratio), corner, pushes))
     return max(found, key=lambda one: one[0])
 

@@ -251,7 +251,7 @@ def test_tick_on_the_tables_gives_the_torque_of_the_filter():
     asked, ticked = guide(), guide()
     errors = 0.03, 0.4, -0.02, -0.3
     torque = asked.tick(100, *errors)
-    assert tick(*ticked.tables, 100, *errors) == torque != (0.0, 0.0)
+    assert tick(ticked.tables, 100, *errors) == torque != (0.0, 0.0)
     assert (ticked.h, ticked.gates, ticked.bounds) == (asked.h, asked.gates, asked.bounds)
 
 
@@ -335,7 +335,7 @@ def test_start_step_rejects_a_shape_with_an_invalid_bound():
     f.start_step(0.5, (0.0, 0.0), (0.0, 0.0))
     with pytest.raises(ValueError, match=r"'factor' must be .* and Xi 0\.512"):
         f.start_step(0.512, (0.0, 0.0), (0.0, 0.0))
-    assert (f.tables[2][:, :, 4:] > 0.0).all()
+    assert (f.tables.step[:, :, 4:] > 0.0).all()
 
 
 @pytest.mark.parametrize(

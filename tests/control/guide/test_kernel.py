@@ -81,7 +81,7 @@ def march(
 
 
 def found(joint: int, side: int, cycle: int, e: float, ed: float) -> float:
-    return limited(GUIDE.joints[joint], GUIDE.flow[joint], GUIDE.step[joint], side, cycle, e, ed)
+    return limited(*of(GUIDE, joint), side, cycle, e, ed)
 
 
 @given(st.integers(0, 1), st.integers(0, 1), st.integers(0, 800), st.floats(0.0, 0.08), st.floats(-1.5, 1.5))
@@ -112,16 +112,16 @@ def test_rollout_far_outside_the_guide_has_a_large_ratio():
 def test_saturated_rollouts_are_counted():
     f = guide()
     f.tick(400, 0.0, 0.0, 0.0, 0.0)
-    assert f.joints["stepped"].tolist() == [0, 0]
+    assert f.tables.joints["stepped"].tolist() == [0, 0]
     f.tick(400, 0.06, 0.5, -0.06, -0.5)
-    assert f.joints["stepped"].tolist() == [1, 1]
+    assert f.tables.joints["stepped"].tolist() == [1, 1]
     assert f.stepped == 2
 
 
 def test_p_and_drift_are_linear_in_the_deviations():
     p = table([forced_response(p, DEADBEAT, q, after, GUIDE.time) for p, q, after in CURVES])
     np.testing.assert_allclose(GUIDE.solution(), p, atol=1e-12)
-    np.testing.assert_allclose(np.hstack(list(GUIDE.step[:, :, 2:4])), DRIFT, atol=1e-12)
+    np.testing.assert_allclose(np.hstack(list(GUIDE.tables.step[:, :, 2:4])), DRIFT, atol=1e-12)
 
 
 def test_new_filter_has_a_step_without_assistance_and_deviation():
@@ -130,8 +130,8 @@ def test_new_filter_has_a_step_without_assistance_and_deviation():
     )
     assert (f.h, f.gates, f.stepped) == ([1.0, 1.0], [0.0, 0.0], 0)
     started.start_step(0.0, (0.0, 0.0), (0.0, 0.0))
-    assert np.array_equal(f.step, started.step)
-    assert f.joints["xi"].tolist() == [0.0, 0.0]
+    assert np.array_equal(f.tables.step, started.tables.step)
+    assert f.tables.joints["xi"].tolist() == [0.0, 0.0]
 
 
 def test_p_and_drift_include_the_feedforward():
@@ -148,7 +148,7 @@ def test_p_and_drift_include_the_feedforward():
     pushed = [(*curve, f.time, u) for curve, u in zip(CURVES, uf, strict=True)]
     for first, respond in ((0, forced_response), (2, free_drift)):
         expected = table([respond(p, DEADBEAT, q, after, time, u) for p, q, after, time, u in pushed])
-        np.testing.assert_allclose(np.hstack(list(f.step[:, :, first : first + 2])), expected, atol=1e-12)
+        np.testing.assert_allclose(np.hstack(list(f.tables.step[:, :, first : first + 2])), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -160,8 +160,8 @@ def test_grid_extends_beyond_the_end_of_the_step(points: int, stride: int, first
     assert (f.cycles, f.stride, f.horizon) == (800, stride, horizon)
     assert f.grid.tolist() == list(range(first, horizon + 1, stride))
     assert f.time.tolist() == [cycle * PERIOD for cycle in range(horizon + 1)]
-    assert f.joints["first"].tolist() == [first] * 2
-    assert f.joints["stride"].tolist() == [stride] * 2
+    assert f.tables.joints["first"].tolist() == [first] * 2
+    assert f.tables.joints["stride"].tolist() == [stride] * 2
 
 
 def test_width_follows_the_assistance_factor():
@@ -184,10 +184,10 @@ def test_compiled_filter_matches_its_source(policies: tuple[BackupPolicy, Backup
     machine, source = guide(policies), guide(policies)
     for cycle in np.sort(rng.integers(0, 801, 40)).tolist():
         state = (rng.uniform(-1.0, 1.0, 4) * [0.08, 1.0, 0.08, 1.0]).tolist()
-        u = tick(source.joints, source.flow, source.step, cycle, *state)
+        u = tick(source.tables, cycle, *state)
         np.testing.assert_allclose(machine.tick(cycle, *state), u, rtol=1e-12, atol=1e-12)
         for name in ("h", "rate", "gate", "upper", "lower"):
-            np.testing.assert_allclose(machine.joints[name], source.joints[name], rtol=1e-12, atol=1e-9)
+            np.testing.assert_allclose(machine.tables.joints[name], source.tables.joints[name], rtol=1e-12, atol=1e-9)
     assert machine.stepped == source.stepped > 0
 
 
@@ -219,7 +219,8 @@ def tube(
 
 
 def of(f: GuideFilter, joint: int) -> tuple[np.void, np.ndarray, np.ndarray]:
-    return f.joints[joint], f.flow[joint], f.step[joint]
+    joints, flow, step = f.tables
+    return joints[joint], flow[joint], step[joint]
 
 
 def cycle_by_cycle(
@@ -229,7 +230,7 @@ def cycle_by_cycle(
     policy, (low, high) = f.config.policies[joint], f.config.disturbance[joint]
     (external, sign), limit = ((low, -1.0) if side else (high, 1.0)), (1.0 - RESERVE) * policy.torque_limit
     (phi,), (s,) = policy.transition(np.array([PERIOD])), policy.step_response(np.array([PERIOD]))
-    p, drift = f.step[joint][:, :2], f.step[joint][:, 2:4]
+    p, drift = f.tables.step[joint][:, :2], f.tables.step[joint][:, 2:4]
     x, errors, saturated = np.array([e, ed]), [sign * e], []
     for k in range(cycle, f.horizon):
         u = -policy.kp * x[0] - policy.kd * x[1]
@@ -295,7 +296,7 @@ def expected_tick(f: GuideFilter, joint: int, cycle: int, e: float, ed: float) -
     limit = (1.0 - RESERVE) * policy.torque_limit
     points = f.grid[f.grid >= cycle]
     tau = (points - cycle) * PERIOD
-    p = f.step[joint][:, :2]
+    p = f.tables.step[joint][:, :2]
     (largest, smallest), s = policy.disturbance(tau, low, high), policy.step_response(tau)
     x = p[points] + policy.transition(tau) @ (np.array([e, ed]) - p[cycle])
     torque = policy.kp * x[:, 0] + policy.kd * x[:, 1]
@@ -328,7 +329,7 @@ def test_tick_applies_the_law_of_the_paper_to_the_largest_ratio(policies):
             f.start_step(0.8, DEVIATION, RATE)
             fresh = True
         states = states.tolist()
-        u = tick(f.joints, f.flow, f.step, min(cycle, 800), *states)
+        u = tick(f.tables, min(cycle, 800), *states)
         for joint, (e, ed) in enumerate((states[:2], states[2:])):
             policy = policies[joint]
             ratio, stepped = expected_tick(f, joint, min(cycle, 800), e, ed)
@@ -338,14 +339,14 @@ def test_tick_applies_the_law_of_the_paper_to_the_largest_ratio(policies):
             weight = damped_gate(gate(now, 0.8 if i >= 12 else 0.5), rate[joint], 0.02)
             backup = -policy.kp * e - policy.kd * ed
             assert f.h[joint] == pytest.approx(now, abs=1e-9)
-            assert f.joints["rate"][joint] == pytest.approx(rate[joint], abs=1e-6)
+            assert f.tables.joints["rate"][joint] == pytest.approx(rate[joint], abs=1e-6)
             assert f.gates[joint] == pytest.approx(weight, abs=1e-9)
             assert u[joint] == pytest.approx(
                 weight * max(-policy.torque_limit, min(policy.torque_limit, backup)), abs=1e-6
             )
-        assert f.joints["stepped"].tolist() == steps
+        assert f.tables.joints["stepped"].tolist() == steps
         assert f.bounds == pytest.approx([0.06, 0.05])
-        assert not f.joints["fresh"].any()
+        assert not f.tables.joints["fresh"].any()
         fresh = False
     assert min(steps) >= 3
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from atalante_control.gait.recentering import Deadbeat
-from atalante_control.joint.flat_foot import FlatFoot, LevelFeet, Tibiae, flat_feet, level, put_level
+from atalante_control.joint.flat_foot import FlatFoot, LevelFeet, Tibiae, flat_feet, level, write_level_ankle
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import load_robot
 from atalante_hal.types import State, SupervisorState
@@ -143,7 +143,7 @@ def feet() -> LevelFeet:
 
 def put(f: LevelFeet, side: int, cycle: int, r: np.ndarray, gyro: tuple[float, float, float] = STILL) -> np.ndarray:
     row = np.arange(24.0)
-    put_level(row, f.ankles, side, f.cubics, cycle, np.array(quaternion(r)), np.array(gyro))
+    write_level_ankle(f.ankles[side], f.cubics, cycle, np.array(quaternion(r)), np.array(gyro), row)
     return row
 
 

@@ -97,7 +97,7 @@ def test_merge_is_the_weighted_mean_of_baseline_and_assistance(leg: int, decoupl
     real = inertia.torques(q[knee], qd[hip], qd[knee], u) if decoupled else u
     for w in (0.0, 0.3, 1.0):
         torque = baseline.copy()
-        merge(law, torque, gravity, q, qd, leg, w, u)
+        merge(law, leg, w, u, q, qd, gravity, torque)
         expected = baseline.copy()
         for i, joint in enumerate((hip, knee)):
             assisted = gravity[joint] + friction.torque(joint % 6, qd[joint]) + real[i]

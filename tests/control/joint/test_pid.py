@@ -65,6 +65,7 @@ def test_integral_does_not_wind_up_past_its_limit():
 def test_saturated_torque_stops_its_integral(cut: float, error: float):
     pid, zero, row = Pid(GAINS), np.zeros(12), desired(np.full(12, error), np.zeros(12))
     before = pid.update(row, zero, zero).copy()
+    pid.store_request(before)
     sent = before.copy()
     sent[3] -= cut
     after = pid.update(row, zero, zero, sent)
@@ -79,9 +80,9 @@ def test_unlimited_torque_as_sent_torque_changes_nothing():
     for _ in range(100):
         q_des, qd_des, q, qd = RNG.normal(size=(4, 12))
         row = desired(q_des, qd_des)
-        for pid in (one, other):
-            pid.torque += 3.0  # gravity
-        assert one.update(row, q, qd).tobytes() == other.update(row, q, qd, other.torque.copy()).tobytes()
+        with_gravity = RNG.normal(size=12)
+        other.store_request(with_gravity)
+        assert one.update(row, q, qd).tobytes() == other.update(row, q, qd, with_gravity.copy()).tobytes()
 
 
 def test_joint_with_share_zero_does_not_integrate():

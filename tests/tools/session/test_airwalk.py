@@ -194,7 +194,7 @@ class Baseline(AirwalkController):
 
     def _change_step(self, state: State, stance: int) -> None:
         super()._change_step(state, stance)
-        self._step["share"], self.guide.joints["kp"] = 1.0, np.nan
+        self._step.share, self.guide.tables.joints["kp"] = 1.0, np.nan
 
 
 @pytest.mark.parametrize(("xi", "equal"), [(1.0, True), (0.99, False)])

@@ -1,0 +1,80 @@
+"""Continuous torque command over a step change: the torque step is carried over and faded out.
+
+`torque before the change, torque of the new control law -> continuous torque`
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+import numpy as np
+
+from atalante_control.gait.gait import PERIOD
+from atalante_control.structured import Records, zeros
+from atalante_hal.robot import JOINTS
+from atalante_hal.types import Vector
+
+
+class Carry:
+    """Record of the torque carried over a step change."""
+
+    pending: bool  # true from the change until the first torque after it
+    before: Annotated[Vector, len(JOINTS)]  # Nm, torque before the change
+    carried: Annotated[Vector, len(JOINTS)]  # Nm, torque before the change less the first torque after it
+
+
+class CarryOver:
+    """Torque carried over a step change.
+
+    Attributes:
+        records: record of `add_carried`, shape (1,).
+        blend: factor of the carried torque for each cycle since the change, from 1 to 0, shape (n,).
+    """
+
+    def __init__(self, duration: float) -> None:
+        """Prepare the fade-out.
+
+        Args:
+            duration: time in which the torque step fades out [s].
+        """
+        ramp = np.arange(round(duration / PERIOD)) * (PERIOD / duration)
+        self.blend: Vector = 0.5 + 0.5 * np.cos(math.pi * ramp)
+        self.records: Records[Carry] = zeros(Carry, 1)
+
+    @property
+    def pending(self) -> bool:
+        """Return whether a change has been started whose first torque is not computed yet."""
+        return bool(self.records[0].pending)
+
+    def start(self, before: Vector) -> None:
+        """Start a change.
+
+        Args:
+            before: torque before the change, shape (12,) [Nm]; copied.
+        """
+        carry = self.records[0]
+        carry.before[:], carry.pending = before, True
+
+    def cancel(self) -> None:
+        """Cancel a pending change."""
+        self.records[0].pending = False
+
+
+def add_carried(carries: Records[Carry], blend: Vector, cycle: int, torque: Vector) -> None:
+    """Add the carried torque to the torque command. The first call after a change computes it.
+
+    Args:
+        carries: `CarryOver.records`; `pending` is cleared.
+        blend: `CarryOver.blend`.
+        cycle: cycles since the change.
+        torque: torque command, shape (12,) [Nm], updated.
+    """
+    carry = carries[0]
+    if carry.pending:
+        for joint in range(len(torque)):
+            carry.carried[joint] = carry.before[joint] - torque[joint]
+        carry.pending = False
+    if cycle < len(blend):
+        for joint in range(len(torque)):
+            torque[joint] += carry.carried[joint] * blend[cycle]

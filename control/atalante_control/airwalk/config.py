@@ -1,0 +1,71 @@
+"""Parameters of the airwalk controller."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from atalante_control.gait.gait import PERIOD
+from atalante_control.guide.certificate import HandOver
+from atalante_control.joint.idealization import Friction
+from atalante_control.joint.pid import AIR_GAINS, PidGains
+
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class AirwalkConfig:
+    """Parameters of the airwalk controller.
+
+    Raises:
+        ValueError: If a parameter is out of range.
+    """
+
+    gains: PidGains = AIR_GAINS
+    friction: Friction = field(default_factory=Friction)
+    alpha: float = 0.4  # fraction of the step after which re-centring reaches the nominal trajectory
+    guide_rate: Pair = (28.0, 44.0)  # rad/s, natural frequency of the stiffest backup policy on SH and SK
+    gentler: tuple[float, ...] = (0.5, 0.7)  # fractions of guide_rate tried first, ascending
+    guide_margin: float = 0.25  # smallest certificate margin, as a fraction of the guide, at which lower gains are used
+    guide_damping: float = 1.05  # damping ratio of the backup policy; monotone from 1 on
+    # Nm, bounds of u_ext of SH and SK as separate inertias (see `certificate`). Measured in PyBullet, 95 % of the cycles:
+    # coupling to other joints, delay and residual friction cause 14 and 20 Nm; a friction error of 20 % causes 43 and 26 Nm.
+    disturbance: tuple[Pair, Pair] = ((-30.0, 30.0), (-20.0, 20.0))
+    points: int = 100  # intervals of the horizon grid
+    overlap: float = 0.1  # s, length of the horizon after the end of the step
+    zeta: float = 0.01  # s, derivative gain of the guide
+    hand_over: HandOver = field(default_factory=HandOver)
+    decoupled: bool = (
+        True  # convert u_v through the mass matrix of SH and SK; False: apply u_v directly, as in the paper
+    )
+    feedforward: bool = False  # apply u_f of the gait to the assisted joints; off in the air
+    flat_foot: bool = True  # hold the swing sole level
+    ankle_offset: float = math.radians(1.0)  # rad, added to both sagittal ankles
+    fade: float = 0.9  # Xi above which the baseline is blended in
+    startup: float = 2.0  # s, duration of the motion from the measured pose to the first pose of the gait
+    blend: float = 0.03  # s, time in which a torque step at the step change fades out
+    active: float = 0.05  # gate above which the filter counts as active
+
+    def __post_init__(self) -> None:
+        for name in ("startup", "blend"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= PERIOD):
+                raise ValueError(f"{name} must be at least one cycle ({PERIOD} s), got {getattr(self, name)!r}")
+        if not 0.0 <= self.fade < 1.0:
+            raise ValueError(f"fade must be an assistance factor in [0, 1), got {self.fade!r}")
+        if not (min(self.guide_rate) > 0.0 and self.guide_damping > 0.0):
+            raise ValueError(
+                f"guide_rate and guide_damping must be positive, got {self.guide_rate!r} and {self.guide_damping!r}"
+            )
+        if list(self.gentler) != sorted(self.gentler) or not all(0.0 < part < 1.0 for part in self.gentler):
+            raise ValueError(f"gentler must be ascending fractions of guide_rate in (0, 1), got {self.gentler!r}")
+
+
+def baseline_share(xi: float, fade: float) -> float:
+    """Return the weight w(Xi) of the baseline torque: 0 up to `fade`, then a smoothstep to exactly 1 at Xi = 1.
+
+    Args:
+        xi: assistance factor in [0, 1].
+        fade: `AirwalkConfig.fade`, in [0, 1).
+    """
+    x = (xi - fade) / (1.0 - fade)
+    return 0.0 if x <= 0.0 else 1.0 if x >= 1.0 else x * x * (3.0 - 2.0 * x)

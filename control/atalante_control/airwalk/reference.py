@@ -1,0 +1,130 @@
+"""Desired trajectories of the airwalk controller: start motion, then q_des = q_nom + s of every step.
+
+`gait, measured pose at the step change -> row (q_des, q_des') of each cycle`
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from atalante_control.gait.gait import PERIOD, Gait
+from atalante_control.gait.recentering import Deadbeat
+from atalante_control.joint.pid import LEFT, RIGHT
+from atalante_hal.robot import JOINTS, LEG_JOINTS
+from atalante_hal.types import Vector
+
+_N, _LEG, _SA = len(JOINTS), len(LEG_JOINTS), LEG_JOINTS.index("SA")
+
+
+class Deviation(NamedTuple):
+    """Deviation of the measured motion from the nominal start of a step."""
+
+    angle: Vector  # (12,) rad, s(0) = q - q_nom
+    rate: Vector  # (12,) rad/s, s'(0) = q' - q_nom'
+
+
+class GaitReference:
+    """Desired trajectory of right-stance and left-stance steps, sampled at every cycle.
+
+    Attributes:
+        nominal: rows (q_nom, q_nom') of the step with stance leg LEFT (0) and RIGHT (1), each of shape (n + 1, 24).
+    """
+
+    def __init__(self, gait: Gait, deadbeat: Deadbeat, ankle_offset: float) -> None:
+        """Sample both steps and the basis of the re-centring.
+
+        Args:
+            gait: right-stance step that repeats.
+            deadbeat: re-centring of the gait.
+            ankle_offset: angle added to both sagittal ankles [rad].
+        """
+        self.nominal: dict[int, Vector] = {}
+        for stance, step in ((LEFT, gait.mirrored()), (RIGHT, gait)):
+            table = step.tables()
+            rows = np.hstack([table.q, table.qd])
+            rows[:, [_SA, _LEG + _SA]] += ankle_offset
+            self.nominal[stance] = rows
+        self._rows = {stance: rows.copy() for stance, rows in self.nominal.items()}
+        time: Vector = np.arange(gait.cycles + 1, dtype=np.float64) * PERIOD
+        (c0, c1), (c0d, c1d), _ = deadbeat.basis(time)
+        end = self._end = int(np.searchsorted(time, deadbeat.end))
+        self._basis = np.zeros((2, end, 2 * _N))  # rows to add per unit of s(0) and of s'(0)
+        self._basis[0, :, :_N], self._basis[0, :, _N:] = c0[:end, None], c0d[:end, None]
+        self._basis[1, :, :_N], self._basis[1, :, _N:] = c1[:end, None], c1d[:end, None]
+        self._added = np.zeros_like(self._basis)
+        self._angles, self._rates = np.zeros(2 * _N), np.zeros(2 * _N)  # s(0) and s'(0), each for q_des and for q_des'
+
+    def start_step(self, stance: int, position: Vector, velocity: Vector) -> Deviation:
+        """Re-centre the step on the measured motion.
+
+        Args:
+            stance: stance leg of the new step, LEFT or RIGHT.
+            position: measured angles at the step change, shape (12,) [rad].
+            velocity: measured speeds at the step change, shape (12,) [rad/s].
+
+        Returns:
+            Deviation from the nominal start, overwritten by the next call.
+        """
+        nominal, angles, rates, added = self.nominal[stance], self._angles, self._rates, self._added
+        np.subtract(position, nominal[0, :_N], out=angles[:_N])
+        np.subtract(velocity, nominal[0, _N:], out=rates[:_N])
+        angles[_N:], rates[_N:] = angles[:_N], rates[:_N]
+        np.multiply(self._basis[0], angles, out=added[0])
+        np.multiply(self._basis[1], rates, out=added[1])
+        np.add(added[0], added[1], out=added[0])
+        np.add(nominal[: self._end], added[0], out=self._rows[stance][: self._end])
+        return Deviation(angles[:_N], rates[:_N])
+
+    def row(self, stance: int, cycle: int) -> Vector:
+        """Return q_des [rad], then q_des' [rad/s] of a cycle, shape (24,). Do not write into it.
+
+        Args:
+            stance: stance leg, LEFT or RIGHT.
+            cycle: cycles since the step change.
+        """
+        row: Vector = self._rows[stance][cycle]
+        return row
+
+
+class StartMotion:
+    """Quintic from rest at the measured pose to the first pose and speed of the gait.
+
+    Attributes:
+        cycles: duration in cycles.
+    """
+
+    def __init__(self, first: Vector, duration: float) -> None:
+        """Set the end of the motion.
+
+        Args:
+            first: first row (q_nom, q_nom') of the gait, shape (24,) [rad, rad/s].
+            duration: duration of the motion [s].
+        """
+        self.cycles = round(duration / PERIOD)
+        self._first, self._duration = first, duration
+        self._pose, self._row = np.zeros(_N), np.zeros(2 * _N)
+
+    def start(self, position: Vector) -> None:
+        """Start at a pose.
+
+        Args:
+            position: measured angles, shape (12,) [rad]; copied.
+        """
+        self._pose[:] = position
+
+    def row(self, cycle: int) -> Vector:
+        """Return q_des [rad], then q_des' [rad/s] of a cycle, shape (24,), overwritten by the next call.
+
+        Args:
+            cycle: cycles since `start`, below `cycles`.
+        """
+        x, duration, row = cycle / self.cycles, self._duration, self._row
+        gap, speed = self._first[:_N] - self._pose, self._first[_N:]
+        row[:_N] = self._pose + gap * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x))
+        row[:_N] += speed * (duration * x**3 * (-4.0 + 7.0 * x - 3.0 * x * x))
+        row[_N:] = gap * (30.0 * x * x * (1.0 - x) ** 2 / duration) + speed * (
+            x * x * (-12.0 + 28.0 * x - 15.0 * x * x)
+        )
+        return row
