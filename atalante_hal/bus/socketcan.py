@@ -17,6 +17,7 @@ import struct
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from atalante_hal.bus import BusAbsent, BusDown, BusError, BusFull, Stamps
 from atalante_hal.bus.batch import Batches
@@ -351,5 +352,5 @@ def _headers(frames: Frames, control: Frames | None) -> tuple[Frames, Frames]:
     return vectors, headers
 
 
-def _address(array: Frames) -> int:
+def _address(array: npt.NDArray[np.void] | npt.NDArray[np.int64]) -> int:
     return array.ctypes.data
