@@ -15,18 +15,7 @@ import numpy as np
 from atalante_dbc import Network
 from atalante_hal.bus import Bus
 from atalante_hal.commands import Commands, StatusReport
-from atalante_hal.record import (
-    ASSISTANCE_FACTOR,
-    CRC_ERRORS,
-    CYCLE,
-    DIAGNOSTICS,
-    DROPPED,
-    FRAMES,
-    OVERRUNS,
-    SUPERVISOR,
-    TIME,
-    Record,
-)
+from atalante_hal.record import Record
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, number_of
 from atalante_hal.safety.limiter import Limiter
@@ -112,7 +101,7 @@ class Hal:
         #: All values of this cycle in one contiguous vector, whose fields `layout` names.
         self.record, self.layout, self.controller_record = parts.values, parts.layout, parts.controller
         self._header = parts.header
-        self._header[ASSISTANCE_FACTOR] = assistance_factor
+        self._header[3] = assistance_factor
         self._image = ReceiveImage(fast, parts.signals)
         self._plausibility = Plausibility(self.robot, self._image, PERIOD)
         self.state = parts.state(assistance_factor, len(fast))
@@ -161,9 +150,9 @@ class Hal:
             self._apply(verdict)
         self._torque_sent[:] = self._limiter.last
         header = self._header
-        header[CYCLE], header[TIME] = cycle, state.time
-        header[FRAMES] += count
-        header[DROPPED] = transceiver.bus.dropped
+        header[0], header[1] = cycle, state.time
+        header[7] += count
+        header[9] = transceiver.bus.dropped
         return state
 
     def _apply(self, verdict: Verdict) -> None:
@@ -177,8 +166,8 @@ class Hal:
         if verdict.acknowledged:
             self._transceiver.acknowledge()
         header = self._header
-        header[SUPERVISOR], header[ASSISTANCE_FACTOR] = verdict.supervisor, verdict.assistance_factor
-        header[DIAGNOSTICS], header[CRC_ERRORS] = verdict.diagnostics, self.crc_errors
+        header[2], header[3], header[10] = verdict.supervisor, verdict.assistance_factor, verdict.diagnostics
+        header[8] = self.crc_errors
 
     def write(self, command: Command) -> Vector:
         """Limit a command and send it; send HOLD instead while the robot is not `moving`.
@@ -220,9 +209,7 @@ class Hal:
         if safety_monitor.start_wanted and state.supervisor in (_S.LOWER, _S.FAULT):
             # The operator acknowledged: reset the drives that have a fault; the others continue to hold.
             control[state.drive_state == DriveState.FAULT] = Controlword.FAULT_RESET
-        elif (
-            safety_monitor.start_wanted and state.supervisor in (_S.READY, _S.HOLD) and not safety_monitor.start_blocked
-        ):
+        elif safety_monitor.start_wanted and state.supervisor in (_S.READY, _S.HOLD) and not safety_monitor.hindered:
             control[:] = [controlword_towards_operation(int(s)) for s in state.drive_state.tolist()]
             # Command the present holding torque, so that no joint sags before the controller's first torque.
             self._follow_drives()
@@ -346,7 +333,7 @@ class Hal:
         state, safety_monitor = self.state, self._safety_monitor
         sent = self._commands.send(state.cycle)
         if state.cycle % self._status.cycles == 0:
-            worst, overruns = number_of(safety_monitor.memory.bits), self._header[OVERRUNS]
+            worst, overruns = number_of(safety_monitor.memory.bits), self._header[6]
             self._status.send(state.supervisor, state.assistance_factor, overruns, worst, safety_monitor.step)
-            safety_monitor.check_heartbeats()
+            safety_monitor.look_for_heartbeats()
         return sent

@@ -14,7 +14,6 @@ from typing import Protocol
 import numpy as np
 
 from atalante_hal.hal import Hal
-from atalante_hal.record import COST_US, LATENESS_US, OVERRUNS
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.types import PERIOD, Controller, State
 
@@ -203,7 +202,7 @@ def run(
             cost = time.perf_counter() - began
             costs[min(int(cost * 1e6), COST_BINS)] += 1
             statistics.cycles += 1
-            header[COST_US], header[LATENESS_US], header[OVERRUNS] = cost * 1e6, late * 1e6, statistics.overruns
+            header[4], header[5], header[6] = cost * 1e6, late * 1e6, statistics.overruns
             record()
             if until(state):
                 break

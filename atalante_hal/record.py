@@ -21,11 +21,6 @@ HEADER_FIELDS = (
     "cycle", "time", "supervisor", "assistance_factor", "cost_us", "lateness_us",
     "overruns", "frames", "crc_errors", "dropped", "diagnostics",
 )  # fmt: skip
-#: Index of each of these fields.
-(
-    CYCLE, TIME, SUPERVISOR, ASSISTANCE_FACTOR, COST_US, LATENESS_US,
-    OVERRUNS, FRAMES, CRC_ERRORS, DROPPED, DIAGNOSTICS,
-) = range(len(HEADER_FIELDS))  # fmt: skip
 
 
 class Record:

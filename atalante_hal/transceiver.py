@@ -17,13 +17,13 @@ from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, Frames, as_words, header_word, new_frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Largest number of frames received in one cycle. About 20 frames are cyclic.
+#: Most frames that are received in one cycle; about 20 are cyclic.
 RECEIVE_BUDGET = 128
 #: Consecutive cycles after which a flood or a full transmit queue is confirmed.
 PERSISTENT = 5
 #: Time to listen for another HAL before the first SYNC [s].
 LISTEN = 0.2
-#: Longest wait for answers [s] if no node has answered so far, or if the last SYNC was not sent.
+#: Longest wait for answers that are unlikely [s]: no node has answered so far, or the last SYNC was not sent.
 _DOUBTFUL_PATIENCE = 0.1
 #: Class bit of an error frame that reports bus-off (linux/can/error.h).
 ERROR_BUS_OFF = 0x40
@@ -89,13 +89,13 @@ class Transceiver:
         self._table = {_header(m) for m in network.sent_by(node)}
         self._own_ids = {m.frame_id for m in network.sent_by(node)}
         self._node = node
-        self._flood_limit = cyclic + surplus
+        self._most = cyclic + surplus
         #: Receive buffer, always the same array.
         self.scratch = new_frames(RECEIVE_BUDGET)
         self._found: list[Finding] = []  # since the last call of `faults`
-        self._full_cycles = 0  # consecutive cycles in which the transmit queue was full
+        self._refused = 0  # consecutive cycles in which the transmit queue was full
         self._full_this_cycle = False
-        self._sent = True  # the last batch was sent completely
+        self._asked = True  # the last batch was sent completely
         self._floods = 0  # consecutive cycles with a flood
         self._bus_off = 0  # error class of the last bus-off frame; 0 after the operator's acknowledgement
         #: True if the bus has no fault, so that `faults` need not be called.
@@ -131,21 +131,21 @@ class Transceiver:
             raise TransmitDenied(
                 f"a frame of {self._node} must keep the identifier, length and format it was granted with"
             )
-        self._sent = False
+        self._asked = False
         try:
             self.bus.send(batch.frames)
         except BusFull as error:
             self._full_this_cycle = True
-            self._find(Dtc.BUS_TX_FULL, self._full_cycles + 1 >= PERSISTENT, error.sent, f"{error}")
+            self._find(Dtc.BUS_TX_FULL, self._refused + 1 >= PERSISTENT, error.sent, f"{error}")
         except BusError as error:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot send: {error}")
         else:
-            self._sent = True
+            self._asked = True
             if self.tap is not None:
                 self.tap.sent(batch.frames)
 
     def receive(self, count: int = 0, cycle: ReceiveImage | None = None, patience: float = 0.0) -> int:
-        """Receive frames into `scratch`, after the frames already in it, up to `RECEIVE_BUDGET` frames.
+        """Receive frames into `scratch`, behind those already in it, up to `RECEIVE_BUDGET` frames.
 
         Args:
             count: Number of frames already in `scratch`.
@@ -163,14 +163,16 @@ class Transceiver:
         except BusError as error:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot receive: {error}")
             count = first
+            if cycle is not None:  # in lock-step, a bus that fails immediately would let the cycles run without a pause
+                time.sleep(min(patience, _DOUBTFUL_PATIENCE))
         if self.tap is not None:
             self.tap.received(scratch[first:] if first else scratch, count - first)
-        if count > self._flood_limit:
+        if count > self._most:
             self._find(Dtc.BUS_FLOOD, self._floods + 1 >= PERSISTENT, count, "")
         return count
 
     def foreign(self, frames: Frames) -> None:
-        """Report received frames that are not messages to this node: error frames, its own messages and unknown messages.
+        """Report received frames that are no messages to this node: error frames, its own messages and unknown messages.
 
         Args:
             frames: Received frames that are not in a process image, shape (n,).
@@ -207,7 +209,7 @@ class Transceiver:
                 )
 
     def discard(self) -> None:
-        """Drop all queued frames, because after a gap they are answers to old SYNCs."""
+        """Drop all queued frames: after a gap they are answers to old SYNCs."""
         try:
             for _ in range(RECEIVE_BUDGET):
                 if self.bus.receive(self.scratch) < RECEIVE_BUDGET:
@@ -221,13 +223,13 @@ class Transceiver:
 
     def faults(self) -> list[Finding]:
         """Return the faults found since the last call, and a bus-off that is not acknowledged; call it once in a cycle."""
-        self._full_cycles = self._full_cycles + 1 if self._full_this_cycle else 0
+        self._refused = self._refused + 1 if self._full_this_cycle else 0
         self._full_this_cycle = False
         self._floods = self._floods + 1 if any(finding.dtc is Dtc.BUS_FLOOD for finding in self._found) else 0
         if self._bus_off:
             self._find(Dtc.BUS_OFF, True, self._bus_off, "")
         found, self._found = self._found, []
-        self.quiet = not (self._full_cycles or self._floods or self._bus_off)
+        self.quiet = not (self._refused or self._floods or self._bus_off)
         return found
 
     def _find(self, dtc: Dtc, confirmed: bool, value: float, text: str) -> None:
@@ -238,7 +240,7 @@ class Transceiver:
         """Wait until every expected message has arrived in `scratch[first:]`, at most `patience` [s]."""
         # If no node has answered so far, receive until the bus is silent, so that no answer is left for the next cycle.
         until_silent = not expected
-        unlikely = until_silent or not self._sent
+        unlikely = until_silent or not self._asked
         deadline = time.monotonic() + (min(patience, _DOUBTFUL_PATIENCE) if unlikely else patience)
         while count < RECEIVE_BUDGET:
             expected.difference_update(self.scratch["can_id"][first:count].tolist())
@@ -246,10 +248,10 @@ class Transceiver:
             if remaining <= 0.0 or not (expected or until_silent):
                 break
             first = count
-            received = self.bus.receive(self.scratch[count:], remaining)
-            if received == 0:
+            got = self.bus.receive(self.scratch[count:], remaining)
+            if got == 0:
                 break
-            count += received
+            count += got
         return count
 
 

@@ -62,6 +62,7 @@ class JoinedBus:
             0  # index of the channel that is read first; it rotates, because a busy channel could block the others
         )
         self._closed = False
+        self._failure: BusError | None = None  # of a channel in the present `receive`
         files = [_file_of(link) for link in self._links]
         self._files = [file for file in files if file is not None]
         self._all_have_files = len(self._files) == len(files)
@@ -115,14 +116,13 @@ class JoinedBus:
             Number of received frames n.
 
         Raises:
-            BusDown: If a channel is closed or down.
+            BusDown: If a channel is closed or down, and no frame was received on the others.
         """
         if self._closed:
             raise BusDown(f"{self.name} is closed")
         tails = self._tails_of(frames)
+        self._failure = None
         count = self._gather(tails)
-        if count or timeout <= 0.0:
-            return count
         deadline = time.monotonic() + timeout
         while not count and (left := deadline - time.monotonic()) > 0.0:
             if self._all_have_files:
@@ -130,6 +130,8 @@ class JoinedBus:
             else:
                 time.sleep(min(left, POLLING_PERIOD))
             count = self._gather(tails)
+        if not count and self._failure is not None:
+            raise self._failure
         return count
 
     def close(self) -> None:
@@ -147,7 +149,11 @@ class JoinedBus:
         for link in links[first:] + links[:first]:
             if count == room:
                 break
-            got = link.receive(tails[count] if room == size else tails[count][: room - count])
+            try:
+                got = link.receive(tails[count] if room == size else tails[count][: room - count])
+            except BusError as error:
+                self._failure = error
+                continue
             if got:
                 self.stamps[count : count + got] = link.stamps[:got]
                 count += got

@@ -14,10 +14,10 @@ import math
 import os
 import socket
 import struct
+import time
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from atalante_hal.bus import BusAbsent, BusDown, BusError, BusFull, Stamps
 from atalante_hal.bus.batch import Batches
@@ -33,7 +33,11 @@ SIOCGIFMTU: Final = 0x8921
 IFF_UP: Final = 1
 #: Error frames to receive (linux/can/error.h): transmit timeout, controller problem, bus-off, controller restarted.
 ERROR_FRAMES = 0x0001 | 0x0004 | 0x0040 | 0x0100
-LINK_LOST = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
+LINK_DOWN: Final = errno.ENETDOWN
+#: Error codes of a removed interface. The socket stays unbound, even if an interface of the same name is created later.
+LINK_REMOVED: Final = (errno.ENODEV, errno.ENXIO)
+#: Shortest time between two attempts to open a removed interface again [s].
+REOPEN_PERIOD: Final = 0.1
 NO_ROOM = (errno.ENOBUFS, errno.EAGAIN)
 
 #: Mask of the used fields of a received header word. The reserved bytes may contain garbage.
@@ -79,6 +83,9 @@ class SocketCanBus:
     It does not receive its own frames. It receives error frames about the state of the CAN controller. Time stamps are
     CLOCK_REALTIME, taken by the kernel when the driver delivers the frame.
 
+    If the interface is removed (an adapter is unplugged), the next call raises `BusDown`. Later calls open the interface again
+    under the same file descriptor as soon as it is present and up, and raise `BusDown` until then.
+
     Args:
         channel: Name of the interface, such as `can0`.
         capacity: Largest number of frames in one system call, and of those that one `receive()` returns.
@@ -100,6 +107,9 @@ class SocketCanBus:
         self._capacity = capacity
         self._batches = Batches()
         self._closed = False
+        self._receive_buffer = receive_buffer
+        self._removed = False
+        self._next_attempt = 0.0  # monotonic time of the next attempt to open a removed interface [s]
         self._socket = _bound_socket(channel, receive_buffer)
         self._file = self._socket.fileno()
         libc = ctypes.CDLL(None, use_errno=True)
@@ -148,6 +158,8 @@ class SocketCanBus:
         """
         if self._closed:
             raise BusDown(f"{self.name} is closed")
+        if self._removed:
+            self._reopen()
         memory, headers = self._batches.to_send(frames)
         total = len(frames)
         for start in range(0, total, self._capacity):
@@ -182,6 +194,8 @@ class SocketCanBus:
         """
         if self._closed:
             raise BusDown(f"{self.name} is closed")
+        if self._removed:
+            self._reopen()
         memory = self._batches.to_fill(frames)
         room = min(len(frames), self._capacity)
         count = self._recvmmsg(self._file, self._rx_address, room, socket.MSG_DONTWAIT, None)
@@ -236,9 +250,7 @@ class SocketCanBus:
             code = ctypes.get_errno()
         if code in (errno.EAGAIN, errno.EINTR):
             return 0
-        if code in LINK_LOST:
-            raise BusDown(f"{self.name} is down ({os.strerror(code)}): type `ip link set {self.name} up`")
-        raise BusError(f"{self.name} cannot receive: {os.strerror(code)}")
+        raise self._link_error(code) or BusError(f"{self.name} cannot receive: {os.strerror(code)}")
 
     def _widen_classic(self, count: int) -> None:
         """Clear the unused bytes of classic CAN frames, and set the FDF flag of CAN FD frames."""
@@ -270,9 +282,35 @@ class SocketCanBus:
                 f"acknowledges frames, or enlarge the queue with `ip link set {self.name} txqueuelen 1000`",
                 sent,
             )
-        if code in LINK_LOST:
-            return BusDown(f"{self.name} is down ({reason}): type `ip link set {self.name} up`")
-        return BusError(f"{self.name} cannot send: {reason}")
+        return self._link_error(code) or BusError(f"{self.name} cannot send: {reason}")
+
+    def _link_error(self, code: int) -> BusDown | None:
+        """Return the error of an interface that is down or removed; None for other codes."""
+        if code == LINK_DOWN:
+            return BusDown(f"{self.name} is down: type `ip link set {self.name} up`")
+        if code in LINK_REMOVED:
+            self._removed = True
+            return BusDown(f"{self.name} was removed: plug the adapter in again; it is opened again when it is up")
+        return None
+
+    def _reopen(self) -> None:
+        """Open a removed interface again, under the same file descriptor.
+
+        Raises:
+            BusDown: If the interface cannot be opened yet; the message names the reason and the command that helps.
+        """
+        now = time.monotonic()
+        if now < self._next_attempt:
+            raise BusDown(f"{self.name} was removed and is not open again")
+        self._next_attempt = now + REOPEN_PERIOD
+        try:
+            require_channel(self.name)
+            with _bound_socket(self.name, self._receive_buffer) as again:
+                os.dup2(again.fileno(), self._file, inheritable=False)
+        except (BusAbsent, OSError) as error:
+            raise BusDown(f"{self.name} was removed and cannot be opened again: {error}") from error
+        self._removed = False
+        self._lost_before = 0  # the kernel counts for each socket
 
 
 def require_channel(channel: str) -> None:
@@ -352,5 +390,5 @@ def _headers(frames: Frames, control: Frames | None) -> tuple[Frames, Frames]:
     return vectors, headers
 
 
-def _address(array: npt.NDArray[np.void] | npt.NDArray[np.int64]) -> int:
+def _address(array: Frames) -> int:
     return array.ctypes.data

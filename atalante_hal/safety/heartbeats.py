@@ -23,7 +23,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: NMT states (CiA 301) of a node that has just started, and of a node in normal operation.
 BOOT_UP, OPERATIONAL = 0, 5
-#: Largest `Check` whose data is new. Numpy compares a plain integer ten times faster than an enum member.
+#: Largest `Check` whose data is new. It is a plain integer because numpy compares that ten times faster.
 _FRESH = int(Check.SOME_LOST)
 
 
@@ -33,8 +33,8 @@ class _Status(NamedTuple):
     row: int  # row of the status message in the process image
     timeout: int  # cycles
     state: int  # index of NodeState in the values of the process image
-    dbc_hash: int  # index of DbcHash in the values of the process image
-    supply: int  # index of SupplyVoltage in the values of the process image
+    dbc_hash: int  # index of DbcHash in the same values
+    supply: int  # index of SupplyVoltage in the same values
 
 
 class Heartbeats:
@@ -63,7 +63,7 @@ class Heartbeats:
         self._status_rows = np.array([s.row for s in self._statuses])
         self._timeouts = np.array([s.timeout for s in self._statuses])
         self._needed = {s.node for s in self._statuses if network.node(s.node).kind != "pendant"}
-        self._reported: set[str] = set()  # nodes that have sent a status message
+        self._heard: set[str] = set()  # nodes that have sent a status message
         self._emergency_of = {
             m.frame_id: (m.sender, codec.rows[m.name], codec.index(m.name, "ErrorCode"))
             for m in messages
@@ -71,14 +71,14 @@ class Heartbeats:
         }
         self._status_of = {codec.messages[s.row].frame_id: s for s in self._statuses}
         self._amplitude, self._amplitude_row = codec.slice("Amplitude"), codec.rows["HAPTICS_STATE"]
-        self._last_cycle = 0  # cycle up to which the ages of the process image are counted
+        self._seen = 0  # cycle up to which the ages of the process image are counted
         #: Node -> diagnostic and error code of its last emergency, until the error is cleared.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
         #: Emergencies since the last `judge` whose reaction is INFO: node, diagnostic, error code.
         self._notices: list[tuple[str, Dtc, int]] = []
         self._reset: set[str] = set()  # nodes that restarted since the last `judge`
-        #: Row -> evidence of two senders, 0 to `FULL`, updated with each frame; a missing row has none.
+        #: Row -> evidence of two senders, 1 to `FULL`, updated with each frame. Rows without evidence may be missing.
         self._evidence: dict[int, int] = {}
         #: Nodes that sent a boot-up message. The safety monitor clears this set after it has used it.
         self.booted: set[str] = set()
@@ -100,10 +100,10 @@ class Heartbeats:
         image = self.image
         self._age(cycle)
         unknown = []
-        for index, frame_id in enumerate(frames["can_id"].tolist()):
+        for place, frame_id in enumerate(frames["can_id"].tolist()):
             refused = len(image.refused)
-            if image.accept_each(frames[index:], 1):
-                unknown.append(index)
+            if image.accept_each(frames[place:], 1):
+                unknown.append(place)
                 continue
             row = image.frame_ids[frame_id]
             self._suspect(row, rival=image.refused[refused:] == [(row, Check.CONFLICT)])
@@ -111,10 +111,10 @@ class Heartbeats:
                 self.quiet = False
                 continue
             if frame_id in self._status_of:
-                self._accept_status(self._status_of[frame_id])
+                self._take_status(self._status_of[frame_id])
             elif frame_id in self._emergency_of:
                 node, _, code = self._emergency_of[frame_id]
-                self._accept_emergency(node, int(image.values[code]))
+                self._take_emergency(node, int(image.values[code]))
         if image.check[self._amplitude_row] <= _FRESH:
             vibration[:] = image.values[self._amplitude]
         return unknown
@@ -156,7 +156,7 @@ class Heartbeats:
         Args:
             still_faulty: DBC names of the drives that are still in FAULT.
         """
-        self.emergencies = {node: last for node, last in self.emergencies.items() if node in still_faulty}
+        self.emergencies = {node: said for node, said in self.emergencies.items() if node in still_faulty}
 
     def explains_fault(self, node: str) -> bool:
         """Return whether an emergency explains the drive state FAULT of a node in this cycle.
@@ -171,17 +171,17 @@ class Heartbeats:
     def missing(self) -> set[str]:
         """Return the required nodes that have sent no status message, and the nodes that use a different DBC."""
         values = self.image.values
-        return (self._needed - self._reported) | {
-            s.node for s in self._statuses if s.node in self._reported and values[s.dbc_hash] != self._hash
+        return (self._needed - self._heard) | {
+            s.node for s in self._statuses if s.node in self._heard and values[s.dbc_hash] != self._hash
         }
 
     def _age(self, cycle: int) -> None:
-        if cycle != self._last_cycle:
+        if cycle != self._seen:
             self._cleared.clear()
             refused = self.image.refused
-            self.image.new_cycle(cycle - self._last_cycle)
+            self.image.new_cycle(cycle - self._seen)
             self.image.refused = refused
-            self._last_cycle = cycle
+            self._seen = cycle
 
     def _suspect(self, row: int, *, rival: bool) -> None:
         """Update the evidence of two senders of a row with one more frame.
@@ -197,22 +197,22 @@ class Heartbeats:
             self.quiet = False
             self._evidence[row] = suspect(before, rival=rival)
 
-    def _accept_status(self, status: _Status) -> None:
+    def _take_status(self, status: _Status) -> None:
         values = self.image.values
         low = status.drive and values[status.supply] < self._low
         if low or values[status.dbc_hash] != self._hash or values[status.state] != OPERATIONAL:
             self.quiet = False
         if values[status.state] == BOOT_UP:
             self.booted.add(status.node)
-        if status.node not in self._reported:
-            self._reported.add(status.node)
-            self.known = self._reported.issuperset(self._needed)
+        if status.node not in self._heard:
+            self._heard.add(status.node)
+            self.known = self._heard.issuperset(self._needed)
             if self.known:
-                self.quiet = False  # the state machine must run: the robot may become READY
+                self.quiet = False  # the robot may become READY now
         elif values[status.state] != OPERATIONAL:
             self._reset.add(status.node)
 
-    def _accept_emergency(self, node: str, code: int) -> None:
+    def _take_emergency(self, node: str, code: int) -> None:
         dtc = emergency(code)
         self.quiet = False
         if dtc is None:

@@ -44,7 +44,7 @@ from atalante_hal.types import Vector
 
 _COUNT = len(JOINTS)
 #: Results of `limit`: torque unchanged, torque of at least one joint cut, input not finite.
-_UNCHANGED, _CUT, _NOT_FINITE = range(3)
+_AS_ASKED, _CUT, _NOT_FINITE = range(3)
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Limited:
     """Result of limiting one command."""
 
     finite: bool  # False: an input was NaN or infinite and the whole command was ignored
-    clamped: bool  # True: the torque of at least one joint was cut
+    clamped: bool  # the torque of at least one joint was cut
 
 
 class JointLimits(NamedTuple):
@@ -99,9 +99,9 @@ class Limiter:
         self.cut: npt.NDArray[np.bool_] = np.zeros(_COUNT, np.bool_)
         self.saturated = 0
         # Copies of the inputs, because the compiled code accepts only the array type and layout that it was compiled for.
-        self._requested, self._motion = np.zeros(_COUNT), np.zeros((2, _COUNT))
+        self._asked, self._motion = np.zeros(_COUNT), np.zeros((2, _COUNT))
         self._apply = compiled(limit)
-        self.apply(self.last, np.zeros((2, _COUNT)))  # compiles `limit` before the first cycle
+        self.apply(self.last, np.zeros((2, _COUNT)))  # nothing; from now on it is machine code
 
     def apply(self, torque: Vector, motion: Vector) -> Limited:
         """Limit a command and store the result in `last`.
@@ -113,13 +113,13 @@ class Limiter:
         Returns:
             Whether the inputs were finite and whether a torque was cut. If an input is not finite, `last` keeps its value.
         """
-        self._requested[:] = torque
+        self._asked[:] = torque
         self._motion[:] = motion
-        result = self._apply(self._requested, self._motion, self._limits, self.limit, self.last, self.cut)
-        if result == _NOT_FINITE:
+        done = self._apply(self._asked, self._motion, self._limits, self.limit, self.last, self.cut)
+        if done == _NOT_FINITE:
             return Limited(finite=False, clamped=False)
-        self.saturated = self.saturated + 1 if result == _CUT else 0
-        return _LIMITED[result]
+        self.saturated = self.saturated + 1 if done == _CUT else 0
+        return _LIMITED[done]
 
     def derate(self, limit: Vector) -> None:
         """Set the torque limit, but no higher than the maximum torque of the robot.
@@ -141,11 +141,11 @@ class Limiter:
         self.cut.fill(False)
 
 
-_LIMITED = {_UNCHANGED: Limited(finite=True, clamped=False), _CUT: Limited(finite=True, clamped=True)}
+_LIMITED = {_AS_ASKED: Limited(finite=True, clamped=False), _CUT: Limited(finite=True, clamped=True)}
 
 
 def limit(
-    requested: Vector,
+    asked: Vector,
     motion: Vector,
     limits: JointLimits,
     torque_limit: Vector,
@@ -155,23 +155,21 @@ def limit(
     """Limit the torque of all joints by torque limit, envelope and rate, as described in the module docstring.
 
     Args:
-        requested: requested torque, shape (12,) [Nm].
+        asked: requested torque, shape (12,) [Nm].
         motion: position [rad] and velocity [rad/s], shape (2, 12).
         limits: constant limits of the joints.
         torque_limit: present torque limit, shape (12,) [Nm].
         last: torque sent in the last cycle, shape (12,) [Nm]; overwritten with the torque to be sent in this cycle.
-        cut: output, True for each joint whose torque differs from the requested torque, shape (12,); overwritten.
+        cut: True for each joint whose torque differs from the requested torque, shape (12,); overwritten.
 
     Returns:
-        `_UNCHANGED`, `_CUT`, or `_NOT_FINITE`; with `_NOT_FINITE` no output is changed.
+        `_AS_ASKED`, `_CUT`, or `_NOT_FINITE`; with `_NOT_FINITE` no output is changed.
     """
-    for joint in range(len(requested)):
-        if not (
-            math.isfinite(requested[joint]) and math.isfinite(motion[0, joint]) and math.isfinite(motion[1, joint])
-        ):
+    for joint in range(len(asked)):
+        if not (math.isfinite(asked[joint]) and math.isfinite(motion[0, joint]) and math.isfinite(motion[1, joint])):
             return _NOT_FINITE
-    result = _UNCHANGED
-    for joint in range(len(requested)):
+    done = _AS_ASKED
+    for joint in range(len(asked)):
         velocity, ahead = motion[1, joint], motion[0, joint] + limits.look_ahead * motion[1, joint]
         too_high = (ahead - limits.position_max[joint]) / limits.position_margin
         too_low = (limits.position_min[joint] - ahead) / limits.position_margin
@@ -181,12 +179,12 @@ def limit(
         down = torque_limit[joint] * share(max(too_low, too_fast_down))
         # If the limit falls below the torque of the last cycle, the torque approaches it at the rate limit.
         lowest, highest = last[joint] - limits.step[joint], last[joint] + limits.step[joint]
-        sent = min(max(requested[joint], within(-down, lowest, highest)), within(up, lowest, highest))
-        cut[joint] = sent != requested[joint]
+        sent = min(max(asked[joint], within(-down, lowest, highest)), within(up, lowest, highest))
+        cut[joint] = sent != asked[joint]
         if cut[joint]:
-            result = _CUT
+            done = _CUT
         last[joint] = sent
-    return result
+    return done
 
 
 def share(beyond: float) -> float:

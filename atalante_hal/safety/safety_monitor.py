@@ -1,4 +1,4 @@
-"""Safety monitor: it collects the faults of a cycle, runs the state machine, and sets torque limit and assistance factor.
+"""Safety monitor: collects the faults of each cycle, runs the state machine, and sets torque limits and assistance factor.
 
     process image, heartbeats, bus faults, plausibility, loop, controller -> fault memory -> state machine -> verdict
 
@@ -38,7 +38,7 @@ DRIVE_NODES = tuple(joint.upper() for joint in JOINTS)
 _ENABLED = np.full(len(JOINTS), float(DriveState.OPERATION_ENABLED)).tobytes()
 _FAULTY = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 _S = SupervisorState
-#: States that START can end. In all other states START only acknowledges faults.
+#: States in which START can change the state. In all other states START only acknowledges faults.
 _STARTABLE = (_S.READY, _S.FULL_ASSIST, _S.HOLD, _S.LOWER, _S.FAULT)
 
 
@@ -57,10 +57,10 @@ class SafetyMonitor:
 
     Attributes:
         reason: reason for the present state, one sentence for the operator.
-        moving: True if the torques of the controller are sent to the drives.
+        moving: True if the controller's torques are sent to the drives.
         step: step number reported by the controller; None if the controller does not walk.
         start_wanted: cycles left in which a pressed START can change the state; 0 if no START is being processed.
-        enabling: True while drives are being enabled; a drive that is already enabled gets a torque command.
+        enabling: True while drives are being enabled; a drive that is already enabled receives torque.
         lowered: DBC names of the drives that cannot hold and are being lowered.
     """
 
@@ -93,7 +93,7 @@ class SafetyMonitor:
         state.valid, state.age = self._message_monitor.valid, image.age
         self.memory = FaultMemory()
         self.conditions = Conditions()
-        self.reason = "the HAL has just started"
+        self.reason = "nothing has happened yet"
         self.moving = False
         self.step: int | None = None
         self.start_wanted = 0
@@ -104,9 +104,9 @@ class SafetyMonitor:
         self._reports: list[Finding] = []  # faults that loop and controller reported since the last `judge`
         self._acknowledged = False  # True if START was pressed in this cycle
         self._ending = False
-        self._other_hal_first = False  # True if another HAL was detected in OFF or READY
+        self._barred = False  # True if another HAL was detected in OFF or READY
         self._assistance_factor = state.assistance_factor  # assistance factor set by the operator
-        self._ramping = False  # True while the assistance factor ramps to 1 or back
+        self._leading = False  # True while the assistance factor ramps to 1 or back
         #: Step when FINISH_STEP began, and cycle in which FINISH_STEP ends at the latest.
         self._finish: tuple[int | None, int] = None, 0
         self._drives_judged = b""  # drive states and temperatures of the last evaluation
@@ -169,7 +169,7 @@ class SafetyMonitor:
         """Request HOLD from the next cycle on, because the program is ending."""
         self._ending, self._steady = True, False
 
-    def check_heartbeats(self) -> None:
+    def look_for_heartbeats(self) -> None:
         """Check for status messages that timed out; call it periodically, because a lost message triggers no other check."""
         if self._heartbeats.overdue(self._state.cycle):
             self._steady = False
@@ -198,14 +198,12 @@ class SafetyMonitor:
         self._reports.clear()
         nodes_well = message_monitor.nodes_well and self._heartbeats.known
         self._judge_drives(nodes_well)
-        if self._other_hal_first:
-            memory.raise_dtc(
-                cycle, Dtc.HAL_DUPLICATE, "HAL", text="another HAL was active first: stop it, then restart this HAL"
-            )
+        if self._barred:
+            memory.raise_dtc(cycle, Dtc.HAL_DUPLICATE, "HAL", text="another HAL was there first: end one, start again")
         row = pendant.row
         pendant.hear(message_monitor.trusts(row), qualifying=message_monitor.hears(row), beside=self._image.beside(row))
         memory.close_cycle(cycle)
-        self._other_hal_first |= Dtc.HAL_DUPLICATE in memory.confirmed and state.supervisor in (_S.OFF, _S.READY)
+        self._barred |= Dtc.HAL_DUPLICATE in memory.confirmed and state.supervisor in (_S.OFF, _S.READY)
         self._judge_start(nodes_well)
         self.conditions = Conditions(
             diagnostics=memory.confirmed,
@@ -222,13 +220,13 @@ class SafetyMonitor:
             self._enter(before, after, reasons)
         elif after is _S.OFF and reasons:
             self.reason = memory.text_of(reasons)
-        self._set_assistance()
-        self._update_lowered()
+        self._lead_assistance()
+        self._let_down()
         self._steady = (
             after is before
             and message_monitor.settled
             and self._heartbeats.quiet
-            and not (memory.active or self.start_wanted or self._ramping or after is _S.FINISH_STEP or self._ending)
+            and not (memory.active or self.start_wanted or self._leading or after is _S.FINISH_STEP or self._ending)
         )
 
     def _judge_drives(self, nodes_well: bool) -> None:
@@ -253,14 +251,14 @@ class SafetyMonitor:
         if limit.tobytes() == full.tobytes():
             return
         share = (limit / full).tolist()
-        for joint, (node, own, other) in enumerate(
+        for place, (node, mine, twins) in enumerate(
             zip(DRIVE_NODES, share, share[len(share) // 2 :] + share, strict=False)
         ):
-            if own < 1.0:
-                text = f"{node}: its torque limit is {limit[joint]:.0f} of {full[joint]:.0f} Nm because it is hot"
-                confirmed = own < self._robot.thresholds.derated_imbalance * other
+            if mine < 1.0:
+                text = f"{node}: its torque limit is {limit[place]:.0f} of {full[place]:.0f} Nm because it is hot"
+                confirmed = mine < self._robot.thresholds.derated_imbalance * twins
                 self.memory.raise_dtc(
-                    self._state.cycle, Dtc.DERATED, node, value=limit[joint], confirmed=confirmed, text=text
+                    self._state.cycle, Dtc.DERATED, node, value=limit[place], confirmed=confirmed, text=text
                 )
 
     def _judge_start(self, nodes_well: bool) -> None:
@@ -286,7 +284,7 @@ class SafetyMonitor:
             self._end_start(ended)
 
     @property
-    def start_blocked(self) -> bool:
+    def hindered(self) -> bool:
         """Return whether a confirmed diagnostic prevents the drives from being enabled."""
         return bool(self.memory.worst())
 
@@ -327,26 +325,26 @@ class SafetyMonitor:
             self._limiter.restart(state.torque)
         if after is _S.FINISH_STEP:
             self._finish = self.step, state.cycle + FINISH_STEP_CYCLES
-        self._ramping = self.moving and before in MOVING
+        self._leading = self.moving and before in MOVING
         severity = "error" if after is _S.FAULT else "info"
         text = f"{before.name} -> {after.name}" + (f": {self.reason}" if reasons else "")
         self.memory.events.append(Event(state.cycle, after.name, text, severity, value=after))
 
-    def _set_assistance(self) -> None:
-        """Set the assistance factor: 1 in FULL_ASSIST and FINISH_STEP, otherwise that of the operator, with a ramp in between."""
-        state, requested = self._state, self._pendant.assistance_factor
-        if requested is not None:
-            self._assistance_factor = requested
-        full_assist = state.supervisor in (_S.FULL_ASSIST, _S.FINISH_STEP)
-        target = 1.0 if full_assist else self._assistance_factor
-        if self._ramping:
-            step, change = PERIOD / self._robot.thresholds.full_assist_ramp, target - state.assistance_factor
-            state.assistance_factor += max(-step, min(step, change))
-            self._ramping = state.assistance_factor != target
-        elif not full_assist:
+    def _lead_assistance(self) -> None:
+        """Set the assistance factor: the operator's value, or a ramp to 1 in FULL_ASSIST and FINISH_STEP and back."""
+        state, wanted = self._state, self._pendant.assistance_factor
+        if wanted is not None:
+            self._assistance_factor = wanted
+        led = state.supervisor in (_S.FULL_ASSIST, _S.FINISH_STEP)
+        target = 1.0 if led else self._assistance_factor
+        if self._leading:
+            step, way = PERIOD / self._robot.thresholds.full_assist_ramp, target - state.assistance_factor
+            state.assistance_factor += max(-step, min(step, way))
+            self._leading = state.assistance_factor != target
+        elif not led:
             state.assistance_factor = target
 
-    def _update_lowered(self) -> None:
+    def _let_down(self) -> None:
         """Update `lowered`: in LOWER and FAULT the drives with a confirmed LOWER diagnostic, otherwise none."""
         if self._state.supervisor in (_S.LOWER, _S.FAULT):
             lower = frozenset(dtc for dtc in self.memory.confirmed if dtc.reaction is Reaction.LOWER)

@@ -90,7 +90,7 @@ def refusal(robot: Robot, request: StartRequest) -> Refusal | None:
 
 
 def _reason(request: StartRequest) -> str:
-    """Return why the drives must not be enabled, without a check of their torques; empty if they may be enabled."""
+    """Return why the drives must not be enabled further, apart from their torques; empty if they may."""
     if request.ending:
         return "the program is ending"
     if request.stop_requested or not request.dead_man:
@@ -99,7 +99,7 @@ def _reason(request: StartRequest) -> str:
         return ""
     if request.diagnostic or request.nodes_well:
         return request.diagnostic
-    return f"timed out or not trusted yet: {', '.join(sorted(request.missing))}"
+    return f"not heard or not trusted yet: {', '.join(sorted(request.missing))}"
 
 
 def stop_text(stop_requested: bool) -> str:

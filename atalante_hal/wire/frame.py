@@ -7,6 +7,7 @@ bytes that the CRC protects and the decoder reads. The record size of 72 bytes k
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +31,7 @@ ID_ERROR = 1 << 29
 #: Payload lengths that CAN FD supports (ISO 11898-1) [bytes].
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 
-Frames = npt.NDArray[np.void]
+Frames = npt.NDArray[Any]
 
 
 def new_frames(count: int) -> Frames:

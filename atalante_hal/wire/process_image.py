@@ -42,21 +42,21 @@ from atalante_hal.wire.e2e import (
 )
 from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES, WORDS, Frames, as_words, new_frames
 
-#: Value of `tag` if each sender uses its own counter.
+#: Marker instead of a cycle tag: each sender uses its own counter.
 _NO_TAG = -1
 #: Values of `Check` as plain integers. A result <= `_FRESH` means new, usable data.
 _FRESH = _SOME_LOST = int(Check.SOME_LOST)
 _REPEATED, _CONFLICT, _WRONG_SEQUENCE = int(Check.REPEATED), int(Check.CONFLICT), int(Check.WRONG_SEQUENCE)
 _CRC, _LENGTH, _RANGE, _INVALID = int(Check.CRC), int(Check.LENGTH), int(Check.RANGE), int(Check.INVALID)
-#: Check results of frames without new values: damaged frames, and repetitions of the accepted frame.
-_NO_NEW_VALUES = frozenset({Check.CRC, Check.LENGTH, Check.REPEATED})
-#: Row of a frame that is not a message of this process image.
+#: Values of `Check` for frames without new values: damaged frames and repeats of the accepted frame.
+_SAYS_NOTHING_NEW = frozenset({Check.CRC, Check.LENGTH, Check.REPEATED})
+#: Marker instead of a row: the frame is not a message of this process image.
 _FOREIGN = -1
 #: Age of a message that has never been received [cycles].
 NEVER = 1 << 30
 #: Age from which an answer to a SYNC counts as replayed; a younger answer counts as late [cycles].
 LATEST = 16
-#: Half the counter period. A counter further ahead counts as an old one, unless the row was silent for as many cycles.
+#: Half the counter period. A larger step forward counts as a step back, unless the row was silent for as many cycles.
 _HALF_TURN = 128
 
 
@@ -128,7 +128,7 @@ class ReceiveImage:
         #: True if the last cycle was perfect: every row was committed with the expected frame.
         self.all_fresh = self._was_fresh = False
         #: Frames of the last `accept_each`, with the row and `Check` of each frame.
-        self._last_found: tuple[Frames, Words] | None = None
+        self._offered: tuple[Frames, Words] | None = None
         self._ordered = _Received(new_frames(count), count)
         self._received = self._ordered
         self._accept_exact, self._accept_frames = compiled(accept_exact), compiled(accept_frames)
@@ -170,9 +170,9 @@ class ReceiveImage:
             return range(rows, count)
         if count >= rows:
             found = [row_of.get(can_id, -1) for can_id in frames["can_id"][:count].tolist()]
-            foreign = [index for index, row in enumerate(found) if row < 0]
+            foreign = [place for place, row in enumerate(found) if row < 0]
             if len(foreign) == count - rows and len(set(found) - {-1}) == rows:
-                # Every message arrived once. There were other frames, too, or several buses or the arbitration changed the order.
+                # Every message arrived once, but with other frames or in another order, due to several buses or arbitration.
                 self._ordered.words[:] = as_words(frames)[np.argsort(found)[count - rows :]].view(np.int64).ravel()
                 if self._accept(self._ordered, tag):
                     return foreign
@@ -180,19 +180,19 @@ class ReceiveImage:
         return self.accept_each(frames, count, tag)
 
     def refuse(self, row: int) -> None:
-        """Reject the implausible values of a row that `accept` just committed: restore its previous values and age.
+        """Reject a row that `accept` just committed, because its values are implausible: restore its previous values and age.
 
         Args:
             row: row of the message; its age is one cycle more than before `accept`.
         """
-        signals = self.codec.row_of == row
-        self.values[signals] = self.values_before[signals]
+        mine = self.codec.row_of == row
+        self.values[mine] = self.values_before[mine]
         self.age[row] = 1 if self._was_fresh else self._age_before[row] + 1
         self.check[row] = Check.IMPLAUSIBLE
         self.all_fresh = False
 
     def begins(self, frames: Frames, count: int) -> bool:
-        """Return whether the buffer begins with all messages of this process image, in order.
+        """Return whether the buffer begins with all messages of this process image in order, so that the cycle is complete.
 
         Args:
             frames: receive buffer.
@@ -201,7 +201,7 @@ class ReceiveImage:
         return count >= len(self.check) and self._received_in(frames).headers.tobytes() == self._expected_headers
 
     def expected_ids(self) -> set[int]:
-        """Return the identifiers of the messages whose values are not older than the timeout in the DBC."""
+        """Return the identifiers of the messages that have not timed out, by the timeout in the DBC."""
         ages = self.age.tolist()
         return {m.frame_id for row, m in enumerate(self.codec.messages) if ages[row] <= m.timeout_ms}
 
@@ -211,7 +211,7 @@ class ReceiveImage:
         return self._received
 
     def _accept(self, received: _Received, tag: int | None) -> bool:
-        """Commit a perfect cycle in one pass; the fast path in place of `new_cycle` and `accept_each`.
+        """Commit a perfect cycle in one pass, as a fast path instead of `new_cycle` and `accept_each`.
 
         Args:
             received: frames of the cycle.
@@ -225,7 +225,7 @@ class ReceiveImage:
             received.words, self._e2e, cycle_tag, self.codec.table, self.values, self.values_before
         ):
             return False
-        self._last_found = None
+        self._offered = None
         if not self.all_fresh:
             self.age.fill(0)
             self._e2e.silent.fill(0)
@@ -235,7 +235,7 @@ class ReceiveImage:
         return True
 
     def accept_each(self, frames: Frames, count: int, tag: int | None = None) -> list[int]:
-        """Check the frames one by one in order of arrival, and commit the good ones; call `new_cycle` before.
+        """Check the frames one by one in order of arrival, and decode and commit the good ones; call `new_cycle` before.
 
         Args:
             frames: receive buffer.
@@ -257,11 +257,11 @@ class ReceiveImage:
             self.values,
             self._status,
         )
-        self._last_found = frames, found
+        self._offered = frames, found
         foreign = []
-        for index, (row, check) in enumerate(found.tolist()):
+        for place, (row, check) in enumerate(found.tolist()):
             if row == _FOREIGN:
-                foreign.append(index)
+                foreign.append(place)
             elif check > _FRESH:
                 self.refused.append((row, Check(check)))
                 self.crc_errors += check == _CRC
@@ -279,15 +279,15 @@ class ReceiveImage:
             A copy of `values` for each of these frames, in order of arrival, with the signals of the row taken from the frame.
             Shape (codec.size,) each, in DBC units; the signals may be outside their range.
         """
-        if self._last_found is None:
+        if self._offered is None:
             return []
-        frames, found = self._last_found
-        results = [(index, check) for index, (of, check) in enumerate(found.tolist()) if of == row]
-        committed = max((index for index, check in results if check <= _FRESH), default=None)
+        frames, found = self._offered
+        mine = [(place, check) for place, (of, check) in enumerate(found.tolist()) if of == row]
+        committed = max((place for place, check in mine if check <= _FRESH), default=None)
         return [
-            self._decoded(frames, index, row)
-            for index, check in results
-            if index != committed and check not in _NO_NEW_VALUES
+            self._decoded(frames, place, row)
+            for place, check in mine
+            if place != committed and check not in _SAYS_NOTHING_NEW
         ]
 
     def _decoded(self, frames: Frames, index: int, row: int) -> Vector:
@@ -429,7 +429,8 @@ def judge_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int, re
         return _CRC
     counter = int(octets[begin + COUNTER_BYTE])
     in_time = tag == _NO_TAG or tag - counter & 0xFF < LATEST
-    # After half the counter period of silence, the counter no longer orders frames. A frame that answers a recent SYNC is new.
+    # After a silence of half the counter period, the counter no longer gives the order of frames. Then a frame is new if it
+    # answers a SYNC of the last cycles.
     back = tag != _NO_TAG and in_time and expected[row] != NOTHING and silent[row] >= _HALF_TURN
     result = judge_counter(expected[row], counter)
     if back and result == _REPEATED:
@@ -441,7 +442,8 @@ def judge_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int, re
             return _CONFLICT
         result = _CONFLICT
     elif tag != _NO_TAG and not back:
-        # An answer to an old SYNC, or to an earlier one than the last accepted frame, must not change the expected counter.
+        # A frame that answers no recent SYNC, or an earlier SYNC than the last accepted frame, must not change the expected
+        # counter.
         backwards = expected[row] != NOTHING and counter - expected[row] + 1 & 0xFF >= _HALF_TURN
         if not in_time or backwards:
             return _WRONG_SEQUENCE
@@ -503,7 +505,7 @@ class TransmitImage:
         return self._octets.tobytes()
 
     def seal_prepared(self, prepared: bytes) -> Frames:
-        """Protect and return frames that were encoded beforehand, so that a fault in the values cannot affect them.
+        """Protect and return frames that were encoded beforehand, so that a later fault in the values cannot affect them.
 
         Args:
             prepared: result of `prepare`.

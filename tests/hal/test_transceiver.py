@@ -31,6 +31,9 @@ class Clock:
         assert self.looks < 200, "endless wait"
         return self.now
 
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
 
 class Bus:
     """Bus of lists: the sent frames, and the frames that each `receive` delivers."""
@@ -293,7 +296,13 @@ def test_bus_down_while_receiving_is_reported_and_not_raised(desk: Desk):
     event = desk.memory.events[0]
     assert (event.text, event.value, event.node) == ("the bus bench cannot receive: gone", 0.0, "HAL")
     desk.bus.arrivals = [ids(1), BusDown("gone")]
-    assert desk.transceiver.receive(0, image(0, 1), 1.0) == 0
+    begun = desk.bus.clock.now
+    assert desk.transceiver.receive(0, image(0, 1), 0.01) == 0
+    assert desk.bus.clock.now == begun + 0.01
+    for patience, paused in ((0.0, 0.0), (0.01, 0.01), (60.0, 0.1)):
+        desk.bus.arrivals, begun = [BusDown("gone")], desk.bus.clock.now
+        assert desk.transceiver.receive(0, image(0, 1), patience) == 0
+        assert desk.bus.clock.now == begun + paused
 
 
 @pytest.mark.parametrize(

@@ -55,14 +55,35 @@ def as_root(*command: str) -> None:
         pytest.fail(f"this test needs root for `{' '.join(command)}`: {reason}", pytrace=False)
 
 
+def create(channel: str) -> None:
+    """Create a virtual CAN FD interface and set it up."""
+    as_root("ip", "link", "add", channel, "type", "vcan")
+    as_root("ip", "link", "set", channel, "mtu", "72", "txqueuelen", "1000", "up")
+
+
+def remove(channel: str) -> None:
+    """Remove a virtual interface, as unplugging removes the interface of an adapter."""
+    as_root("ip", "link", "del", channel)
+
+
 @pytest.fixture
 def spare_vcan(vcan: str) -> Iterator[str]:
-    """Name of a second interface, up, that the test may take down, clog or reconfigure."""
+    """Name of a second interface, up, that the test may take down, clog, remove or reconfigure."""
     channel = "vcanspare"
-    as_root("ip", "link", "add", channel, "type", "vcan")
-    as_root("ip", "link", "set", channel, "mtu", "72", "up")
+    create(channel)
     yield channel
-    as_root("ip", "link", "del", channel)
+    remove(channel)
+
+
+@pytest.fixture
+def four_vcans(vcan: str) -> Iterator[list[str]]:
+    """Names of four interfaces, up, one for each bus of the robot."""
+    channels = [f"vcanbus{number}" for number in range(4)]
+    for channel in channels:
+        create(channel)
+    yield channels
+    for channel in channels:
+        remove(channel)
 
 
 @contextmanager

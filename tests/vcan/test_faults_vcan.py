@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
@@ -16,40 +17,27 @@ from atalante_dbc import Network
 from atalante_emulator.body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
-from atalante_hal.bus import BusDown
+from atalante_hal.bus import Bus
+from atalante_hal.bus.joined import JoinedBus
+from atalante_hal.bus.resilient import ResilientBus
 from atalante_hal.bus.socketcan import SocketCanBus
-from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
 from atalante_hal.transceiver import RECEIVE_BUDGET
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import DriveState
-from atalante_hal.wire.frame import Frames, new_frames
-from tests.vcan.conftest import PATIENCE, Loop, as_root, repeated
+from atalante_hal.wire.frame import new_frames
+from tests.vcan.conftest import PATIENCE, Loop, as_root, create, remove, repeated
 
 S = SupervisorState
 ATALANTE = str(Path(sys.executable).with_name("atalante"))
 
 
-class NodesEnd(WrappedBus):
-    """The nodes' end of the wire: an interface that is down is silence to them, and what they say then reaches nobody."""
-
-    down = False  # and nothing has been heard since
-
-    def send(self, frames: Frames) -> None:
-        try:
-            super().send(frames)
-        except BusDown:
-            self.down = True
-
-    def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        try:
-            count = super().receive(frames, timeout)
-        except BusDown:
-            self.down = True
-            return 0
-        self.down = self.down and not count
-        return count
+def opened(network: Network, channels: Sequence[str]) -> Bus:
+    """Open one channel for all buses of the robot, or one for each."""
+    if len(channels) == 1:
+        return SocketCanBus(channels[0])
+    return JoinedBus(network, dict(zip(network.buses, map(SocketCanBus, channels), strict=True)))
 
 
 @dataclass
@@ -72,6 +60,13 @@ class Line:
     def drives_hold(self) -> bool:
         return set(self.emulator.drives.state) == {DriveState.QUICK_STOP_ACTIVE}
 
+    def reconnect(self) -> None:
+        """Run until every node answers again."""
+        deadline = time.monotonic() + PATIENCE
+        while self.hal.missing():
+            self.loop.cycles(1)
+            assert time.monotonic() < deadline, self.hal.missing()
+
     def start(self) -> None:
         """To ACTIVE, on the operator's word."""
         self.operator.start()
@@ -83,23 +78,23 @@ class Line:
 
 @pytest.fixture
 def walking(network: Network, robot: Robot, urdf_text: str) -> Iterator[type]:
-    """`with walking(channel) as line`: ACTIVE."""
+    """`with walking(channel, ...) as line`: ACTIVE; with four channels, each bus of the robot has its own."""
 
     @contextmanager
-    def on(channel: str) -> Iterator[Line]:
+    def on(*channels: str) -> Iterator[Line]:
         with ExitStack() as stack:
-            buses = [SocketCanBus(channel) for _ in range(2)]
+            buses = [opened(network, channels) for _ in range(2)]
             for bus in buses:
                 stack.callback(bus.close)
             body = PyBulletBody(urdf_text)
             stack.callback(body.close)
             operator = Operator(0.5, starts=False)
-            wire = NodesEnd(buses[0])
+            wire = ResilientBus(buses[0])
             emulator = Emulator(network, robot, body, wire, operator=operator)
 
             def answer() -> None:
-                if not emulator.poll(0.05) and wire.down:
-                    emulator.idle()  # no SYNC will come: a millisecond goes by without
+                if not emulator.poll(0.001 if wire.down else 0.05) and wire.down:
+                    emulator.idle()  # a millisecond without SYNC
 
             hal = Hal(network, robot, buses[1], patience=PATIENCE)
             line = Line(hal, Loop(hal), emulator, operator, stack)
@@ -181,5 +176,39 @@ def test_f16_an_interface_that_goes_down_ends_in_hold_until_the_operator_starts_
         assert line.loop.cycles(60) is S.HOLD  # what was pressed meanwhile does not count
         assert line.hal.missing() == []
         assert line.drives_hold
+        line.start()
+        assert line.loop.cycles(20) is S.ACTIVE, line.hal.reason
+
+
+def test_f16_a_removed_interface_ends_in_hold_and_is_used_again_when_it_is_back(spare_vcan: str, walking) -> None:
+    with walking(spare_vcan) as line:
+        for _ in range(2):
+            line.loop.cycles(20)
+            remove(spare_vcan)
+            assert line.loop.cycles(2) is S.HOLD
+            assert "BUS_DOWN" in line.codes()
+            assert f"{spare_vcan} was removed: plug the adapter in again" in line.hal.reason
+            assert line.loop.cycles(30) is S.HOLD
+            assert line.drives_hold
+            create(spare_vcan)
+            line.reconnect()
+            assert line.loop.cycles(60) is S.HOLD
+            line.start()
+        assert line.loop.cycles(20) is S.ACTIVE, line.hal.reason
+
+
+def test_f16_one_of_four_interfaces_is_removed_and_comes_back(four_vcans: list[str], walking) -> None:
+    with walking(*four_vcans) as line:
+        line.loop.cycles(20)
+        lost = four_vcans[1]
+        remove(lost)
+        assert line.loop.cycles(2) is S.HOLD
+        assert f"{lost} was removed" in line.hal.reason
+        line.loop.cycles(30)
+        bus = line.hal.network.buses[1]
+        assert set(line.hal.missing()) == {m.sender for m in line.hal.network.messages if m.bus == bus} - {"HAL"}
+        assert line.drives_hold
+        create(lost)
+        line.reconnect()
         line.start()
         assert line.loop.cycles(20) is S.ACTIVE, line.hal.reason

@@ -9,11 +9,11 @@ import can
 import numpy as np
 import pytest
 
-from atalante_hal.bus import Bus, BusAbsent, BusDown, BusFull, open_bus
+from atalante_hal.bus import Bus, BusAbsent, BusDown, BusFull, open_bus, socketcan
 from atalante_hal.bus.channel_map import open_channels, parse_channel_map
 from atalante_hal.bus.python_can import message_of
 from atalante_hal.bus.replay import ReplayBus
-from atalante_hal.bus.socketcan import SocketCanBus
+from atalante_hal.bus.socketcan import REOPEN_PERIOD, SocketCanBus
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, Frames, new_frames
 from tests.hal.bus.test_bus import (
     BUSES,
@@ -24,7 +24,7 @@ from tests.hal.bus.test_bus import (
     random_frames,
     receive_all,
 )
-from tests.vcan.conftest import Candump, as_root
+from tests.vcan.conftest import Candump, as_root, create, remove
 
 
 class TestSocketCan(FrameSender, FrameReceiver, FrameWaiter):
@@ -161,13 +161,68 @@ def test_a_link_that_goes_down_is_reported_and_comes_back(spare_vcan: str) -> No
     other.close()
 
 
-def test_an_interface_that_is_gone_is_down(spare_vcan: str) -> None:
+def test_a_removed_interface_is_opened_again_when_it_is_back(spare_vcan: str) -> None:
+    sender, receiver = SocketCanBus(spare_vcan), SocketCanBus(spare_vcan)
+    remove(spare_vcan)
+    with pytest.raises(BusDown, match=f"{spare_vcan} was removed: plug the adapter in again"):
+        sender.send(random_frames(2))
+    with pytest.raises(BusDown, match=f"{spare_vcan} was removed: plug the adapter in again"):
+        receiver.receive(new_frames(4))
+    time.sleep(REOPEN_PERIOD)
+    for bus in (sender, receiver):
+        with pytest.raises(BusDown, match=f"cannot be opened again: there is no interface {spare_vcan}"):
+            bus.receive(new_frames(4), 5.0)
+    create(spare_vcan)
+    time.sleep(REOPEN_PERIOD)
+    assert receiver.receive(new_frames(4)) == 0
+    for _ in range(2):
+        sent = random_frames(2)
+        sender.send(sent)
+        assert receive_all(receiver, 2).tobytes() == sent.tobytes()
+    sender.close()
+    receiver.close()
+    with pytest.raises(BusDown, match="is closed"):
+        sender.send(random_frames(2))
+
+
+def test_a_removed_interface_is_tried_once_in_a_period(spare_vcan: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socketcan, "REOPEN_PERIOD", 3600.0)
     bus = SocketCanBus(spare_vcan)
-    as_root("ip", "link", "del", spare_vcan)
-    with pytest.raises(BusDown):
-        bus.send(random_frames(2))
+    remove(spare_vcan)
+    with pytest.raises(BusDown, match="was removed: plug"):
+        bus.send(random_frames(1))
+    with pytest.raises(BusDown, match="cannot be opened again"):
+        bus.send(random_frames(1))
+    create(spare_vcan)
+    with pytest.raises(BusDown, match="is not open again"):
+        bus.send(random_frames(1))
     bus.close()
-    as_root("ip", "link", "add", spare_vcan, "type", "vcan")
+
+
+def test_frames_lost_before_a_removal_are_counted_once(spare_vcan: str) -> None:
+    sender, receiver = SocketCanBus(spare_vcan), SocketCanBus(spare_vcan, receive_buffer=1)
+    frames = random_frames(200)
+    sender.send(frames)
+    receive_some(receiver)
+    sender.send(frames[:1])
+    receive_some(receiver)
+    dropped = receiver.dropped
+    assert dropped > 0
+    remove(spare_vcan)
+    with pytest.raises(BusDown):
+        receiver.receive(new_frames(4))
+    create(spare_vcan)
+    time.sleep(REOPEN_PERIOD)
+    assert receiver.receive(new_frames(4)) == 0
+    assert receiver.dropped == dropped
+    sender.close()
+    receiver.close()
+
+
+def receive_some(bus: SocketCanBus) -> None:
+    """Empty the receive queue."""
+    while bus.receive(new_frames(64)):
+        pass
 
 
 def test_a_full_transmit_queue_says_how_many_went_out(spare_vcan: str) -> None:

@@ -79,7 +79,7 @@ TORQUE = "the drive of left_FH reports 3 Nm in SWITCH_ON_DISABLED; must be withi
         (ENABLING, {"stop_requested": True, "dead_man": False, **ILL}, STOP),
         (ENABLING, {"dead_man": False, **ILL}, RELEASED),
         (ENABLING, {**ILL, **UNWELL}, ILL["diagnostic"]),
-        (ENABLING, {**UNWELL, "cycles_left": 0}, "timed out or not trusted yet: IMU_TORSO, LEFT_SK"),
+        (ENABLING, {**UNWELL, "cycles_left": 0}, "not heard or not trusted yet: IMU_TORSO, LEFT_SK"),
         (ENABLING, {"cycles_left": 0, "torque": OFF_TORQUE}, FAILED),
         (ENABLING, {"torque": OFF_TORQUE}, TORQUE),
         (ENABLING, {"supervisor": S.HOLD, "torque": OFF_TORQUE}, TORQUE),

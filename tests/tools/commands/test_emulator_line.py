@@ -9,7 +9,7 @@ from atalante_dbc import Network
 from atalante_emulator.body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
-from atalante_hal.bus import BusDown
+from atalante_hal.bus import BusDown, resilient
 from atalante_hal.bus.pair import PairBus, lockstep_pair
 from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.hal import Hal
@@ -17,7 +17,6 @@ from atalante_hal.robot import Robot
 from atalante_hal.types import Command, SupervisorState
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.frame import FRAME, Frames, new_frames
-from atalante_tools.commands import emulator_line
 from atalante_tools.commands.emulator import status_line
 from atalante_tools.commands.emulator_line import Line
 
@@ -131,7 +130,7 @@ def test_the_robot_restarts_after_the_interface_was_down(network: Network, robot
 def test_a_removed_adapter_does_not_cause_a_busy_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     near, _ = lockstep_pair()
     slept: list[float] = []
-    monkeypatch.setattr(emulator_line.time, "sleep", slept.append)
+    monkeypatch.setattr(resilient.time, "sleep", slept.append)
     line = Line(near, pendant_id=0x194)
     near.close()
     for _ in range(3):

@@ -575,3 +575,37 @@ def test_an_invalid_command_line_is_one_sentence_and_code_2(arguments: list[str]
     assert sentence in result.stderr
     assert result.stderr.count("\n") == 1
     assert result.stdout == ""
+
+
+def test_a_lost_link_releases_the_dead_man_until_start_is_typed(
+    world: World, capsys: pytest.CaptureFixture[str]
+) -> None:
+    losses = 0
+    node = PendantNode(world.network, world.wire.end(world.cycle))
+    pressed: list[bool] = []
+
+    class LosesTheLink(Keyboard):
+        """Loses the link in cycles 300 and 400, and types start in cycle 600."""
+
+        def lines(self) -> list[str]:
+            nonlocal losses
+            losses = (node.answered >= 300) + (node.answered >= 400)
+            pressed.append(node.dead_man)
+            return ["start"] if node.answered == 600 else []
+
+    operator = Session(node, TARGET, StopRequest(), LosesTheLink(None), now=lambda: world.now, losses=lambda: losses)
+    operator.take_over()
+    operator.start_wanted = True
+    operator.run(0.8)
+    assert world.states[world.states.index(ACTIVE) :].count(HOLD) > 200
+    assert pressed.index(False) in range(295, 306)
+    assert pressed[pressed.index(False) :].index(True) in range(295, 306)
+    assert capsys.readouterr().err.splitlines()[4:] == [
+        "the HAL is ACTIVE",
+        "the dead-man switch is released; type start to press it again, with START",
+        "the HAL is HOLD",
+        "the dead-man switch is released; type start to press it again, with START",
+        "START pressed",
+        "the HAL is ACTIVE",
+        "STOP: the HAL is HOLD",
+    ]

@@ -22,7 +22,8 @@ def command(shape: str, target: Target, options: Options, as_json: bool) -> None
     """Walk in the air inside one virtual guide, with a real or an emulated robot.
 
     The robot starts when the operator presses START (`atalante pendant start`). The operator may change the assistance
-    factor at any time. The robot ends in HOLD after the last step, on Ctrl-C, or on an error.
+    factor at any time. After a HOLD the command waits for the next START, and counts the steps from there. The robot ends in
+    HOLD: after the steps, on Ctrl-C, or in FAULT.
 
     \b
     Example: atalante emulator -i socketcan -c vcan0     (in another terminal)

@@ -5,23 +5,18 @@ HAL <-> bus <-> Line <-> emulated nodes
 
 from __future__ import annotations
 
-import time
-
-from atalante_hal.bus import Bus, BusDown
-from atalante_hal.bus.wrapped import WrappedBus
+from atalante_hal.bus import Bus
+from atalante_hal.bus.resilient import ResilientBus
 from atalante_hal.wire.frame import Frames
 
 
-class Line(WrappedBus):
+class Line(ResilientBus):
     """Bus of the emulated robot. It counts frames, and drops the emulated pendant's frames if another pendant sends.
 
-    While the interface is down, sent frames are dropped and no frames are received, as with a disconnected cable.
-
     Attributes:
-        sent: Number of sent frames.
-        received: Number of received frames.
-        down: Error message of the interface while it is down. Empty while it is up.
-        pendant_displaced: Whether another pendant sent a frame.
+        sent: Number of frames sent so far.
+        received: Number of frames received so far.
+        pendant_displaced: Whether another pendant has sent a frame.
     """
 
     def __init__(self, bus: Bus, pendant_id: int) -> None:
@@ -29,38 +24,28 @@ class Line(WrappedBus):
         self._pendant_id = pendant_id
         self.sent = 0
         self.received = 0
-        self.down = ""
         self.pendant_displaced = False
 
     def send(self, frames: Frames) -> None:
-        """Send frames like `Bus.send`. While the interface is down, drop them.
+        """Send frames as `ResilientBus.send`, without those of the emulated pendant after a takeover.
 
         Args:
             frames: Frames to send.
         """
         if self.pendant_displaced:
             frames = self._without_pendant(frames)
-        try:
-            super().send(frames)
-        except BusDown as error:
-            self.down = str(error)
-        else:
-            self.down = ""
+        super().send(frames)
+        if not self.down:
             self.sent += len(frames)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Receive frames like `Bus.receive`. While the interface is down, wait for the timeout and return 0.
+        """Receive frames as `ResilientBus.receive`, and recognise another pendant.
 
         Args:
             frames: Buffer for the received frames.
             timeout: Longest wait for the first frame [s].
         """
-        try:
-            count = super().receive(frames, timeout)
-        except BusDown as error:
-            self.down = str(error)
-            time.sleep(timeout)
-            return 0
+        count = super().receive(frames, timeout)
         self.received += count
         if not self.pendant_displaced and (frames["can_id"][:count] == self._pendant_id).any():
             self.pendant_displaced = True

@@ -153,13 +153,17 @@ def session(target: Target) -> Iterator[Session]:
         BusError: If the bus cannot be opened.
         ChannelMapError: If the channel map is invalid.
     """
+    from atalante_hal.bus.resilient import ResilientBus
     from atalante_tools.session.pendant_node import PendantNode
     from atalante_tools.session.pendant_session import Keyboard, Session
 
-    network, bus = open_pendant_bus(target)
+    network, opened = open_pendant_bus(target)
+    bus = ResilientBus(opened, say)
     try:
         with stop_requested() as stop:
-            yield Session(PendantNode(network, bus), target, stop, Keyboard(_standard_input()))
+            yield Session(
+                PendantNode(network, bus), target, stop, Keyboard(_standard_input()), losses=lambda: bus.losses
+            )
     finally:
         bus.close()
 

@@ -13,7 +13,7 @@ import click
 from atalante_tools.console.options import Between, Target, json_option, target_options
 from atalante_tools.console.outcome import Failed, FaultLatched
 from atalante_tools.console.stop_request import StopRequest, stop_requested
-from atalante_tools.console.terminal import show_json, table
+from atalante_tools.console.terminal import say, show_json, table
 
 if TYPE_CHECKING:
     from atalante_hal.bus import Bus
@@ -47,13 +47,14 @@ def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
              atalante status -i socketcan -c vcan0 --watch
     """
     import atalante_dbc
+    from atalante_hal.bus.resilient import ResilientBus
     from atalante_hal.robot import load_robot
     from atalante_tools.commands import observer
     from atalante_tools.session.rig import join, open_buses
 
     network, robot = atalante_dbc.load(), load_robot()
     with stop_requested() as stop:
-        bus = join(network, open_buses(network, target))
+        bus = ResilientBus(join(network, open_buses(network, target)), say)
         try:
             listener = observer.Observer(network, robot, time.monotonic())
             while True:

@@ -245,7 +245,9 @@ class _Walk:
         self._rig, self._controller, self._telemetry = rig, controller, telemetry
         self._report_endpoint, self._name, self._steps = report_endpoint, name, steps
         self._reported = 0
-        self._watch_of = functools.partial(Watch, rig, done=self._done, describe=self._describe)
+        self._watch_of = functools.partial(
+            Watch, rig, done=self._done, describe=self._describe, resumes=not rig.target.embedded
+        )
         hal = rig.hal
         if telemetry.frames is not None:
             if rig.target.lockstep:

@@ -47,7 +47,18 @@ class Session:
         stop: StopRequest,
         keyboard: Keyboard,
         now: Callable[[], float] = time.monotonic,
+        losses: Callable[[], int] = lambda: 0,
     ) -> None:
+        """Create the session.
+
+        Args:
+            node: Pendant node on its bus.
+            target: Bus named in the messages.
+            stop: Stop request of the process.
+            keyboard: Reader of typed lines.
+            now: Clock [s].
+            losses: Returns how often the link of the bus was lost.
+        """
         self.node, self.stop = node, stop
         #: Whether to press START as soon as the HAL is in READY or HOLD.
         self.start_wanted = False
@@ -56,6 +67,7 @@ class Session:
         self._hal_present = True
         self._hal: object = None
         self._pressed_at: int | None = None
+        self._losses, self._lost_before = losses, 0
 
     def listen(self) -> None:
         """Listen for SYNC of a HAL and for frames of another pendant, without sending."""
@@ -119,9 +131,18 @@ class Session:
                 return
             if node.takeover_failed:
                 raise Failed("another pendant must stop sending, but it still sends: use that pendant, or end it first")
+            if self._losses() > self._lost_before:
+                self._release_after_loss()
             for line in self._keyboard.lines():
                 self.execute(line)
         self.press_stop()
+
+    def _release_after_loss(self) -> None:
+        """Release the dead-man switch after a lost link: the operator must press it again."""
+        self._lost_before = self._losses()
+        self.node.dead_man = False
+        self.start_wanted = False
+        say("the dead-man switch is released; type start to press it again, with START")
 
     def _elapsed(self) -> float:
         """Return the time since the start [s]. It counts cycles after the first answered SYNC, and wall-clock time before."""
@@ -146,6 +167,8 @@ class Session:
         if word in ("start", "stop", "hold") and not arguments:
             self.start_wanted = False
             self._pressed_at = self.node.cycles if word == "start" else None
+            if word == "start":
+                self.node.dead_man = True
             self.node.press(Request[word.upper()])
             say(f"{word.upper()} pressed")
         elif word == "xi" and len(arguments) == 1 and (factor := _factor(arguments[0])) is not None:

@@ -201,14 +201,31 @@ def join(network: Network, buses: dict[str, Bus]) -> Bus:
 class Watch:
     """End condition of a run, called once per cycle. It also prints a progress line.
 
-    A run ends if `done(state)` returns True in ACTIVE, if a signal arrives, if the robot leaves ACTIVE, or if the robot is in
-    FAULT. After the run, `conclude` raises an error unless `done` ended the run.
+    A run ends when `done(state)` returns True while ACTIVE, when a signal arrives, or when the robot is in FAULT. When the robot
+    leaves ACTIVE, the run ends, or waits in HOLD for the operator's START. After the run `conclude` raises an error unless `done`
+    ended the run.
     """
 
     def __init__(
-        self, rig: Rig, stop: StopRequest, done: Callable[[State], bool], describe: Callable[[State], str]
+        self,
+        rig: Rig,
+        stop: StopRequest,
+        done: Callable[[State], bool],
+        describe: Callable[[State], str],
+        *,
+        resumes: bool = False,
     ) -> None:
+        """Create the end condition of one run.
+
+        Args:
+            rig: Rig of the run.
+            stop: Stop request of the process.
+            done: Returns whether the run is complete; called in each cycle in ACTIVE.
+            describe: Returns the progress line in ACTIVE.
+            resumes: Whether the run continues when the operator presses START in HOLD. False: HOLD ends the run.
+        """
         self._rig, self._stop, self._done, self._describe = rig, stop, done, describe
+        self._resumes = resumes
         self._progress = Progress()
         self._started = False
         self._finished = False
@@ -229,6 +246,10 @@ class Watch:
                 self._progress.clear()
                 say(f"ACTIVE on {self._rig.target}; Ctrl-C ends in HOLD")
             over = self._finished = self._done(state)
+        elif self._started and self._resumes and state.supervisor is not SupervisorState.FAULT:
+            self._started = over = False
+            self._progress.clear()
+            say(f"{state.supervisor.name}: {self._rig.hal.reason}")
         else:
             over = self._started or state.supervisor is SupervisorState.FAULT
         if over:
@@ -271,6 +292,8 @@ def waiting_for(rig: Rig) -> str:
         return f"waiting for {', '.join(missing)}" if missing else f"OFF: {hal.reason}"
     if hal.reason.startswith(REFUSED):
         return f"{hal.state.supervisor.name}: {hal.reason}"
+    if missing := hal.missing():
+        return f"{hal.state.supervisor.name}: waiting for {', '.join(missing)}"
     waits = f"{hal.state.supervisor.name}: waiting for START"
     return (
         f"{waits} of the emulated operator"

@@ -205,6 +205,10 @@ def _listen(options: Options, plan: Plan, project: Project) -> tuple[list[Report
         if progress.due():
             progress.show(f"{frames} frames" + ("; Ctrl-C ends and prints the report" if end is None else ""))
 
+    def notice(message: str) -> None:
+        progress.clear()
+        say(message)
+
     try:
         with stop_requested() as stop:
             result = listen(
@@ -215,6 +219,7 @@ def _listen(options: Options, plan: Plan, project: Project) -> tuple[list[Report
                 stopped=lambda: stop.wanted or (end is not None and time.monotonic() >= end),
                 node=options.node,
                 progress=show,
+                notice=notice,
             )
     finally:
         for bus in buses.values():

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from atalante_hal.bus import Bus, BusError, open_bus
+from atalante_hal.bus.resilient import ResilientBus
 from atalante_hal.wire.frame import new_frames
 from atalante_tools.canlog.plan import Plan
 from atalante_tools.canlog.reader.chunk import NO_DIRECTION, Chunk, concatenated
@@ -101,8 +102,11 @@ def listen(
     stopped: Callable[[], bool],
     node: str | None = None,
     progress: Callable[[int], None] = lambda frames: None,
+    notice: Callable[[str], None] = lambda message: None,
 ) -> Report:
-    """Check the frames of one or more open buses until `stopped` returns True or a bus error occurs. Send nothing.
+    """Check the frames of one or more open buses until `stopped` returns True. Send nothing.
+
+    The check continues when a lost link is back. Each channel with a lost link is a finding of the report.
 
     Args:
         buses: open bus of each channel name.
@@ -112,29 +116,37 @@ def listen(
         stopped: function that is called in every iteration; True ends the loop.
         node: require only the messages of this node; None: of all nodes.
         progress: called after each check with the frames so far.
+        notice: called with a message when a link is lost or back.
     """
     validator = Validator(plan, project, node=node)
-    names, scratch = list(buses), new_frames(_LIVE_FRAMES)
+    links = {channel: ResilientBus(bus, notice) for channel, bus in buses.items()}
+    names, scratch = list(links), new_frames(_LIVE_FRAMES)
     received: list[Chunk] = []
     next_time = time.monotonic() + _CHECK_PERIOD
     failure = ""
     while not stopped() and not failure:
-        for channel, bus in enumerate(buses.values()):
+        for channel, bus in enumerate(links.values()):
             try:
-                count = bus.receive(scratch, _RECEIVE_TIMEOUT if len(buses) == 1 else 0.0)
+                count = bus.receive(scratch, _RECEIVE_TIMEOUT if len(links) == 1 else 0.0)
             except BusError as error:
                 failure = str(error)
                 break
             if count:
                 received.append(_chunk(bus, scratch[:count], channel))
-        if len(buses) > 1 and not received:
+        if len(links) > 1 and not received:
             time.sleep(_RECEIVE_TIMEOUT / 10)
         if time.monotonic() >= next_time:
             next_time += _CHECK_PERIOD
             _check_received(validator, received, names)
             progress(validator.frames)
     _check_received(validator, received, names)
-    validator.finish((), dropped=sum(bus.dropped for bus in buses.values()))
+    validator.finish((), dropped=sum(bus.dropped for bus in links.values()))
+    for label, link in links.items():
+        if link.losses:
+            text = f"the link of {label} was lost {link.losses} times" + (
+                f" and is not back: {link.down}" if link.down else ""
+            )
+            validator.findings.add_log("log-truncated", validator.end, link.losses, text)
     if failure:
         validator.findings.add_log("log-truncated", validator.end, 1, f"listening ended with a bus error: {failure}")
     return report(name, validator, live=True)
