@@ -1,1 +1,1 @@
-"""Walking suspended in the air: the controller, its compiled kernel and its telemetry."""
+"""Airwalk: walking while suspended in the air. Controller, its parts, compiled kernel and telemetry."""

@@ -1,4 +1,4 @@
-"""Idealization and feedforward of the assisted joints, SH and SK of the swing leg. `model, gait -> u_i law, u_f`."""
+"""Idealization u_i and feedforward u_f of the assisted joints: SH and SK of the swing leg. `model, gait -> u_i, u_f`."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class Assistance:
     def __init__(
         self, inertia: AssistedInertia, gait: Gait, friction: Friction, *, decoupled: bool, feedforward: bool
     ) -> None:
-        """Prepare the tables.
+        """Compute the parameters of the idealization and u_f of every cycle.
 
         Args:
             inertia: mass matrix and separate inertias of SH and SK.
             gait: right-stance step that repeats.
             friction: friction to compensate.
             decoupled: whether u_f + u_v are torques on the separate inertias.
-            feedforward: whether u_f of the gait acts.
+            feedforward: whether u_f of the gait is applied; False: u_f is zero.
         """
         self.inertia = inertia
         self.feedforward = swing_feedforward(gait, inertia, decoupled) if feedforward else None

@@ -1,4 +1,4 @@
-"""Continuous torque command over a step change: the torque step is carried over and faded out.
+"""Carry-over of the torque at a step change: the step of the command is compensated, and the compensation fades out.
 
 `torque before the change, torque of the new control law -> continuous torque`
 """
@@ -17,15 +17,15 @@ from atalante_hal.types import Vector
 
 
 class Carry:
-    """Record of the torque carried over a step change."""
+    """Values of one carry-over."""
 
-    pending: bool  # true from the change until the first torque after it
+    pending: bool  # true until the first torque after the change is computed
     before: Annotated[Vector, len(JOINTS)]  # Nm, torque before the change
-    carried: Annotated[Vector, len(JOINTS)]  # Nm, torque before the change less the first torque after it
+    carried: Annotated[Vector, len(JOINTS)]  # Nm, torque before the change minus first torque after it
 
 
 class CarryOver:
-    """Torque carried over a step change.
+    """Carry-over of the torque, which keeps the command continuous at a step change.
 
     Attributes:
         records: record of `add_carried`, shape (1,).
@@ -33,7 +33,7 @@ class CarryOver:
     """
 
     def __init__(self, duration: float) -> None:
-        """Prepare the fade-out.
+        """Compute the factors of the fade-out.
 
         Args:
             duration: time in which the torque step fades out [s].
@@ -44,11 +44,11 @@ class CarryOver:
 
     @property
     def pending(self) -> bool:
-        """Return whether a change has been started whose first torque is not computed yet."""
+        """Return whether the first torque after the change is still to be computed."""
         return bool(self.records[0].pending)
 
     def start(self, before: Vector) -> None:
-        """Start a change.
+        """Start the carry-over at a change of the control law.
 
         Args:
             before: torque before the change, shape (12,) [Nm]; copied.
@@ -57,7 +57,7 @@ class CarryOver:
         carry.before[:], carry.pending = before, True
 
     def cancel(self) -> None:
-        """Cancel a pending change."""
+        """Cancel a carry-over that is pending."""
         self.records[0].pending = False
 
 

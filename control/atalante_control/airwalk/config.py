@@ -25,26 +25,26 @@ class AirwalkConfig:
     friction: Friction = field(default_factory=Friction)
     alpha: float = 0.4  # fraction of the step after which re-centring reaches the nominal trajectory
     guide_rate: Pair = (28.0, 44.0)  # rad/s, natural frequency of the stiffest backup policy on SH and SK
-    gentler: tuple[float, ...] = (0.5, 0.7)  # fractions of guide_rate tried first, ascending
-    guide_margin: float = 0.25  # smallest certificate margin, as a fraction of the guide, at which lower gains are used
-    guide_damping: float = 1.05  # damping ratio of the backup policy; monotone from 1 on
-    # Nm, bounds of u_ext of SH and SK as separate inertias (see `certificate`). Measured in PyBullet, 95 % of the cycles:
-    # coupling to other joints, delay and residual friction cause 14 and 20 Nm; a friction error of 20 % causes 43 and 26 Nm.
+    gentler: tuple[float, ...] = (0.5, 0.7)  # fractions of guide_rate of the softer guides, ascending
+    guide_margin: float = 0.25  # smallest certificate margin of a softer guide, as a fraction of the guide width
+    guide_damping: float = 1.05  # damping ratio of the backup policy; the loop is monotone if it is at least 1
+    # Nm, bounds of the disturbance u_ext of SH and SK, as torques on the separate inertias (see `certificate`).
+    # In PyBullet, coupling, delay and friction residuals stay below 14 Nm (SH) and 20 Nm (SK) in 95 % of the cycles.
+    # With a friction error of 20 %, these values are 43 Nm (SH) and 26 Nm (SK).
     disturbance: tuple[Pair, Pair] = ((-30.0, 30.0), (-20.0, 20.0))
-    points: int = 100  # intervals of the horizon grid
-    overlap: float = 0.1  # s, length of the horizon after the end of the step
-    zeta: float = 0.01  # s, derivative gain of the guide
+    points: int = 100  # number of intervals of the prediction grid over one step
+    overlap: float = 0.1  # s, length of the prediction beyond the end of the step
+    zeta: float = 0.01  # s, gain of the derivative term of the guide
     hand_over: HandOver = field(default_factory=HandOver)
-    decoupled: bool = (
-        True  # convert u_v through the mass matrix of SH and SK; False: apply u_v directly, as in the paper
-    )
-    feedforward: bool = False  # apply u_f of the gait to the assisted joints; off in the air
-    flat_foot: bool = True  # hold the swing sole level
+    #: True: u_v is converted with the mass matrix of SH and SK. False: u_v is applied directly, as in the paper.
+    decoupled: bool = True
+    feedforward: bool = False  # True: u_f of the gait is applied to the assisted joints
+    flat_foot: bool = True  # True: the sole of the swing foot is held level
     ankle_offset: float = math.radians(1.0)  # rad, added to both sagittal ankles
-    fade: float = 0.9  # Xi above which the baseline is blended in
+    fade: float = 0.9  # assistance factor Xi above which the baseline torque is blended in
     startup: float = 2.0  # s, duration of the motion from the measured pose to the first pose of the gait
     blend: float = 0.03  # s, time in which a torque step at the step change fades out
-    active: float = 0.05  # gate above which the filter counts as active
+    active: float = 0.05  # weight of the backup torque above which the filter counts as active
 
     def __post_init__(self) -> None:
         for name in ("startup", "blend"):

@@ -8,17 +8,17 @@ Steps alternate between right and left stance. They change by time, because no f
 the swing leg get the assistive torque; every other joint gets the baseline torque. The paper leaves four points open. They are
 decided as follows:
 
-- *Assistance factor.* Xi changes only at a step change, where the state is re-centred and the torque is handed over. The guide
-  therefore never moves during a step, and the certificate of each step stays valid for any input of the operator.
+- *Assistance factor.* Xi changes only at a step change, where the reference is re-centred and the torque is carried over.
+  The guide therefore never moves during a step, and the certificate of each step stays valid for any input of the operator.
 - *Xi towards 1.* The assisted joints get w u_t + (1 - w) (u_i + u_f + u_v). The weight w is a smoothstep from 0 at Xi = 0.9 to
   exactly 1 at Xi = 1, where the torque is bitwise equal to the baseline torque. Their integrals are scaled by the same w.
   No guide is certified for Xi between 0.9 and 1.
 - *Gains.* A stiff backup policy is needed in a narrow guide, but exceeds the available torque in a wide one. Each step uses the
   lowest of a few gains with which its guide is certified, with a margin, at its Xi. The command is continuous in Xi except
   where the gains change.
-- *Hand-over.* At a step change the re-centring sets the tracking error to zero, a leg changes from one control law to the
-  other, and the horizon returns to its full length. The resulting torque step is carried over and faded out within `blend`, so
-  the command is continuous. This is part of the baseline and is the same with and without assistance.
+- *Carry-over.* At a step change the re-centring sets the tracking error to zero, a leg changes from one control law to the
+  other, and the horizon returns to its full length. The resulting torque step is compensated, and the compensation fades out
+  within `blend`, so the command is continuous. This is part of the baseline and is the same with and without assistance.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class AirwalkController:
         config: AirwalkConfig | None = None,
         exoskeleton: ExoskeletonParameters | None = None,
     ) -> None:
-        """Build the parts and prepare every table, so that the control loop allocates no memory.
+        """Build the parts and allocate all arrays, because the control loop must not allocate memory.
 
         Args:
             robot: limits of the joints.
@@ -143,7 +143,7 @@ class AirwalkController:
         self._forget()
 
     def _compile(self) -> None:
-        """Compile the kernel by a call whose results are discarded."""
+        """Compile the kernel by one call, and discard its results."""
         inputs = 0, False, np.zeros(2 * _N), self._measured, self.guide.tables, self._parts
         self._run = specialised(run, *inputs)
 
@@ -187,7 +187,7 @@ class AirwalkController:
             self.pid.store_request(state.torque_sent)
 
     def _forget(self) -> None:
-        """Clear every memory of the last motion."""
+        """Reset all values of the last motion."""
         self._walking, self._assisting, self._stance, self._changed_at = False, False, RIGHT, 0
         self._carry.cancel()
         self.pid.reset()
@@ -247,7 +247,7 @@ class AirwalkController:
         return self._command
 
     def _change_step(self, state: State, stance: int) -> None:
-        """Start a step: re-centre the reference, then hand the assisted joints and the torque over."""
+        """Start a step: re-centre the reference, start the guide and carry the torque over."""
         self._changed_at, self._stance = state.cycle, stance
         self._command.step = (self._command.step or 0) + 1
         xi = min(1.0, max(0.0, state.assistance_factor))

@@ -27,7 +27,7 @@ _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 
 
 class Measured(NamedTuple):
-    """Measurements of a cycle, and the torque sent in the last one; copies that belong to the controller."""
+    """Measurements of this cycle and torque sent in the last cycle, copied from `State`."""
 
     q: Vector  # (12,) rad
     qd: Vector  # (12,) rad/s
@@ -37,7 +37,7 @@ class Measured(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """Tables of the parts of the controller. Each table belongs to its part."""
+    """Arrays of the parts of the controller. Each part allocates its own arrays."""
 
     steps: Records[Step]  # (1,) values of the step
     links: Records[LinkRecord]  # (n,) `Gravity.links`
@@ -53,7 +53,7 @@ class Parts(NamedTuple):
 
 
 class Outputs:
-    """Record of the results of a cycle."""
+    """Results of one cycle."""
 
     desired: Annotated[Vector, 2 * len(JOINTS)]  # q_des [rad], then q_des' [rad/s]
     gravity: Annotated[Vector, len(JOINTS)]  # Nm, u_g
@@ -72,7 +72,7 @@ def run(
         row: q_des [rad], then q_des' [rad/s], shape (24,).
         measured: measurements of the cycle.
         guide: tables of the guide filter of this step.
-        parts: tables of the other parts; their memories are updated, and the results are written.
+        parts: arrays of the other parts; updated, and the results are written to `outputs` and `telemetry`.
 
     Returns:
         The larger |e| / q_bound of SH and SK, the smaller h of the two, and whether the filter is active on either.

@@ -33,7 +33,7 @@ class GaitReference:
     """
 
     def __init__(self, gait: Gait, deadbeat: Deadbeat, ankle_offset: float) -> None:
-        """Sample both steps and the basis of the re-centring.
+        """Sample the trajectories of both steps and the basis cubics of the re-centring.
 
         Args:
             gait: right-stance step that repeats.
@@ -50,11 +50,14 @@ class GaitReference:
         time: Vector = np.arange(gait.cycles + 1, dtype=np.float64) * PERIOD
         (c0, c1), (c0d, c1d), _ = deadbeat.basis(time)
         end = self._end = int(np.searchsorted(time, deadbeat.end))
-        self._basis = np.zeros((2, end, 2 * _N))  # rows to add per unit of s(0) and of s'(0)
+        self._basis = np.zeros((2, end, 2 * _N))  # rows (s, s') per rad of s(0), then per rad/s of s'(0)
         self._basis[0, :, :_N], self._basis[0, :, _N:] = c0[:end, None], c0d[:end, None]
         self._basis[1, :, :_N], self._basis[1, :, _N:] = c1[:end, None], c1d[:end, None]
         self._added = np.zeros_like(self._basis)
-        self._angles, self._rates = np.zeros(2 * _N), np.zeros(2 * _N)  # s(0) and s'(0), each for q_des and for q_des'
+        self._angles, self._rates = (
+            np.zeros(2 * _N),
+            np.zeros(2 * _N),
+        )  # s(0) and s'(0), repeated for both halves of a row
 
     def start_step(self, stance: int, position: Vector, velocity: Vector) -> Deviation:
         """Re-centre the step on the measured motion.
@@ -96,7 +99,7 @@ class StartMotion:
     """
 
     def __init__(self, first: Vector, duration: float) -> None:
-        """Set the end of the motion.
+        """Set end pose, end speed and duration.
 
         Args:
             first: first row (q_nom, q_nom') of the gait, shape (24,) [rad, rad/s].
@@ -107,7 +110,7 @@ class StartMotion:
         self._pose, self._row = np.zeros(_N), np.zeros(2 * _N)
 
     def start(self, position: Vector) -> None:
-        """Start at a pose.
+        """Start the motion at the measured pose.
 
         Args:
             position: measured angles, shape (12,) [rad]; copied.

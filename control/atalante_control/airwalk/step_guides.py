@@ -1,4 +1,4 @@
-"""Virtual guides of the airwalk controller: one filter for each set of gains, and the choice of a filter for each step.
+"""Virtual guides of the airwalk controller: one guide filter for each set of gains, and the selection for each step.
 
 `assistance factor -> guide filter, certificate`. A stiff backup policy is needed in a narrow guide, but exceeds the available
 torque in a wide one. Each step uses the filter of lowest gains that is certified, with a margin, at its assistance factor.
@@ -43,7 +43,7 @@ class StepGuides:
         assistance: Assistance,
         torque_limits: Vector,
     ) -> None:
-        """Prepare the filters and the assistance factors at which each is used.
+        """Build the filters and compute up to which assistance factor each one is used.
 
         Args:
             config: parameters of the controller.
@@ -98,7 +98,7 @@ class StepGuides:
 
 
 def backup_torque_limits(robot: Robot, config: AirwalkConfig, gravity: Gravity, poses: Vector) -> Vector:
-    """Return the torque of SH and SK that gravity and friction leave to the backup policy, shape (2,) [Nm].
+    """Return the torque limits of SH and SK minus gravity and friction torques, shape (2,) [Nm].
 
     Args:
         robot: limits of the joints.

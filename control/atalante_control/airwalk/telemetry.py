@@ -14,12 +14,12 @@ Pair = tuple[float, float]
 
 
 class Telemetry:
-    """Record of the telemetry of a cycle. Pairs are SH and SK of the swing leg."""
+    """Telemetry of one cycle. Pairs are values of SH and SK of the swing leg."""
 
     q_des: Annotated[Vector, len(JOINTS)]  # rad
     error: Annotated[Vector, 2]  # rad, q - q_des
-    q_bound: Annotated[Vector, 2]  # rad, distance to the guide on the side of the error
-    guide: Annotated[Vector, 2]  # rad, distances to the guide of SH, upper and lower
+    q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the guide on the side of the error
+    guide: Annotated[Vector, 2]  # rad, distances from q_des of SH to the guide, upper and lower
     h: Annotated[Vector, 2]  # safe backward image function
     gate: Annotated[Vector, 2]  # lambda + (1 - lambda) lambda_d, published as `lambda`
     filter_active: Annotated[Vector, 2]  # 1 where the filter is active
@@ -37,28 +37,28 @@ TELEMETRY_FIELDS = tuple(
 
 
 class Step:
-    """Record of the values that are constant during a step."""
+    """Values that are constant during one step."""
 
     stance: int  # 0 left, 1 right
-    completed: int  # right-stance steps completed before this step
+    completed: int  # number of right-stance steps completed before this step
     cycles: int  # cycles of a step
     xi: float  # assistance factor
-    share: float  # w, weight of the baseline torque
+    share: float  # weight w of the baseline torque
     intensity: float  # factor of the haptic levels
-    active: float  # gate above which the filter counts as active
+    active: float  # weight of the backup torque above which the filter counts as active
 
 
 @dataclass
 class AirwalkStatistics:
-    """Statistics of the guide from the first completed right-stance step on."""
+    """Statistics of the guide, counted after the first completed right-stance step."""
 
     steps: int = 0  # completed right-stance steps
     cycles: int = 0  # counted cycles
-    inside: int = 0  # counted cycles with both assisted joints in the guide
-    active: int = 0  # counted cycles with the filter active on at least one joint
+    inside: int = 0  # number of counted cycles with both assisted joints inside the guide
+    active: int = 0  # number of counted cycles with the filter active on at least one joint
     max_ratio: float = 0.0  # largest |e| / q_bound
-    min_h_at_start: float = 1.0  # smallest h in the first cycle of a step
-    hand_overs_exceeded: int = 0  # step changes with a deviation beyond the certified hand-over
+    min_h_at_start: float = 1.0  # smallest safe backward image function h in the first cycle of a step
+    hand_overs_exceeded: int = 0  # number of step changes with a deviation beyond the certified hand-over
     factors: set[float] = field(default_factory=set)  # assistance factors of the steps
 
     @property
@@ -72,7 +72,7 @@ class AirwalkStatistics:
         return self.active / max(1, self.cycles)
 
     def count(self, cycle: int, ratio: float, h: float, acting: bool) -> None:
-        """Count a cycle of a step.
+        """Add one cycle of a step to the statistics.
 
         Args:
             cycle: cycles since the step change.

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from atalante_control.gait.gait import derivative, power_basis
 from atalante_control.gait.recentering import Deadbeat
@@ -50,7 +51,7 @@ class BackupPolicy:
 
     @property
     def monotone(self) -> bool:
-        """Return whether Kd^2 >= 4 Kp J.
+        """Return whether the loop is critically damped or overdamped, Kd^2 >= 4 Kp J.
 
         The impulse response of a monotone loop never changes sign, so a constant extreme is the worst disturbance.
         """
@@ -168,18 +169,21 @@ class ForcedResponse(NamedTuple):
     """Solution P of the undisturbed loop and its sensitivity to the re-centring; (e, e'), each of shape (n, 2)."""
 
     nominal: Vector  # P without re-centring [rad, rad/s]
-    deviation: Vector  # added to P per rad of s(0)
-    rate: Vector  # added to P per rad/s of s'(0)
+    deviation: Vector  # response added to P per rad of s(0)
+    rate: Vector  # response added to P per rad/s of s'(0)
 
 
-def forced_response(
-    policy: BackupPolicy,
-    deadbeat: Deadbeat,
-    nominal: Vector,
-    following: Vector,
-    time: Vector,
-    feedforward: Vector | None = None,
-) -> ForcedResponse:
+class Curve(NamedTuple):
+    """Nominal motion and feedforward of one joint in a step and in the next one."""
+
+    deadbeat: Deadbeat  # re-centring of the gait
+    nominal: Vector  # (8,) rad, Bezier control points of q_nom in this step
+    following: Vector  # (8,) rad, Bezier control points of q_nom of the same joint in the next step
+    time: Vector  # (n,) s, time since the step change, at least 0; may exceed T
+    feedforward: Vector | None = None  # (8,) Nm, Bezier control points of u_f in this step; None: no feedforward
+
+
+def forced_response(policy: BackupPolicy, curve: Curve) -> ForcedResponse:
     """Return P of one joint over a step and, after T, along the nominal trajectory of the next step.
 
     P is linear in the deviations at the step change, so a step change only adds two tables: P = nominal + s(0) deviation +
@@ -187,20 +191,14 @@ def forced_response(
 
     Args:
         policy: backup policy of the joint.
-        deadbeat: re-centring of the gait.
-        nominal: Bezier control points of q_nom in this step, shape (8,) [rad].
-        following: Bezier control points of q_nom of the same joint in the next step, shape (8,) [rad].
-        time: time since the step change, shape (n,) [s], at least 0; may exceed T.
-        feedforward: Bezier control points of u_f applied in this step, shape (8,) [Nm]; None: no feedforward.
+        curve: nominal motion and feedforward of the joint.
     """
+    deadbeat, time = curve.deadbeat, curve.time
     duration = deadbeat.duration
-    now = policy.particular(_forcing(policy, nominal, feedforward, duration), duration)
-    then = policy.particular(_forcing(policy, following, None, duration), duration)
-    late = time > duration
-    result = np.where(late[:, None], _polynomial(then, time - duration, duration), _polynomial(now, time, duration))
-    end = np.array([duration])
-    gap = _polynomial(now, end, duration)[0] - _polynomial(then, np.zeros(1), duration)[0]
-    result[late] += policy.transition(time[late] - duration) @ gap
+    now = policy.particular(_forcing(policy, curve.nominal, curve.feedforward, duration), duration)
+    then = policy.particular(_forcing(policy, curve.following, None, duration), duration)
+    result, late, jump = _successive(now, then, time, duration)
+    result[late] += policy.transition(time[late] - duration) @ jump
 
     bases = []
     for cubic in deadbeat.polynomials():
@@ -214,14 +212,7 @@ def forced_response(
     return ForcedResponse(result, bases[0], bases[1])
 
 
-def free_drift(
-    policy: BackupPolicy,
-    deadbeat: Deadbeat,
-    nominal: Vector,
-    following: Vector,
-    time: Vector,
-    feedforward: Vector | None = None,
-) -> ForcedResponse:
+def free_drift(policy: BackupPolicy, curve: Curve) -> ForcedResponse:
     """Return the error of the joint without backup torque, the double integral of u_f / J - q_des''.
 
     Where the drive saturates, the kernel adds the motion under a constant torque to this drift. Only differences along the
@@ -229,27 +220,35 @@ def free_drift(
 
     Args:
         policy: backup policy of the joint.
-        deadbeat: re-centring of the gait.
-        nominal: Bezier control points of q_nom in this step, shape (8,) [rad].
-        following: Bezier control points of q_nom of the same joint in the next step, shape (8,) [rad].
-        time: time since the step change, shape (n,) [s], at least 0; may exceed T.
-        feedforward: Bezier control points of u_f applied in this step, shape (8,) [Nm]; None: no feedforward.
+        curve: nominal motion and feedforward of the joint.
     """
+    deadbeat, _, _, time, feedforward = curve
     duration = deadbeat.duration
-    late = time > duration
-    start, end = np.zeros(1), np.array([duration])
-    now, then = -power_basis(nominal[None, :])[0], -power_basis(following[None, :])[0]
+    now, then = -power_basis(curve.nominal[None, :])[0], -power_basis(curve.following[None, :])[0]
     pushed = np.zeros(len(now) + 2)
     pushed[: len(now)] = now
     if feedforward is not None:
         uf, powers = power_basis(feedforward[None, :])[0], np.arange(len(feedforward))
         pushed[2:] += uf * duration**2 / policy.inertia / ((powers + 1) * (powers + 2))
-    result = np.where(late[:, None], _polynomial(then, time - duration, duration), _polynomial(pushed, time, duration))
-    gap = _polynomial(pushed, end, duration)[0] - _polynomial(then, start, duration)[0]
-    result[late, 0] += gap[0] + gap[1] * (time[late] - duration)
-    result[late, 1] += gap[1]
+    result, late, jump = _successive(pushed, then, time, duration)
+    result[late, 0] += jump[0] + jump[1] * (time[late] - duration)
+    result[late, 1] += jump[1]
     value, slope, _ = deadbeat.basis(time)
     return ForcedResponse(result, *(-np.stack([value[i], slope[i]], axis=1) for i in (0, 1)))
+
+
+def _successive(
+    now: Vector, then: Vector, time: Vector, duration: float
+) -> tuple[Vector, npt.NDArray[np.bool_], Vector]:
+    """Evaluate a polynomial in t / T up to T, and another one in (t - T) / T after T.
+
+    Returns:
+        Values and rates, shape (n, 2); True for each time after T, shape (n,); the jump of value and rate at T, shape (2,).
+    """
+    late = time > duration
+    result = np.where(late[:, None], _polynomial(then, time - duration, duration), _polynomial(now, time, duration))
+    end = _polynomial(now, np.array([duration]), duration)[0]
+    return result, late, end - _polynomial(then, np.zeros(1), duration)[0]
 
 
 def _forcing(policy: BackupPolicy, nominal: Vector, feedforward: Vector | None, duration: float) -> Vector:

@@ -57,7 +57,7 @@ from atalante_hal.types import Vector
 Pair = tuple[float, float]
 
 _JOINTS = ("SH", "SK")
-_STATES = 41  # number of errors across the guide at which the image is evaluated
+_STATES = 41  # number of errors e across the guide at which the safe backward image is evaluated
 #: Ratio of the real torques of hip and knee in the pair that `joint_torque` returns.
 _DIRECTION = np.array([5.0, 3.0])
 _KNEE_SPACING = math.radians(0.05)  # rad, largest spacing of the knee angles at which the mass matrix is evaluated
@@ -82,7 +82,7 @@ class HandOver:
 
 @dataclass(frozen=True)
 class JointTorque:
-    """Largest disturbances of the real joints, together and in any direction and order, within the bounds of the filter."""
+    """Largest real torques at hip and knee that the disturbance bounds cover, at the same time and in any direction."""
 
     hip: float  # Nm, at SH
     knee: float  # Nm, at SK
@@ -98,10 +98,10 @@ class JointCertificate:
     tightest_phase: float  # phase of the smallest margin, t / T
     side: str  # side of the smallest margin, upper or lower
     u_ext: tuple[float, float]  # Nm on the separate inertia, disturbance bounds of the filter
-    #: Disturbance bounds scaled to a margin of zero, Nm on the separate inertia; (0, 0): no bounds are admissible. Only a
-    #: filter configured with these bounds holds them, not the filter of this certificate.
+    #: Largest admissible disturbance bounds, at a margin of zero, Nm on the separate inertia; (0, 0) if none are.
+    #: They hold only for a filter that is configured with them.
     u_ext_max: tuple[float, float]
-    #: Largest backup torque |u_b| over the step, disturbance included, in Nm on the separate inertia (see module).
+    #: Largest backup torque |u_b| over the step, with disturbance, Nm on the separate inertia (see module docstring).
     torque: float
     torque_limit: float  # Nm on the separate inertia, torque limit less the reserve of the filter
     image_empty_at: float  # first phase without a safe state; infinity if every phase has one
@@ -143,7 +143,7 @@ def certify(
     hand_over = hand_over or HandOver()
     bounds = guide.shape.bounds(guide.time / guide.deadbeat.duration, xi)
     joints = (_joint(guide, bounds, 0, hand_over), _joint(guide, bounds, 1, hand_over))
-    reason = next((complaint for complaint in map(_complaint, joints) if complaint), "")
+    reason = next((reason for reason in map(_reason, joints) if reason), "")
     if reason:
         return Certificate(guide.shape.name, xi, False, reason, joints)
     worst = min(joints, key=lambda joint: joint.margin)
@@ -159,7 +159,7 @@ def certify(
 
 
 def joint_torque(guide: GuideFilter, xi: float, hand_over: HandOver, inertia: AssistedInertia) -> JointTorque:
-    """Return the largest pair of real torques, hip to knee as 5 to 3, within the disturbance bounds of the filter.
+    """Return the largest real torques of hip and knee, in the ratio 5 to 3, within the disturbance bounds of the filter.
 
     With A = J M(q_SK)^-1 it is the largest pair for which |A| (hip, knee) is at most the bounds, row by row. This holds at every
     knee angle that the guide and the re-centring allow along the step. The pair is rounded down to 0.01 Nm.
@@ -219,7 +219,7 @@ def _joint(guide: GuideFilter, bounds: Vector, joint: int, hand_over: HandOver) 
     policy, (low, high), time = guide.config.policies[joint], guide.config.disturbance[joint], guide.time
     response = _from_rest(policy, guide.forced[joint], time)
     up, down = policy.disturbance(time, low, high)
-    # The response is linear in the deviations, so a corner of the box is the worst case: (n, 2) of (e, e'), up to a sign.
+    # The response is linear in the deviations, so a corner of the hand-over box is the worst case.
     d, r = hand_over.deviation, hand_over.rate
     same, opposite = d * response.deviation + r * response.rate, d * response.deviation - r * response.rate
     moved = np.maximum(np.abs(same[:, 0]), np.abs(opposite[:, 0]))
@@ -260,7 +260,7 @@ def _joint(guide: GuideFilter, bounds: Vector, joint: int, hand_over: HandOver) 
     )
 
 
-def _complaint(joint: JointCertificate) -> str:
+def _reason(joint: JointCertificate) -> str:
     """Return why a joint is not certified, or "" if it is.
 
     Values are percentages of the bounds, because the bounds are torques on separate inertias and not on the real joint.

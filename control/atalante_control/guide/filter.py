@@ -20,7 +20,7 @@ import numpy as np
 
 from atalante_control.gait.gait import PERIOD
 from atalante_control.gait.recentering import Deadbeat
-from atalante_control.guide.backup_policy import BackupPolicy, ForcedResponse, forced_response, free_drift
+from atalante_control.guide.backup_policy import BackupPolicy, Curve, ForcedResponse, forced_response, free_drift
 from atalante_control.guide.kernel import BOUND, GuideTables, Joint, P, errors_ahead, tick
 from atalante_control.guide.shapes import GuideShape
 from atalante_control.structured import Records, zeros
@@ -41,7 +41,7 @@ class GuideConfig:
     policies: tuple[BackupPolicy, BackupPolicy]
     disturbance: tuple[tuple[float, float], tuple[float, float]]  # Nm, (u_ext_min, u_ext_max) of each joint
     points: int = 100  # grid intervals over a step
-    overlap: float = 0.1  # s, length of the horizon after the end of the step
+    overlap: float = 0.1  # s, length of the prediction beyond the end of the step
     zeta: float = 0.01  # s, gain of the derivative term lambda_d
     derivative_time: float = 0.005  # s, time constant of the low-pass filter on dh/dt
     reserve: float = (
@@ -86,7 +86,7 @@ class GuideFilter:
         following: Vector,
         feedforward: Vector | None = None,
     ) -> None:
-        """Prepare every table of a step.
+        """Compute the tables that are the same in every step.
 
         Args:
             config: gains, disturbance bounds and horizon.
@@ -112,10 +112,10 @@ class GuideFilter:
         tables = []
         for joint, policy in enumerate(config.policies):
             uf = None if feedforward is None else feedforward[joint]
-            curve = policy, deadbeat, nominal[joint], following[joint], self.time, uf
-            self.forced.append(forced_response(*curve))
-            tables.append(np.concatenate([self.forced[joint], free_drift(*curve)], axis=2))
-        #: First columns of `step` for the nominal, per unit of deviation and per unit of rate. Shape (3, 2, horizon + 1, 4).
+            curve = Curve(deadbeat, nominal[joint], following[joint], self.time, uf)
+            self.forced.append(forced_response(policy, curve))
+            tables.append(np.concatenate([self.forced[joint], free_drift(policy, curve)], axis=2))
+        #: Columns P and DRIFT of `step`: nominal, per rad of s(0), per rad/s of s'(0). Shape (3, 2, horizon + 1, 4).
         self._parts = np.stack(tables, axis=1)
         first = int(self.grid[0])
         flow = np.array([_flow(config, joint, self.time) for joint in (0, 1)])
@@ -141,7 +141,7 @@ class GuideFilter:
             joints[i].xi, joints[i].fresh = xi, True
 
     def tick(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Pair:
-        """Return u_v of SH and SK [Nm].
+        """Return the guide torques u_v of SH and SK [Nm].
 
         Args:
             cycle: cycles since the step change; limited to the length of the step.

@@ -20,13 +20,13 @@ Pair = tuple[float, float]
 
 
 class Joint:
-    """Record of an assisted joint: constants, values of the step, and results of the last tick."""
+    """Data of one assisted joint: constants, values of the step, and results of the last tick."""
 
     kp: float  # Nm/rad, of the backup policy
     kd: float  # Nm s/rad, of the backup policy
     inertia: float  # kg m2
     limit: float  # Nm, torque limit of the backup policy
-    counted: float  # Nm, torque limit less the reserve, used by the rollouts
+    counted: float  # Nm, torque limit minus reserve; the limit in the rollouts
     up: float  # Nm, u_ext_max
     down: float  # Nm, u_ext_min
     phi11: float  # error after one cycle per unit of e
@@ -38,33 +38,36 @@ class Joint:
     monotone: bool  # see `BackupPolicy.monotone`
     first: int  # cycle of the first point of the grid
     stride: int  # cycles between two points of the grid
-    zeta: float  # s, gain of the derivative term
-    smoothing: float  # weight of a new value in the low-pass filter of dh/dt
+    zeta: float  # s, gain of the derivative term lambda_d
+    smoothing: float  # weight of the new value in the low-pass filter of dh/dt
     xi: float  # assistance factor of the step
     fresh: bool  # true before the first tick of a step, when dh/dt is not defined
     h: float  # safe backward image function
     rate: float  # 1/s, dh/dt
     gate: float  # lambda + (1 - lambda) lambda_d
-    upper: float  # rad, distance to the guide above
-    lower: float  # rad, distance to the guide below
+    upper: float  # rad, distance from q_des up to the guide
+    lower: float  # rad, distance from q_des down to the guide
     stepped: int  # number of rollouts computed cycle by cycle
 
 
 class GuideTables(NamedTuple):
     """Tables of the guide filter for SH and SK of the swing leg, index 0 and 1 of the first axis."""
 
-    joints: Records[Joint]  # (2,) `tick` writes its results to them
-    flow: Vector  # (2, horizon + 1, 9) flow of the backup policy, one row for each cycle ahead; columns see `ERROR`
-    step: Vector  # (2, horizon + 1, 6) one row for each cycle since the step change; columns see `P`
+    joints: Records[Joint]  # (2,) data of SH and SK; `tick` writes its results to them
+    flow: Vector  # (2, horizon + 1, 9) flow of the backup policy, one row for each cycle ahead; columns as listed at `ERROR`
+    step: Vector  # (2, horizon + 1, 6) one row for each cycle since the step change; columns as listed at `P`
 
 
-#: Columns of `flow`: error per unit of e and of e', then the largest error added by the disturbance, up and down; the same four
-#: columns for the torque Kp e + Kd e'; then the error under a constant torque of 1 Nm.
-ERROR, ERROR_ADDED, TORQUE, TORQUE_ADDED, STEADY = 0, 2, 4, 6, 8
-#: Columns of `step`: P and P' of the loop; the drift without torque and its rate; the guide, upper and lower.
-P, DRIFT, BOUND = 0, 2, 4
+ERROR = 0  # columns 0 and 1 of `flow`: predicted error per unit of e and per unit of e'
+ERROR_ADDED = 2  # columns 2 and 3 of `flow`: largest error that the disturbance adds, up and down [rad]
+TORQUE = 4  # columns 4 and 5 of `flow`: predicted Kp e + Kd e' per unit of e and per unit of e'
+TORQUE_ADDED = 6  # columns 6 and 7 of `flow`: largest torque that the disturbance adds, up and down [Nm]
+STEADY = 8  # column 8 of `flow`: error caused by a constant disturbance of 1 Nm [rad/Nm]
+P = 0  # columns 0 and 1 of `step`: solution P of the undisturbed loop and its rate [rad, rad/s]
+DRIFT = 2  # columns 2 and 3 of `step`: error without backup torque and its rate [rad, rad/s]
+BOUND = 4  # columns 4 and 5 of `step`: distance from q_des to the guide, upper and lower [rad]
 
-_HOPELESS = 2.0  # |e| / q_bound at which a rollout ends early; lambda is 1 for every value above 1
+_HOPELESS = 2.0  # |e| / q_bound at which a prediction ends early, because lambda is 1 for every value above 1
 
 
 def tick(guide: GuideTables, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Pair:
@@ -127,7 +130,7 @@ def damped_gate(gate: float, rate: float, zeta: float) -> float:
 
 
 def _largest_ratio(joint: Joint, flow: Vector, step: Vector, cycle: int, e: float, ed: float) -> float:
-    """Return the largest |e| / q_bound now and ahead, under both extreme disturbances.
+    """Return the largest |e| / q_bound of this cycle and of the predictions under both extreme disturbances.
 
     A rollout is computed cycle by cycle only if the drive saturates while it pushes away from the side of the rollout. A
     rollout of a monotone loop that saturates in the other direction stays below the linear rollout, which then is its bound.
@@ -211,7 +214,7 @@ def limited(joint: Joint, flow: Vector, step: Vector, side: int, cycle: int, e: 
             e = then[DRIFT] + y + (yd + 0.5 * gained) * PERIOD
             ed = then[DRIFT + 1] + yd + gained
         cycle += 1
-        # Difference between the worst disturbance and the constant extreme, which is zero in a monotone loop.
+        # Error of the worst disturbance minus that of the constant extreme; zero in a monotone loop.
         ahead = flow[cycle - start]
         allowance = ahead[ERROR_ADDED + side] - sign * external * ahead[STEADY]
         worst = max(worst, (sign * e + allowance) / then[BOUND + side])

@@ -148,5 +148,5 @@ PINCHED = GuideShape("pinched", "full width until 0.4 T, closing to 1 degree by 
 ASYMMETRIC = GuideShape("asymmetric", "full width above, 0.6 of it below", _asymmetric)
 SNAP = GuideShape("snap", "closes to 0.1 degrees within 0.02 T, too fast for any backup policy", _snap)
 
-#: Shapes of this package, by name. `snap` cannot be certified; it demonstrates the report of this case.
+#: Shapes of this package, by name. `snap` cannot be certified; it shows how such a guide is reported.
 SHAPES = {shape.name: shape for shape in (CONSTANT, WIDENING, NARROWING, PINCHED, ASYMMETRIC, SNAP)}

@@ -29,22 +29,23 @@ Quaternion = tuple[float, float, float, float]
 Vector3 = tuple[float, float, float]
 
 _SA, _HA = LEG_JOINTS.index("SA"), LEG_JOINTS.index("HA")
-_STOP_MARGIN, _STOP_FADE = math.radians(1.0), math.radians(3.0)  # distances to the limits of the ankle
+_STOP_MARGIN = math.radians(1.0)  # rad, smallest distance of a target to the joint limit
+_STOP_FADE = math.radians(3.0)  # rad, distance to the end of the target range at which the rate starts to fade
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
-_IMU_AGE = 10  # largest age of a valid IMU message in cycles, its timeout in the DBC
+_IMU_AGE = 10  # cycles, largest age of a valid IMU message; its timeout in the DBC
 
 
 class Ankle:
-    """Record of an ankle: constants, then the deviations at the step change for the re-centring."""
+    """Data of one ankle: constants, then the deviations at the step change for the re-centring."""
 
     geometry: Annotated[Vector, 4]  # `FlatFoot.geometry`
     offset: float  # rad, added to SA
-    joints: Annotated[npt.NDArray[np.int64], 2]  # indices of SA and HA in JOINTS
+    joints: Annotated[npt.NDArray[np.int64], 2]  # indices of SA and HA of this leg in JOINTS
     low: Annotated[Vector, 2]  # rad, smallest targets of SA and HA
     high: Annotated[Vector, 2]  # rad, largest targets of SA and HA
-    deviation: Annotated[Vector, 2]  # rad, of SA and HA from the target at the step change
-    rate: Annotated[Vector, 2]  # rad/s, of SA and HA from the target at the step change
+    deviation: Annotated[Vector, 2]  # rad, deviation of SA and HA from the target at the step change
+    rate: Annotated[Vector, 2]  # rad/s, deviation of the rates of SA and HA at the step change
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,8 @@ class FlatFoot:
         ValueError: If the henke axis has a y component or no x component.
     """
 
-    toe_out: float  # rad, rotation of the foot about the vertical of the tibia, positive to the left
-    axis: tuple[float, float, float]  # henke axis in the foot frame, any length
+    toe_out: float  # rad, rotation of the foot about the vertical axis of the tibia, positive to the left
+    axis: tuple[float, float, float]  # direction of the henke axis in the foot frame, of any length
 
     def __post_init__(self) -> None:
         if self.axis[1] != 0.0 or self.axis[0] == 0.0:
@@ -118,7 +119,7 @@ def flat_feet(parameters: ExoskeletonParameters) -> tuple[FlatFoot, FlatFoot]:
 
 
 class LevelFeet:
-    """Flat-foot targets that replace the nominal ones of the swing ankle, with their own re-centring.
+    """Flat-foot targets of the swing ankle, which replace its nominal trajectory.
 
     Call `start_step` at each step change. Then call `write_level_ankle` once a cycle, or `without_imu` while the tibia IMU is
     lost.
@@ -137,7 +138,7 @@ class LevelFeet:
         nominal: Sequence[Vector],
         offset: float,
     ) -> None:
-        """Prepare both ankles.
+        """Compute the constants of both ankles.
 
         Args:
             robot: limits of the joints.
@@ -220,7 +221,7 @@ def write_level_ankle(ankle: Ankle, cubics: Vector, cycle: int, tibia: Vector, g
 
 
 def _write_targets(ankle: Ankle, cubics: Vector, cycle: int, target: tuple[Pair, Pair], desired: Vector) -> None:
-    """Write angles and rates of SA and HA, with the re-centring of the ankle."""
+    """Write angles and rates of SA and HA with the re-centring added."""
     (angles, rates), n = target, len(desired) // 2
     for i in range(2):
         angle, rate, joint = angles[i], rates[i], ankle.joints[i]
@@ -261,7 +262,11 @@ def level(geometry: Vector, tibia: Sequence[float] | Vector, gyro: Sequence[floa
     w, x, y, z = tibia[0], tibia[1], tibia[2], tibia[3]
     tx, ty, tz = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
     p, q, r = gyro[0], gyro[1], gyro[2]
-    txd, tyd, tzd = ty * r - tz * q, tz * p - tx * r, tx * q - ty * p  # rate of the vertical in the tibia frame
+    txd, tyd, tzd = (
+        ty * r - tz * q,
+        tz * p - tx * r,
+        tx * q - ty * p,
+    )  # 1/s, rate of the vertical direction in the tibia frame
     gx, gy, gxd, gyd = c * tx + s * ty, c * ty - s * tx, c * txd + s * tyd, c * tyd - s * txd
 
     sine = -gy / ax

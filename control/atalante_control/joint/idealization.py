@@ -31,11 +31,11 @@ _ASSISTED = (LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"))
 
 
 class Law:
-    """Record of the parameters of `merge` for the assisted joints, SH and SK."""
+    """Parameters of `merge` for the assisted joints, SH and SK."""
 
     fit: Annotated[Vector, (3, 3)]  # kg m2, `AssistedInertia.fit`
-    inertias: Annotated[Vector, 2]  # kg m2, `AssistedInertia.inertias`
-    decoupled: bool  # true: convert the torques with the mass matrix
+    inertias: Annotated[Vector, 2]  # kg m2, separate inertias, see `AssistedInertia.inertias`
+    decoupled: bool  # true: torques are converted with the mass matrix
     coulomb: Annotated[Vector, 2]  # Nm
     viscous: Annotated[Vector, 2]  # Nm s/rad
     smoothing: float  # rad/s
@@ -83,7 +83,7 @@ class AssistedInertia:
     """
 
     def __init__(self, articulated: ArticulatedModel, swing: Vector) -> None:
-        """Identify the block of the left leg; by symmetry it is also that of the right leg.
+        """Compute the mass matrix of SH and SK of the left leg. By symmetry it also applies to the right leg.
 
         Args:
             articulated: empty exoskeleton with the pelvis fixed.
@@ -209,7 +209,7 @@ def friction(velocity: float, coulomb: float, viscous: float, smoothing: float) 
 
 
 def coupled(fit: Vector, inertias: Vector | Pair, knee: float, hip_rate: float, knee_rate: float, u: Pair) -> Pair:
-    """Compute `AssistedInertia.torques` as a function, for the compiled kernel.
+    """Convert torques on the separate inertias to real torques, as `AssistedInertia.torques`, for the compiled kernel.
 
     Args:
         fit: `AssistedInertia.fit`.

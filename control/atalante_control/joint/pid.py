@@ -45,7 +45,7 @@ class LegGains:
 
 @dataclass(frozen=True)
 class PidGains:
-    """Gains of both roles and the limit of the integral.
+    """PID gains of stance leg and swing leg, and the limit of the integral torque.
 
     The defaults are those for walking on the ground, where the stance leg carries the robot.
     """
@@ -63,8 +63,8 @@ class PidGains:
     integral_limit: float = 10.0  # Nm
 
 
-#: Gains in the air. The stance leg carries no load there, so its TH, SK, SA and HA get the gains of a free leg. With the gains
-#: for the ground, knee and ankle would oscillate, because they move only a small inertia (0.16 and 0.04 kg m2).
+#: Gains in the air. The stance leg carries no load, so its TH, SK, SA and HA get the gains of the swing leg.
+#: With the gains for the ground, knee and ankle would oscillate, because their inertia is small (0.16 and 0.04 kg m2).
 AIR_GAINS = PidGains(
     stance=LegGains(
         kp=(3000.0, 720.0, 3000.0, 900.0, 300.0, 180.0),
@@ -75,7 +75,7 @@ AIR_GAINS = PidGains(
 
 
 class PidRecord:
-    """Record of the PIDs of the twelve joints: gains, then the values of the last cycle."""
+    """PID data of the twelve joints: gains, integral torque and last requested torque."""
 
     gains: Annotated[Vector, (3, len(JOINTS))]  # Kp [Nm/rad], Kd [Nm s/rad], and Ki times the cycle [Nm/rad]
     limit: float  # Nm, largest absolute value of the integral torque
@@ -153,7 +153,7 @@ class Pid:
 
 
 def control(pids: Records[PidRecord], desired: Vector, q: Vector, qd: Vector, sent: Vector, torque: Vector) -> None:
-    """Write u_t into `torque`, as in `Pid.update`.
+    """Compute the tracking torque u_t, as `Pid.update` does, and write it into `torque`.
 
     Args:
         pids: `Pid.records`; the integral is updated.

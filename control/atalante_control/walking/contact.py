@@ -18,10 +18,10 @@ class ImpactConfig:
         ValueError: If the release force is not below the impact force, or a number is out of range.
     """
 
-    impact_force: float = 80.0  # N, vertical, on the swing foot
-    release_force: float = 30.0  # N, the force must have been below this since the last step change
-    debounce: int = 5  # consecutive cycles at or above impact_force
-    earliest: float = 0.5  # fraction of the step before which no impact counts
+    impact_force: float = 80.0  # N, smallest vertical force on the swing foot that counts as an impact
+    release_force: float = 30.0  # N, the force must fall below this value in a step before an impact counts
+    debounce: int = 5  # number of consecutive cycles with at least impact_force
+    earliest: float = 0.5  # fraction of the step duration before which no impact counts
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.release_force < self.impact_force < math.inf:
@@ -43,7 +43,7 @@ class ImpactDetector:
         self.start_step()
 
     def start_step(self) -> None:
-        """Reset the detector; the new swing foot must leave the ground before an impact counts."""
+        """Reset the detector. An impact counts only after the new swing foot has left the ground."""
         self._released, self._count = False, 0
 
     def update(self, vertical_force: float, phase: float) -> bool:

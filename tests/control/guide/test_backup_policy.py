@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from atalante_control.gait.gait import bezier, derivative
 from atalante_control.gait.recentering import Deadbeat
-from atalante_control.guide.backup_policy import BackupPolicy, forced_response, free_drift
+from atalante_control.guide.backup_policy import BackupPolicy, Curve, forced_response, free_drift
 
 OVERDAMPED = BackupPolicy(6300.0, 473.0, 8.0)
 CRITICAL = BackupPolicy(8.0 * 28.0**2, 2 * 8.0 * 28.0, 8.0)
@@ -141,7 +141,7 @@ def forcing(policy: BackupPolicy, time: np.ndarray, part: int) -> np.ndarray:
 @pytest.mark.parametrize("part", [0, 1, 2], ids=["nominal", "deviation", "rate"])
 def test_forced_response_is_integrated_by_runge_kutta(policy: BackupPolicy, part: int):
     time = np.arange(901) * 1e-3
-    response = forced_response(policy, DEADBEAT, NOW, THEN, time, UF)[part]
+    response = forced_response(policy, Curve(DEADBEAT, NOW, THEN, time, UF))[part]
     a, h, x = system(policy), 2.5e-4, response[0].copy()
     # Just inside each interval, because the forcing jumps at T and at the end of the re-centring.
     start = np.arange(3600) * h
@@ -162,7 +162,7 @@ def test_forced_response_is_integrated_by_runge_kutta(policy: BackupPolicy, part
 @pytest.mark.parametrize("part", [0, 1, 2], ids=["nominal", "deviation", "rate"])
 def test_free_drift_is_the_twice_integrated_forcing(part: int):
     time = np.arange(901) * 1e-3
-    drift = free_drift(OVERDAMPED, DEADBEAT, NOW, THEN, time, UF)[part]
+    drift = free_drift(OVERDAMPED, Curve(DEADBEAT, NOW, THEN, time, UF))[part]
     np.testing.assert_allclose(np.diff(drift[:, 0]), 0.5 * (drift[1:, 1] + drift[:-1, 1]) * 1e-3, atol=1e-6)
     middle = 0.5 * (time[1:] + time[:-1])
     np.testing.assert_allclose(np.diff(drift[:, 1]) / 1e-3, forcing(OVERDAMPED, middle, part), atol=0.2)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from atalante_control.gait.gait import AIRWALK_GAIT, PERIOD, load_gait
 from atalante_control.gait.recentering import Deadbeat
-from atalante_control.guide.backup_policy import BackupPolicy, ForcedResponse, forced_response, free_drift
+from atalante_control.guide.backup_policy import BackupPolicy, Curve, ForcedResponse, forced_response, free_drift
 from atalante_control.guide.filter import GuideConfig, GuideFilter
 from atalante_control.guide.kernel import damped_gate, gate, limited, tick
 from atalante_control.guide.shapes import GuideShape, half_width
@@ -55,7 +55,7 @@ def table(responses: Sequence[ForcedResponse]) -> np.ndarray:
     )
 
 
-DRIFT = table([free_drift(p, DEADBEAT, q, after, GUIDE.time) for p, q, after in CURVES])
+DRIFT = table([free_drift(p, Curve(DEADBEAT, q, after, GUIDE.time)) for p, q, after in CURVES])
 
 
 def march(
@@ -119,7 +119,7 @@ def test_saturated_rollouts_are_counted():
 
 
 def test_p_and_drift_are_linear_in_the_deviations():
-    p = table([forced_response(p, DEADBEAT, q, after, GUIDE.time) for p, q, after in CURVES])
+    p = table([forced_response(p, Curve(DEADBEAT, q, after, GUIDE.time)) for p, q, after in CURVES])
     np.testing.assert_allclose(GUIDE.solution(), p, atol=1e-12)
     np.testing.assert_allclose(np.hstack(list(GUIDE.tables.step[:, :, 2:4])), DRIFT, atol=1e-12)
 
@@ -147,7 +147,7 @@ def test_p_and_drift_include_the_feedforward():
     f.start_step(XI, DEVIATION, RATE)
     pushed = [(*curve, f.time, u) for curve, u in zip(CURVES, uf, strict=True)]
     for first, respond in ((0, forced_response), (2, free_drift)):
-        expected = table([respond(p, DEADBEAT, q, after, time, u) for p, q, after, time, u in pushed])
+        expected = table([respond(p, Curve(DEADBEAT, q, after, time, u)) for p, q, after, time, u in pushed])
         np.testing.assert_allclose(np.hstack(list(f.tables.step[:, :, first : first + 2])), expected, atol=1e-12)
 
 
