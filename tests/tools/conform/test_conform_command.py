@@ -106,6 +106,14 @@ def test_missing_bus_exits_with_no_device():
     assert "no-such-interface" in result.output
 
 
+def test_empty_bus_passes_nothing_and_exits_with_1(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("atalante_emulator.emulator.Emulator.poll", lambda emulator: None)
+    result = run("LEFT_SH")
+    assert result.exit_code == 1
+    assert "LEFT_SH: 0 of 38 requirements passed; not passed: NODE-01, " in result.stderr
+    assert " ".join(result.stdout.split()).count("measured: no frame of LEFT_SH received; ") == 38
+
+
 # -- requirements in general -------------------------------------------------------------------------------------------
 
 
@@ -120,6 +128,7 @@ def test_failure_with_a_delayed_cycle_is_repeated_and_then_not_tested(make_setup
     def late(tester: NodeTester) -> Outcome:
         nonlocal tries
         tries += 1
+        tester.cycle()
         tester.clock.delay = 2 * LATE
         return Outcome(False, "a gap")
 
@@ -130,6 +139,7 @@ def test_failure_with_a_delayed_cycle_is_repeated_and_then_not_tested(make_setup
     def late_once(tester: NodeTester) -> Outcome:
         nonlocal tries
         tries += 1
+        tester.cycle()
         tester.clock.delay = 2 * LATE if tries == 4 else 0.0
         return Outcome(False, "a defect")
 

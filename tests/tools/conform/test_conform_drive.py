@@ -270,6 +270,22 @@ def test_every_drive_requirement_has_a_defective_drive(make_setup: MakeSetup):
     assert {id for _, expected in BROKEN.values() for id, verdict in expected.items() if verdict is F} == ids
 
 
+@pytest.mark.parametrize("missing", [(2, S.SWITCH_ON_DISABLED, C.SHUTDOWN), (4, S.SWITCHED_ON, C.ENABLE_OPERATION)])
+def test_missing_transition_on_a_route_fails(
+    missing: tuple[int, DriveState, Controlword], make_setup: MakeSetup, monkeypatch: Patch
+):
+    number, state, controlword = missing
+
+    def rule(present: DriveState, word: int, latched: bool) -> DriveState:
+        return present if (present, word) == (state, controlword) else next_state(present, word, latched=latched)
+
+    tester = _with_rule(rule)(make_setup, monkeypatch).tester
+    (result,) = examine(tester, [r for r in requirements_of(tester) if r.id == "DRIVE-02"])
+    assert result.verdict is Verdict.FAILED
+    assert f"{number} ({state.name}, {controlword.name}): {state.name}" in result.measured
+    assert result.measured.count("OPERATION_ENABLED not reached") == 1
+
+
 @pytest.mark.parametrize(("cycles", "verdict"), [(45, Verdict.PASSED), (55, Verdict.FAILED)])
 def test_a_transition_may_take_fifty_cycles(cycles: int, verdict: Verdict, make_setup: MakeSetup, monkeypatch: Patch):
     received = 0

@@ -36,6 +36,25 @@ def test_emulated_node_passes_every_requirement(node: str, make_setup: MakeSetup
     assert len(results) == KINDS[node]
 
 
+@pytest.mark.parametrize("node", ["LEFT_SH", *KINDS])
+def test_no_requirement_passes_without_a_frame_of_the_node(node: str, make_setup: MakeSetup):
+    setup = make_setup(node)
+    setup.wire.from_node = lambda frame: wire.NO_FRAME
+    results = setup.examine()
+    assert {r.requirement.id: r.measured for r in results if r.verdict is Verdict.PASSED} == {}
+    assert all(r.measured.startswith(f"no frame of {node} received; ") for r in results)
+
+
+def test_silence_between_two_syncs_passes_only_if_syncs_are_answered(make_setup: MakeSetup):
+    setup = make_setup(IMU)
+    state = setup.message("STATE").frame_id
+    setup.wire.from_node = lambda frame: wire.NO_FRAME if int(frame["can_id"][0]) == state else frame
+    setup.tester.idle(200)  # the heartbeats are received
+    (result,) = examine(setup.tester, [r for r in requirements_of(setup.tester) if r.id == "NODE-06"])
+    assert result.verdict is Verdict.NOT_TESTED
+    assert "NODE-04" in result.measured or "no frame" in result.measured
+
+
 # -- frames sent -------------------------------------------------------------------------------------------------------
 
 
@@ -312,11 +331,11 @@ class Ghost(Operator):
 
     def __init__(self) -> None:
         super().__init__(starts=False)
-        self._heard = 0
+        self._received = 0
 
-    def hear(self, hal_state: int) -> None:
-        self._heard += 1
-        if self._heard == self.at:
+    def receive(self, hal_state: int) -> None:
+        self._received += 1
+        if self._received == self.at:
             self.start()
 
     #: Cycle of the press, during the test of PENDANT-01.

@@ -45,8 +45,16 @@ def starts_disabled(tester: NodeTester) -> Outcome:
 def makes_legal_transitions(tester: NodeTester) -> Outcome:
     """Test DRIVE-02: the drive makes every transition of the standard."""
     axis, slowest, wrong = Axis(tester), 0, []
+    unreached: set[DriveState] = set()
     for (state, controlword), (number, goal) in LEGAL.items():
-        axis.go(state)
+        if state not in unreached:
+            try:
+                axis.go(state)
+            except NotTested:
+                unreached.add(state)
+                wrong.append(f"{state.name} not reached")
+        if state in unreached:
+            continue
         took = axis.follow(controlword, goal)
         stayed = axis.run(STAY, controlword)
         if took is None or not all_in(stayed, goal):

@@ -117,6 +117,7 @@ class NodeTester:
 
     Attributes:
         received: frames of the node since the start of the examination.
+        frame_count: number of frames of the node recorded so far, including those removed from `received` since then.
         cycle_number: number of cycles of 1 ms, with or without SYNC.
     """
 
@@ -133,6 +134,7 @@ class NodeTester:
         self.network, self.robot, self.node, self.clock, self.technician = network, robot, node, clock, technician
         self.limits = limits or Limits()
         self.received: list[ReceivedFrame] = []
+        self.frame_count = 0
         self.cycle_number = 0
         self.sync = MessageSender(network.message(f"SYNC_{self._of_node('STATE').bus.upper()}"))
         self.state_message = self._of_node("STATE")
@@ -255,6 +257,7 @@ class NodeTester:
             if receiver is not None:
                 stamp = self.clock.time_of(int(stamps[row]), self.cycle_number)
                 self.received.append(receiver.decode(self._singles[row], self.cycle_number, stamp))
+                self.frame_count += 1
 
     # -- waiting -------------------------------------------------------------------------------------------------------
 

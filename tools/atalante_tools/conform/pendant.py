@@ -62,6 +62,8 @@ def requirements(_tester: NodeTester) -> list[Requirement]:
 def sends_no_request(tester: NodeTester) -> Outcome:
     """Test PENDANT-01: the request counter does not change without a press."""
     received = tester.states(tester.idle(200))
+    if not received:
+        raise NotTested("no state frame received")
     counters = {int(frame.values["RequestCounter"]) for frame in received}
     return Outcome(len(counters) == 1, f"{len(counters) - 1} requests in {len(received)} frames")
 

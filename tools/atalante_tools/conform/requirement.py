@@ -60,13 +60,32 @@ def examine(tester: NodeTester, requirements: Sequence[Requirement]) -> Iterator
 def _result(tester: NodeTester, requirement: Requirement) -> Result:
     for _ in range(ATTEMPTS):
         tester.clock.delay = 0.0
+        frames, cycle = tester.frame_count, tester.cycle_number
         try:
             outcome = requirement.test(tester)
         except NotTested as error:
-            return Result(requirement, Verdict.NOT_TESTED, str(error))
+            silence = _silence(tester, frames, cycle)
+            return Result(requirement, Verdict.NOT_TESTED, silence + str(error))
+        silence = _silence(tester, frames, cycle)
+        measured = silence + outcome.measured
         if outcome.passed:
-            return Result(requirement, Verdict.PASSED, outcome.measured)
+            # A requirement that forbids frames or torque also holds for a node that is not there.
+            return Result(requirement, Verdict.NOT_TESTED if silence else Verdict.PASSED, measured)
         if tester.clock.delay < LATE:
-            return Result(requirement, Verdict.FAILED, outcome.measured)
-    reason = f"this computer was late by {tester.clock.delay * 1e3:.1f} ms; measured: {outcome.measured}"
+            return Result(requirement, Verdict.FAILED, measured)
+    reason = f"this computer was late by {tester.clock.delay * 1e3:.1f} ms; measured: {measured}"
     return Result(requirement, Verdict.NOT_TESTED, reason)
+
+
+def _silence(tester: NodeTester, frames: int, cycle: int) -> str:
+    """Return the beginning of a result whose test received no frame of the node; empty if it received one.
+
+    A test that runs no cycle of its own judges all frames received so far.
+
+    Args:
+        tester: tester of the node.
+        frames: `tester.frame_count` at the start of the test.
+        cycle: `tester.cycle_number` at the start of the test.
+    """
+    received = tester.frame_count > frames if tester.cycle_number > cycle else tester.received
+    return "" if received else f"no frame of {tester.node.name} received; "
