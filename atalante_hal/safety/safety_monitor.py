@@ -23,7 +23,7 @@ from atalante_hal.safety.heartbeats import Heartbeats
 from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.message_monitor import MessageMonitor
 from atalante_hal.safety.plausibility import Plausibility
-from atalante_hal.safety.start import ENABLE_CYCLES, Refusal, StartRequest, refusal, stop_text
+from atalante_hal.safety.start import ENABLE_CYCLES, Refusal, StartRequest, entry_text, refusal, stop_text
 from atalante_hal.safety.state_machine import MOVING, Conditions, next_state
 from atalante_hal.types import PERIOD, State, SupervisorState, Vector
 from atalante_hal.wire.cia402 import DriveState
@@ -321,6 +321,8 @@ class SafetyMonitor:
             memory.raise_dtc(state.cycle, Dtc.OPERATOR_STOP, "PENDANT", text=text)
         if reasons:
             self.reason = memory.text_of(reasons) or self.reason
+        elif before is not _S.FINISH_STEP:  # the robot holds for the reason for which it finished the step
+            self.reason = entry_text(after, self.missing())
         if after is _S.ACTIVE and before not in MOVING and not self.enabling:
             self._limiter.restart(state.torque)
         if after is _S.FINISH_STEP:

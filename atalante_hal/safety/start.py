@@ -99,7 +99,34 @@ def _reason(request: StartRequest) -> str:
         return ""
     if request.diagnostic or request.nodes_well:
         return request.diagnostic
-    return f"not heard or not trusted yet: {', '.join(sorted(request.missing))}"
+    return missing_text(request.missing)
+
+
+def missing_text(missing: Collection[str]) -> str:
+    """Return which nodes prevent READY, one sentence.
+
+    Args:
+        missing: DBC names of the nodes that are not well.
+    """
+    return f"not heard or not trusted yet: {', '.join(sorted(missing))}"
+
+
+def entry_text(state: SupervisorState, missing: Collection[str]) -> str:
+    """Return why the robot entered a state without a diagnostic that demands it, one sentence.
+
+    Args:
+        state: state that was entered.
+        missing: DBC names of the nodes that are not well.
+    """
+    match state:
+        case _S.OFF:
+            return missing_text(missing)
+        case _S.READY:
+            return "every required node answers and no diagnostic prevents a start"
+        case _S.ACTIVE:
+            return "the operator pressed START"
+        case _:
+            return "the operator acknowledged the fault with START"
 
 
 def stop_text(stop_requested: bool) -> str:

@@ -210,12 +210,17 @@ def test_finish_step_times_out_in_hold(rig):
     assert rig.walk(1, step=7).supervisor is S.HOLD
 
 
-def test_joint_that_cannot_hold_is_lowered_and_the_others_hold(rig):
-    rig.until(S.ACTIVE)
+def with_encoder_fault():
+    """Add an emergency of the left knee drive to the frames for the HAL."""
     emergency = TransmitImage([load().message("LEFT_SK_EMCY")])
     emergency.values[:] = 0.0
-    emergency.values[emergency.codec.index("LEFT_SK_EMCY", "ErrorCode")] = 0x7305  # encoder fault
-    rig.bus.to_hal = lambda frames: np.concatenate([frames, emergency.seal()])
+    emergency.values[emergency.codec.index("LEFT_SK_EMCY", "ErrorCode")] = 0x7305
+    return lambda frames: np.concatenate([frames, emergency.seal()])
+
+
+def test_joint_that_cannot_hold_is_lowered_and_the_others_hold(rig):
+    rig.until(S.ACTIVE)
+    rig.bus.to_hal = with_encoder_fault()
     assert rig.cycle().supervisor is S.LOWER
     rig.bus.to_hal = lambda frames: frames
     commands = rig.last_commands()
@@ -269,6 +274,86 @@ def test_change_of_state_contains_its_reason(rig):
     rig.until(S.HOLD, 5)
     assert rig.hal.events[-1].text == "ACTIVE -> HOLD: the operator asked to stop"
     assert rig.hal.reason == "the operator asked to stop"
+
+
+ALL_WELL = "every required node answers and no diagnostic prevents a start"
+STARTED = "the operator pressed START"
+ACKNOWLEDGED = "the operator acknowledged the fault with START"
+
+
+def hold_and_start(rig):
+    rig.operator.hold()
+    rig.until(S.HOLD, 5)
+    rig.operator.start()
+    rig.until(S.ACTIVE, 20)
+
+
+def full_assist_and_start(rig):
+    into_full_assist(rig)
+    rig.operator.start()
+    rig.walk(2)
+
+
+def fault_and_start(rig):
+    rig.emulator.drives.leave(7, DriveState.FAULT)
+    rig.until(S.FAULT, 5)
+    rig.run(50)
+    rig.operator.start()
+    rig.until(S.HOLD, 30)
+    rig.run(300)
+    rig.operator.start()
+    rig.until(S.ACTIVE, 30)
+
+
+def lower_and_start(rig):
+    rig.bus.to_hal = with_encoder_fault()
+    rig.until(S.LOWER, 5)
+    rig.bus.to_hal = lambda frames: frames
+    rig.run(50)
+    rig.operator.start()
+    rig.until(S.HOLD, 5)
+
+
+def finish_step(rig):
+    finishing(rig, None)
+    rig.cycle()
+
+
+@pytest.mark.parametrize(
+    ("course", "expected"),
+    [
+        (hold_and_start, ["the operator asked to stop", STARTED]),
+        (full_assist_and_start, ["a cell is stuck", STARTED]),
+        (fault_and_start, ["RIGHT_TH: a drive is in FAULT and sent no emergency message", ACKNOWLEDGED, STARTED]),
+        (lower_and_start, ["LEFT_SK: emergency of a node: encoder or another sensor (emergency 0x7305)", ACKNOWLEDGED]),
+        (finish_step, ["the battery is nearly empty"] * 2),
+    ],
+)
+def test_reason_is_that_of_the_present_state_after_every_transition(rig, course, expected):
+    reasons, states, cycle = [], [S.OFF], rig.hal.read
+
+    def read():
+        state = cycle()
+        if state.supervisor is not states[-1]:
+            states.append(state.supervisor)
+            reasons.append(rig.hal.reason)
+        return state
+
+    rig.hal.read = read
+    rig.until(S.ACTIVE)
+    course(rig)
+    assert reasons == [ALL_WELL, STARTED, *expected], states
+
+
+def test_reason_names_the_missing_node_after_ready_is_lost(make_rig):
+    rig = make_rig(starts=False)
+    rig.until(S.READY)
+    rig.bus.to_hal = rig.drop(load().message("LEFT_SK_STATE").frame_id)
+    rig.until(S.OFF, 20)
+    assert "LEFT_SK" in rig.hal.reason
+    rig.bus.to_hal = lambda frames: frames
+    rig.until(S.READY, 100)
+    assert rig.hal.reason == ALL_WELL
 
 
 def own_frame(frames):

@@ -7,7 +7,7 @@ import pytest
 
 from atalante_hal.robot import JOINTS, load_robot
 from atalante_hal.safety.diagnostics import Dtc
-from atalante_hal.safety.start import REFUSED, StartRequest, implausible_torque, powered, refusal
+from atalante_hal.safety.start import REFUSED, StartRequest, entry_text, implausible_torque, powered, refusal
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
 
@@ -68,6 +68,10 @@ UNWELL = {"nodes_well": False, "missing": {"LEFT_SK", "IMU_TORSO"}}
 STOP, RELEASED = "the operator asked to stop", "the dead-man was released or the pendant is lost"
 FAILED = "the drives were not enabled within 200 cycles"
 TORQUE = "the drive of left_FH reports 3 Nm in SWITCH_ON_DISABLED; must be within 2 Nm, it makes no torque"
+
+
+def test_entry_text_of_off_names_the_missing_nodes():
+    assert entry_text(S.OFF, {"LEFT_SK", "IMU_TORSO"}) == "not heard or not trusted yet: IMU_TORSO, LEFT_SK"
 
 
 @pytest.mark.parametrize(

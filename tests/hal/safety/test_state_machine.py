@@ -112,6 +112,24 @@ def test_invariants_hold_for_all_states_reactions_and_facts():
         check_laws(before, reaction, conditions)
 
 
+#: Transitions that no diagnostic causes. Each has a reason of its own, see `test_safety_monitor.py`.
+WITHOUT_REASON = {
+    (S.OFF, S.READY),
+    (S.READY, S.OFF),
+    *((before, S.ACTIVE) for before in (S.READY, S.FULL_ASSIST, S.HOLD)),
+    *((before, S.HOLD) for before in (S.FINISH_STEP, S.LOWER, S.FAULT)),
+}
+
+
+def test_transitions_without_a_diagnostic_are_those_of_the_table():
+    found = set()
+    for before, _, conditions in EVERYTHING:
+        then, reasons = next_state(before, conditions)
+        if then is not before and not reasons:
+            found.add((before, then))
+    assert found == WITHOUT_REASON
+
+
 def check_laws(before: S, reaction: R, c: Conditions):
     then, _ = next_state(before, c)
     if reaction is R.FAULT:
