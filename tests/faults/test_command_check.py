@@ -87,9 +87,9 @@ def test_a_torque_a_limit_a_step_and_a_torque_while_stopped_are_found(hal: Hal, 
     hal.word[HIP], hal.torque[HIP] = Controlword.QUICK_STOP, 0.1
     hal.send(4)
     assert hal.commands().violations(robot) == [
-        "a torque beyond the joint's limit was sent to left_SK in cycle 2",
-        "a torque step beyond the joint's rate was sent to left_SK in cycle 2",
-        "a torque limit beyond the joint's limit was sent to right_SH in cycle 3",
+        "a torque above the joint's limit was sent to left_SK in cycle 2",
+        "a torque change above the joint's rate limit was sent to left_SK in cycle 2",
+        "a torque limit above the joint's limit was sent to right_SH in cycle 3",
         "a torque with QUICK STOP was sent to right_SH in cycle 4",
     ]
 
@@ -104,7 +104,7 @@ def test_a_step_may_be_the_rate_of_its_joint_over_one_cycle(hal: Hal, robot: Rob
     hal.torque[:] = 3.0 * step
     hal.send(3)
     assert hal.commands().violations(robot) == [
-        f"a torque step beyond the joint's rate was sent to {side}_{JOINTS[0].split('_')[1]} in cycle 3"
+        f"a torque change above the joint's rate limit was sent to {side}_{JOINTS[0].split('_')[1]} in cycle 3"
         for side in ("left", "right")
     ]
 

@@ -107,10 +107,10 @@ def test_one_of_several_diagnostics_is_enough(seen: Any) -> None:
 @pytest.mark.parametrize(
     ("quantity", "value", "says"),
     [
-        ("torque", 400.0, "a motor's torque was beyond its limit: left_FH in cycle 3"),
-        ("position", 1.0, "a joint was beyond its limit: left_FH in cycle 3"),
-        ("position", -1.0, "a joint was beyond its limit: left_FH in cycle 3"),
-        ("velocity", -6.0, "a joint was too fast: left_FH in cycle 3"),
+        ("torque", 400.0, "a motor's torque was above its limit: left_FH in cycle 3"),
+        ("position", 1.0, "a joint was outside its position range: left_FH in cycle 3"),
+        ("position", -1.0, "a joint was outside its position range: left_FH in cycle 3"),
+        ("velocity", -6.0, "a joint was above its velocity limit: left_FH in cycle 3"),
     ],
 )
 def test_what_must_never_be_is_told(seen: Any, quantity: str, value: float, says: str) -> None:

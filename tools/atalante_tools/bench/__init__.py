@@ -1,4 +1,4 @@
-"""Command `atalante bench`: measure the speed of the stack, and of baselines in the same run.
+"""Command `atalante bench`: measure the speed of the stack against baselines in the same run.
 
 nodes, generated_c, python_can_hal -> wire, motion, startup -> catalogue -> table or JSON lines
 """
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("names", metavar="[NAME]...", nargs=-1)
-@click.option("--quick", is_flag=True, help="Run only a few rounds per benchmark, to check that all of them work.")
+@click.option("--quick", is_flag=True, help="Run only a few rounds per benchmark, to check that all benchmarks work.")
 @json_option
 def command(names: tuple[str, ...], quick: bool, as_json: bool) -> None:
     """Measure the speed of the stack against baselines and print the ratio of the medians.

@@ -141,7 +141,7 @@ BENCHMARKS: Final = (
         "library_two_processes",
         gaits.library_two_processes,
         "s",
-        "limit of 3 s per gait and core of a library on two cores",
+        "limit of 1.5 s per gait of a library on two cores, 3 s per gait and core",
         1.0,
     ),
     Benchmark(

@@ -13,9 +13,9 @@ from atalante_control.gait.subject import Subject
 from atalante_control.model import Patient
 from atalante_tools.bench.measure import Effort, Measurement, require
 
-#: Target time for a gait that is solved from the kinematic guess [s].
+#: Target time to solve a gait from the kinematic guess [s].
 _COLD_LIMIT: Final = 3.0
-#: Target time for a gait that is solved from a neighbouring gait [s].
+#: Target time to solve a gait from a neighbouring gait [s].
 _WARM_LIMIT: Final = 1.0
 _ROUNDS: Final = 12
 _CENTRE: Final = Subject(Patient(75.0, 1.75), 0.15, 0.9)
@@ -39,7 +39,7 @@ def gait_solve_warm(effort: Effort) -> Measurement:
 
 @cache
 def _centre() -> Gait:
-    """Return the initial guess of the warm benchmark. The first call also builds the nonlinear program."""
+    """Return the initial guess of the warm benchmark, a neighbouring gait. The first call also builds the nonlinear program."""
     from atalante_control.gait_optimization.solve import solve
 
     return solve(_CENTRE).gait

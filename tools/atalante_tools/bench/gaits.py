@@ -37,7 +37,7 @@ def model_build(effort: Effort) -> Measurement:
 
 
 def inverse_dynamics(effort: Effort) -> Measurement:
-    """Measure the time to compute joint torques and ground wrench from the motion, by inverse dynamics on the stance foot."""
+    """Measure the inverse dynamics on the stance foot, which compute joint torques and ground wrench from a motion."""
     robot = load_robot()
     dynamics = stance_dynamics(robot, _PATIENT)
     model = pinocchio_model(urdf(ExoskeletonParameters(), robot, _PATIENT), fixed_base=False).model
@@ -58,7 +58,7 @@ def inverse_dynamics(effort: Effort) -> Measurement:
 
 
 def network_evaluation(effort: Effort) -> Measurement:
-    """Measure the time in which the gait network computes twelve joint trajectories from subject parameters."""
+    """Measure the time of the gait network to compute twelve joint trajectories from subject parameters."""
     network = load_network()
     inputs = np.random.default_rng(0).uniform(network.low, network.high, (64, len(network.low)))
     spread = np.ptp([network.coefficients(row) for row in inputs], axis=0).max()
@@ -69,12 +69,12 @@ def network_evaluation(effort: Effort) -> Measurement:
 
 
 def library_one_process(effort: Effort) -> Measurement:
-    """Measure the time per gait of a library that one process solves."""
+    """Measure the time per gait when one process solves a library of gaits."""
     return _library(effort, 1)
 
 
 def library_two_processes(effort: Effort) -> Measurement:
-    """Measure the time per gait of a library that two processes solve in parallel."""
+    """Measure the time per gait when two processes solve a library of gaits in parallel."""
     return _library(effort, 2)
 
 

@@ -50,7 +50,7 @@ def available() -> bool:
 
 
 class GeneratedC:
-    """Generated C code that decodes or encodes the messages of a codec. Row i of the frames is message i of the codec.
+    """Generated C code that decodes or encodes the messages of a codec. Row i of the frames contains message i of the codec.
 
     The values are in the order of the codec's signals.
 

@@ -1,4 +1,4 @@
-"""Benchmarks of the check of a CAN log, with other decoders as baselines.
+"""Benchmarks of the CAN log validator, with other decoders as baselines.
 
 The log contains a recorded run of the emulated robot in ACTIVE, repeated to 1.3 million frames. The repeated frames have new
 alive counters and CRCs, because otherwise the rules would report repeated frames.
@@ -24,9 +24,9 @@ from atalante_tools.canlog.column_codec import crc_differences, crc_of_zeros
 from atalante_tools.canlog.plan import Plan
 from atalante_tools.canlog.validate.project import Project
 
-#: Length of the recording [cycles], a multiple of the period of every message.
+#: Length of the recording in a normal and in a quick run [cycles]. It is a multiple of the period of every message.
 _CYCLES, _QUICK_CYCLES = 2000, 300
-#: Number of repetitions of the recording in the log.
+#: Number of repetitions of the recording in the log, in a normal and in a quick run.
 _REPEATED, _QUICK_REPEATED = 25, 2
 #: Number of frames that the slow baseline of python-can and cantools decodes per block.
 _SLICE = 30_000
@@ -239,7 +239,7 @@ def _write(path: Path, frames: Frames, stamps: npt.NDArray[np.int64], sent: npt.
 
 
 def _write_mdf(path: Path, frames: Frames) -> None:
-    """Write frames to an MF4 file of the type bus logging, as python-can does."""
+    """Write frames to an MF4 file for bus logging, in the layout of python-can."""
     from asammdf import MDF, Signal
     from asammdf.blocks.v4_blocks import SourceInformation
     from asammdf.blocks.v4_constants import BUS_TYPE_CAN, SOURCE_BUS

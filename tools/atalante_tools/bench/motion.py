@@ -23,7 +23,7 @@ from atalante_tools.console.options import EMBEDDED, Target
 from atalante_tools.session.embedded import EmbeddedRobot
 from atalante_tools.session.rig import Rig, open_hal
 
-#: Largest accepted difference between exact flow and step-by-step integration [rad].
+#: Largest accepted difference between the exact flow and the step-by-step integration of a rollout [rad].
 AGREEMENT: Final = 1e-6
 #: Largest accepted deviation of a joint from the gait while the robot walks [rad].
 POSE: Final = 0.15
@@ -63,8 +63,8 @@ def filter_tick(effort: Effort) -> Measurement:
 def emulator_tick(effort: Effort) -> Measurement:
     """Measure one tick of the emulator while the robot walks; the baseline is the time of PyBullet in the same ticks.
 
-    Both are measured while the whole stack runs. A step of PyBullet that is repeated alone takes a third less time, because
-    no other code uses the processor caches.
+    Both are measured while the whole stack runs. PyBullet alone would need a third less time per step, because no other
+    code would use the processor caches.
     """
     now = time.perf_counter
     tick_times: list[float] = []
@@ -101,7 +101,7 @@ def emulator_tick(effort: Effort) -> Measurement:
 
 
 def lockstep(effort: Effort) -> Measurement:
-    """Measure the wall time in which HAL, controller, emulator and telemetry ring run one simulated second."""
+    """Measure the wall time for one simulated second of HAL, controller, emulator and telemetry ring."""
     with _stack(EmbeddedRobot()) as stack:
         stack.walk(effort)
     ordered = [block / (_BLOCK * PERIOD) for block in sorted(stack.blocks)]
@@ -121,13 +121,13 @@ class _Stack:
     blocks: list[float] = field(default_factory=list)  # wall time of each block of `_BLOCK` cycles [s]
 
     def walk(self, effort: Effort) -> int:
-        """Run until the robot has walked for all rounds; return the number of these cycles.
+        """Run until the robot has walked for all rounds; return the number of cycles of these rounds.
 
         Args:
-        effort: number of rounds of `_BLOCK` cycles, and progress display.
+            effort: number of rounds of `_BLOCK` cycles, and progress display.
 
         Raises:
-        BenchmarkError: If the robot does not walk, or frames or records are lost.
+            BenchmarkError: If the robot does not walk, or frames or records are lost.
         """
         rounds = effort.rounds()
         cycles = rounds * _BLOCK

@@ -31,7 +31,7 @@ from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES, Frames, new_frame
 from atalante_hal.wire.process_image import TransmitImage
 from atalante_tools.bench.measure import require
 
-#: Number of cycles after which an alive counter starts again at 0.
+#: Number of cycles after which an alive counter wraps to 0.
 TURN = 256
 #: Number of poses of the recording. It is odd, so that a check in every 16th cycle gets a different pose each time.
 POSES = 15
@@ -99,7 +99,7 @@ class Recording:
         error = rng.uniform(-ERROR, ERROR, len(JOINTS))
         self.values[:, codec.slice("Position")] = (walk.tables.q[0] + error + swing) * motor
         self.values[:, codec.slice("Velocity")] = ERROR_RATE * np.cos(phase) * motor
-        # Noise of alternating sign, because consecutive sensor values must differ.
+        # The HAL detects constant sensor values as a fault, so the noise alternates in sign.
         sign = np.where(np.arange(POSES) % 2, 1.0, -1.0)[:, None]
         for name, noise in (("Torque", 0.05), ("Gyro", 0.01), ("Accel", 0.05), ("Force", 1.0)):
             columns = codec.slice(name)
@@ -120,7 +120,8 @@ class Recording:
         image.values[image.codec.slice("NodeState")] = 5  # operational
         image.values[image.codec.slice("SupplyVoltage")] = 48.0
         gap = max(m.cycle_ms for m in slow) // len(slow)
-        #: Slow messages. Their phases are spread evenly, so that every block of ten cycles has the same number of frames.
+        #: Messages with long periods: (message, period, phase) [cycles].
+        #: The phases are spread evenly, so every block of ten cycles has the same number of frames.
         self.slow = tuple((m, m.cycle_ms, gap * row % m.cycle_ms) for row, m in enumerate(slow))
         self._slow = _seal(image, image.values[None, :])
         self._slow_turn = [0] * len(slow)
@@ -158,7 +159,7 @@ class Recording:
 
 class _Sealed(NamedTuple):
     payloads: list[bytes]  # all frames of each pose
-    checksums: npt.NDArray[np.uint16]  # CRC of each row for each counter, shape (TURN, rows)
+    checksums: npt.NDArray[np.uint16]  # CRC of each message for each counter value, shape (TURN, messages)
 
 
 def _seal(image: TransmitImage, values: Vector) -> _Sealed:
@@ -173,7 +174,7 @@ def _seal(image: TransmitImage, values: Vector) -> _Sealed:
 
 
 def _e2e_fields(frames: Frames) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint16]]:
-    """Return a view of the counters and a view of the CRCs of frames, shape (frames,) each."""
+    """Return a view of the counters and a view of the CRCs of the frames, shape (frames,) each."""
     octets, halves = (
         frames.view(np.uint8).reshape(-1, FRAME_BYTES),
         frames.view(np.uint16).reshape(-1, FRAME_BYTES // 2),
@@ -221,7 +222,7 @@ class RecordedBus:
         self._prepared = [memory[: self._recording.play() * FRAME_BYTES].tobytes() for _ in range(cycles)][::-1]
 
     def send(self, frames: Frames) -> None:
-        """Count the frames. A batch with one frame per bus consists of the SYNC frames."""
+        """Count the frames. A batch with one frame per bus is the SYNC of all buses."""
         count = len(frames)
         self.sent += count
         if count == self._syncs:

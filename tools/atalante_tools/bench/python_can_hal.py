@@ -63,7 +63,7 @@ class VirtualNodes:
 
 
 class PythonCanHal:
-    """HAL of python-can and cantools, with one cycle per call and the state in plain arrays."""
+    """HAL written with python-can and cantools. Each call of `cycle` runs one cycle. The state is in plain arrays."""
 
     def __init__(self, walk: Walk, recording: Recording, controller: FilterOnly) -> None:
         network, robot = walk.network, walk.robot

@@ -2,7 +2,7 @@
 
 This module is not part of the control loop. It integrates all four rollouts (two joints, two extreme disturbances) over the
 horizon grid of the guide filter. The exact discretisation of each grid interval is computed in advance. All rollouts are
-integrated together, which needs the fewest numpy operations per step.
+integrated together, which needs the fewest numpy operations per interval.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from atalante_hal.types import Vector
 
 
 class SteppedRollouts:
-    """Step-by-step integration of the rollouts of a guide filter whose backup policies are monotone and not saturated."""
+    """Step-by-step integration of the rollouts of a guide filter. Its backup policies must be monotone and not saturated."""
 
     def __init__(self, guide: GuideFilter) -> None:
         """Copy grid, gains and disturbance bounds of the guide filter.
@@ -37,7 +37,7 @@ class SteppedRollouts:
         self.start_step()
 
     def start_step(self) -> None:
-        """Update the particular solution P for a new step. Must be called after `GuideFilter.start_step`."""
+        """Update the particular solution P for a new walking step. It must be called after `GuideFilter.start_step`."""
         guide = self._guide
         self._p = guide.solution()[:, [[0, 0, 2, 2], [1, 1, 3, 3]]]
         interval = self._p[guide.grid]
@@ -48,7 +48,7 @@ class SteppedRollouts:
         """Return the rollouts of both joints, as `GuideFilter.rollouts` does.
 
         Args:
-            cycle: cycle of the step.
+            cycle: cycle of the walking step, from 0.
             e_hip: tracking error of the hip [rad].
             ed_hip: rate of the tracking error of the hip [rad/s].
             e_knee: tracking error of the knee [rad].

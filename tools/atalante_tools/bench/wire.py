@@ -105,7 +105,7 @@ def encode_cycle(effort: Effort) -> Measurement:
     decoded = np.empty((2, codec.size))
     for frames, out in zip((by_codec, by_c), decoded, strict=True):
         codec.decode(frames, out)
-    # The generated C code truncates and the codec rounds, so they may differ by one resolution step.
+    # The generated C code truncates and the codec rounds, so their results may differ by the resolution of the signal.
     resolution = np.array([s.factor for _, s in codec.signals])
     require(
         (np.abs(decoded[0] - decoded[1]) <= 1.001 * resolution).all(), "the generated C code encodes different values"

@@ -114,7 +114,7 @@ def run(id_: str, name: str, as_json: bool) -> None:
     "--endurance/--no-endurance",
     default=True,
     show_default=True,
-    help="Also measure the longest duration of each fault during which the walk continues.",
+    help="Also measure for each fault the longest duration that the walk survives.",
 )
 @click.option(
     "--out",
@@ -137,7 +137,7 @@ def campaign_(
     if without := [id_ for id_ in chosen if id_ not in SCENARIOS]:
         raise InvalidUsage(f"{without[0]} has only tests and no scenario: `atalante faults list` shows the tests")
     tasks = plan(chosen, endurance=endurance, pairs=pairs and not ids)
-    out.mkdir(parents=True, exist_ok=True)  # a folder that cannot be created fails before the runs
+    out.mkdir(parents=True, exist_ok=True)  # reports an invalid folder before the runs start
     begun = time.monotonic()
     say(f"{len(tasks)} runs on {f'the workers of {dask}' if dask else f'{jobs} processes'}")
     found = list(_done(tasks, jobs=jobs, dask=dask))
@@ -180,7 +180,7 @@ def _done(tasks: Sequence[Task], *, jobs: int = 1, dask: str = "") -> Iterator[R
 
 
 def _table(summary: Summary) -> str:
-    """Return a table with one row per fault: its result, and the cycles for which the walk survives it."""
+    """Return a table with one row per fault: its result, and its longest duration that the walk survives [cycles]."""
     from atalante_tools.faults.report import number, survived
 
     lasts = {one.id: survived(one) for one in summary.endurance}

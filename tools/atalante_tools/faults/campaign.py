@@ -9,7 +9,7 @@ from atalante_control.gait_optimization.parallel import FanOutError, fan_out
 from atalante_tools.console.outcome import Failed
 from atalante_tools.faults.tasks import Result, Task, run_task
 
-#: Longest time between two results; after this time the campaign fails [s].
+#: Longest time between two results [s]. The campaign fails after this time without a result.
 RESULT_TIMEOUT: Final = 300.0
 
 

@@ -12,13 +12,14 @@ from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_tools.faults.observation import Observation
 
 _KNEE: Final = JOINTS.index("left_SK")
-#: Cycles without a command after which a drive must hold. It is not imported from the drive, so the check is independent.
+#: Number of cycles without a command after which a drive must start its local hold.
+#: This check must be independent, so the number is not imported from the emulated drive.
 _WATCHDOG: Final = 5
 _LEFT_LEG: Final = slice(0, len(LEG_JOINTS))
 
 
 def guide_kept(run: Observation) -> str | None:
-    """Check that assisted joints leave their guide by at most 0.5 deg while the robot walks.
+    """Check that no assisted joint is more than 0.5 deg outside its guide while the robot walks.
 
     Args:
         run: observation of the run.
@@ -29,7 +30,7 @@ def guide_kept(run: Observation) -> str | None:
 
 
 def guide_regained(run: Observation) -> str | None:
-    """Check that an assisted joint left its guide, and that all assisted joints are inside at the end.
+    """Check that an assisted joint left its guide, and that at the end all assisted joints are inside their guides.
 
     Args:
         run: observation of the run.
@@ -51,7 +52,7 @@ def data_stays_fresh(run: Observation) -> str | None:
 
 
 def not_enabled_in_motion(run: Observation) -> str | None:
-    """Check that the drive of the left knee is not enabled before the operator presses START.
+    """Check that the drive of the left knee stays disabled from the fault until the operator presses START.
 
     Args:
         run: observation of the run.
@@ -73,7 +74,7 @@ def drives_report_two_senders(run: Observation) -> str | None:
 
 
 def full_queue_is_confirmed(run: Observation) -> str | None:
-    """Check that the diagnostic of the full transmit queue is confirmed, in addition to the timeouts that it causes.
+    """Check that the HAL confirms the diagnostic of a full transmit queue. The resulting timeouts are not sufficient.
 
     Args:
         run: observation of the run.

@@ -1,6 +1,6 @@
 """Independent check of all command frames of the HAL: decode them with the bit positions of the DBC and compare with the limits.
 
-It shares no code with the limiter, the codec and the process image, so it can detect errors of these.
+It shares no code with the limiter, the codec and the process image, so it can detect errors in them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from atalante_hal.wire.cia402 import Controlword
 from atalante_hal.wire.frame import FRAME, Frames
 
 Vector = npt.NDArray[np.float64]
-#: Resolution of the torque signals [Nm]. A sent torque may exceed its limit by the rounding.
+#: Resolution of the torque signals [Nm]. Rounding may raise a sent torque above its limit by this value.
 _RESOLUTION: Final = 0.0125
 _PERIOD: Final = 1e-3  # s
 
@@ -131,10 +131,14 @@ class Commands:
             both = enabled[1:] & enabled[:-1] & (np.diff(leg.cycle) == 1)[:, None]
             step = np.abs(np.diff(leg.torque, axis=0))
             for violation, wrong, cycles in (
-                ("a torque beyond the joint's limit", np.abs(leg.torque) > largest + _RESOLUTION, leg.cycle),
-                ("a torque limit beyond the joint's limit", leg.limit > largest + _RESOLUTION, leg.cycle),
+                ("a torque above the joint's limit", np.abs(leg.torque) > largest + _RESOLUTION, leg.cycle),
+                ("a torque limit above the joint's limit", leg.limit > largest + _RESOLUTION, leg.cycle),
                 ("a torque with QUICK STOP", stopped & (leg.torque != 0.0), leg.cycle),
-                ("a torque step beyond the joint's rate", both & (step > rate * _PERIOD + _RESOLUTION), leg.cycle[1:]),
+                (
+                    "a torque change above the joint's rate limit",
+                    both & (step > rate * _PERIOD + _RESOLUTION),
+                    leg.cycle[1:],
+                ),
             ):
                 if wrong.any():
                     row, joint = (int(index) for index in np.argwhere(wrong)[0])

@@ -1,4 +1,4 @@
-"""Injection of host faults: wrappers of controller, clock and bus that fail in chosen cycles."""
+"""Injection of host faults. Wrappers make the controller, the clock and the bus of the HAL fail in chosen cycles."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from atalante_hal.types import PERIOD, Command, Controller, State, Vector
 from atalante_hal.wire.frame import Frames
 from atalante_tools.faults.scenario import HostFault
 
-#: 1 for the joint that the fault `shake` disturbs, the left hip, and 0 for all others, shape (12,).
+#: Joint that the fault `shake` disturbs: 1 for the left hip, 0 for all other joints, shape (12,).
 _HIP: Final = np.array([joint == "left_SH" for joint in JOINTS], np.float64)
 
 
@@ -93,7 +93,7 @@ class DisturbedClock:
 
     def __init__(self, now: HostFaults) -> None:
         self._now = now
-        self._behind = 0.0  # delay of a slow loop behind its deadline [s]
+        self._behind = 0.0  # accumulated delay of the loop during the fault `slow` [s]
 
     def wait(self) -> float:
         """Return the delay of the cycle behind its deadline [s], as `WallClock.wait` does."""

@@ -95,7 +95,7 @@ SCENARIOS: Final = (
                     node=_KNEE,
                     reacted=reacted,
                     recovers=False,
-                    observed=40,  # short, because after 100 cycles the constant force values are detected as a fault
+                    observed=40,  # must end before cycle 100, when the constant forces are detected as a fault
                 )
                 for frames, state, dtc, reacted in (
                     (5, SupervisorState.FINISH_STEP, "SWING_TIMEOUT", 5),
@@ -114,7 +114,7 @@ SCENARIOS: Final = (
         "F06",
         (
             Case("0 cycles", (), dtc="", state=_ACTIVE, observed=200),
-            # The first late frame reveals the delay. Before, no frame arrives.
+            # The HAL detects the delay when the first late frame arrives, `k` cycles after the fault begins.
             *(
                 Case(f"{k} cycles", (Fault("delay", _STATE, 0, 200, by=k),), node=_KNEE, detected=k + 1, state=_ACTIVE)
                 for k in range(1, 5)
@@ -123,7 +123,7 @@ SCENARIOS: Final = (
         ),
         permanent=Case("by 4 cycles, permanent", (Fault("delay", _STATE, 0, None, by=4),)),
     ),
-    # The counter of the first frozen frame is correct, so the fault begins one cycle later.
+    # The first frozen frame still has the expected counter, so the first faulty frame comes one cycle later.
     Scenario(
         "F07",
         (
@@ -238,7 +238,7 @@ SCENARIOS: Final = (
         ),
         permanent=Case("permanent", (Fault("inject", _COMMAND, SK_TargetTorque=200.0),)),
     ),
-    # The counter of the second sender is that of the last genuine frame plus `ahead`.
+    # Each frame of the second sender has the counter of the last genuine frame plus `ahead`.
     Scenario(
         "F58",
         (

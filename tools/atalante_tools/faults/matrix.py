@@ -16,7 +16,7 @@ from atalante_hal.types import SupervisorState
 
 MATRIX_FILE: Final = Path(__file__).with_name("FAULTS.md")
 COLUMNS: Final = ("ID", "Fault", "Detected by", "Cycles", "Reaction", "State", "DTC", "Proof")
-#: Entry of the column Proof for a scenario with the ID of the row.
+#: Entry in the column Proof. It means that the scenario with the ID of the row proves the row.
 SCENARIO: Final = "scenario"
 _ID = re.compile(r"F\d\d")
 _BOUND = re.compile(r"(\d+)(?: / (\d+))?")
@@ -33,21 +33,21 @@ class Row:
     id: str
     fault: str  # description of the fault
     noticed_by: str  # check that detects it
-    cycles: str  # text of the bounds, such as 1 / 5; see `detected` and `reacted`
+    cycles: str  # bounds as text, such as "1 / 5"; `detected` and `reacted` return the numbers
     behaviour: str  # reaction in words
     state: SupervisorState  # final state of the HAL
     dtc: str  # diagnostic code; empty: none
-    proof: tuple[str, ...]  # each entry is SCENARIO or `path::test` below tests/; a * at the end matches any text
+    proof: tuple[str, ...]  # each entry is SCENARIO or a test `path::test` in tests/; a final * matches any text
 
     @property
     def detected(self) -> int | None:
-        """Return the bound of the diagnostic [cycles], counted from the first faulty cycle as 1; None if there is no number."""
+        """Return the cycle by which the diagnostic must be reported. The first faulty cycle is 1. None without a number."""
         bound = _BOUND.fullmatch(self.cycles)
         return int(bound[1]) if bound else None
 
     @property
     def reacted(self) -> int | None:
-        """Return the bound of the reaction [cycles]: the number after `/`, or the only number; None if there is no number."""
+        """Return the cycle by which the reaction must occur: the number after `/`, or the only number. None without a number."""
         bound = _BOUND.fullmatch(self.cycles)
         return int(bound[2] or bound[1]) if bound else None
 

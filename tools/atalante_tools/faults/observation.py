@@ -16,7 +16,7 @@ from atalante_tools.faults.command_check import Commands
 
 @dataclass(frozen=True)
 class Observation:
-    """Record of one run. Every cycle is a HAL cycle. Arrays have one row per cycle, from cycle 1."""
+    """Record of one run. All cycle numbers are HAL cycles, from 1. Row k of an array belongs to cycle k + 1."""
 
     network: Network
     robot: Robot
@@ -32,8 +32,8 @@ class Observation:
     velocity: Vector  # true joint velocities [rad/s], shape (cycles, 12)
     temperature: Vector  # reported temperature of the drives [degC], shape (cycles, 12)
     age: npt.NDArray[np.int64]  # age of the data of each message in the HAL [cycles], shape (cycles, messages)
-    guide_exit: Vector  # largest distance of an assisted joint beyond its guide, negative inside [rad], shape (cycles,)
-    messages: tuple[str, ...]  # message of each column of `age`
+    guide_exit: Vector  # largest distance of an assisted joint outside its guide [rad], shape (cycles,); inside: < 0
+    messages: tuple[str, ...]  # name of the message in each column of `age`
 
     def state(self, cycle: int) -> SupervisorState:
         """Return the state of a cycle.
@@ -45,7 +45,7 @@ class Observation:
 
     @property
     def last_before_start(self) -> int:
-        """Return the last cycle before the operator's START after the fault."""
+        """Return the last cycle before the operator's START after the fault, or the last cycle of a run without START."""
         return (self.pressed or self.last + 1) - 1
 
     @property
@@ -54,7 +54,7 @@ class Observation:
         return len(self.states)
 
     def latency(self, cycle: int) -> int:
-        """Return the number of cycles from the first faulty cycle to a cycle, both included.
+        """Return the number of cycles from the first faulty cycle to the given cycle. Both are counted.
 
         Args:
             cycle: HAL cycle.

@@ -24,7 +24,7 @@ class Line:
     id: str
     passed: bool
     state: str
-    cycles: int | None  # latency of the worst case: a failed case, else the case closest to its bound
+    cycles: int | None  # latency of the worst case, which is a failed case or the case closest to its bound
     bound: int
     dtc: str
     cases: int
@@ -121,7 +121,7 @@ class Summary:
         if self.endurance:
             lasting = [[e.id, matrix[e.id].fault, e.case, survived(e)] for e in self.endurance]
             parts += [
-                "## Cycles that the walk survives each fault",
+                "## Longest duration of each fault that the walk survives",
                 _table([["ID", "Fault", "Case", "Cycles"], *lasting]),
             ]
         if self.pairs:
@@ -129,7 +129,7 @@ class Summary:
         return "\n\n".join(parts) + "\n"
 
     def _pairs(self) -> str:
-        """Return the table of final states, with a row for the first fault and a column for the second fault."""
+        """Return a table of the final states of all pairs. Each row is a first fault, each column is a second fault."""
         names = [f"{id_} {name}" for id_, name in REPRESENTATIVES]
         found = {(pair.first, pair.second): pair for pair in self.pairs}
         rows = [["", *(name.split()[0] for name in names)]]
@@ -141,7 +141,7 @@ class Summary:
 
 
 def survived(endurance: Endurance) -> str:
-    """Return the cycles for which the walk survives a fault, as text.
+    """Return as text for how many cycles of a fault the walk continues.
 
     Args:
         endurance: result of the run.

@@ -40,11 +40,11 @@ _GUIDE: Final = ("error", "q_bound")
 #: Controller settings. The startup is short, because the robot is already in the first pose of the gait.
 CONFIG: Final = AirwalkConfig(startup=0.1)
 ASSISTANCE: Final = 0.5
-#: Cycles within which a robot without fault must be ACTIVE.
+#: Number of cycles within which a robot without fault must reach ACTIVE after power-on.
 _START: Final = 600
 #: Cycles between the two presses of START after the fault. The first press leaves FAULT, the second press leaves HOLD.
 RECOVERY: Final = 100
-#: Cycles in a row in ACTIVE after which the robot counts as restarted.
+#: Number of consecutive cycles in ACTIVE that count as a restart of the walk.
 RESTARTED: Final = 10
 
 
@@ -210,7 +210,7 @@ class _Run:
 
 
 class _Sample(NamedTuple):
-    """One row of the arrays of an `Observation`."""
+    """Values of one cycle. They become one row of each array of an `Observation`."""
 
     drive_state: list[int]
     torque: Vector
@@ -222,7 +222,7 @@ class _Sample(NamedTuple):
 
     @classmethod
     def of(cls, rig: Rig) -> _Sample:
-        """Return the values of the present cycle, mostly the true values of the emulated robot."""
+        """Return the values of the present cycle. Drive states, torques and motion are true values of the emulated robot."""
         hal, emulator = rig.hal, rig.emulator
         assert emulator is not None
         (hip, knee), (hip_bound, knee_bound) = (hal.record[hal.layout[f"controller.{name}"]] for name in _GUIDE)

@@ -17,7 +17,7 @@ from atalante_hal.types import SupervisorState
 if TYPE_CHECKING:
     from atalante_tools.faults.observation import Observation
 
-#: Default phase of the first step at which a case begins. The left leg is in swing and has its largest velocity.
+#: Default start of a case, as phase of the first walking step (0 to 1). Here the left leg swings with its largest velocity.
 MID_SWING: Final = 0.35
 
 
@@ -62,21 +62,21 @@ class Case:
 
     name: str  # unique name in the scenario
     stimuli: tuple[Stimulus, ...]  # faults and operator actions; `start` counts from the start of the case
-    phase: float | None = MID_SWING  # start of the case, as phase of the first step, 0 to 1; None: power-on
+    phase: float | None = MID_SWING  # start of the case, as phase of the first walking step (0 to 1); None: power-on
     first_faulty: int = 0  # first faulty cycle, counted from the start of the case
-    state: SupervisorState | None = None  # expected final state; None: from the row of the matrix
-    dtc: str | None = None  # expected diagnostic code; "": no code; None: from the row
-    detected: int | None = None  # bound of the diagnostic [cycles]; None: from the row
-    reacted: int | None = None  # bound of the reaction [cycles]; None: from the row
+    state: SupervisorState | None = None  # expected final state; None: as in the matrix
+    dtc: str | None = None  # expected diagnostic code; "": no code; None: as in the matrix
+    detected: int | None = None  # time limit for the diagnostic [cycles]; None: as in the matrix
+    reacted: int | None = None  # time limit for the reaction [cycles]; None: as in the matrix
     node: str | None = None  # node that the diagnostic must name; None: any node
-    recovers: bool = True  # whether START after the fault must lead to ACTIVE; False: it must not
-    observed: int = 60  # cycles from the end of the fault, or from the bound of a permanent fault, to START
+    recovers: bool = True  # True: START after the fault must lead to ACTIVE; False: it must not
+    observed: int = 60  # cycles from the end of the fault (of a permanent fault: from its reaction limit) to START
     seed: int = 0  # seed of the random numbers in the emulator
     checks: tuple[ObservationCheck, ...] = ()  # additional checks of the run
 
     @property
     def ends(self) -> int | None:
-        """Return the first cycle after all stimuli, from the start of the case; None if a stimulus is permanent."""
+        """Return the first cycle after all stimuli, counted from the start of the case. None if a stimulus is permanent."""
         ends = [None if one.cycles is None else one.start + one.cycles for one in self.stimuli]
         return None if None in ends else max((end for end in ends if end is not None), default=0)
 

@@ -13,13 +13,14 @@ from atalante_tools.faults.scenario import Case, OperatorAction, Scenario
 _ACTIVE: Final = SupervisorState.ACTIVE
 _HOLD: Final = SupervisorState.HOLD
 _KNEE: Final = "LEFT_SK"
-#: Joint that hardly moves while the left leg swings, so a small jump of its encoder is visible.
+#: Joint that hardly moves while the left leg swings, so a small jump of its encoder is detectable.
 _STILL: Final = "RIGHT_FH"
 _IMUS: Final = tuple(f"IMU_{name.upper()}" for name in IMUS)
 _FEET: Final = tuple(f"FOOT_{name.upper()}" for name in FEET)
 #: Vertical forces of the cells of a foot on the ground [N].
 _ON_GROUND: Final = {f"{cell}_ForceZ": 150.0 for cell in CELLS}
-#: Permanent faults that the sensor checks must tolerate. The last two affect messages that the checks use.
+#: Permanent communication faults that must not prevent the detection of a sensor fault.
+#: The last two affect messages that the sensor checks use.
 _TOLERATED: Final = {
     "FOOT_LEFT doubled": Fault("duplicate", "FOOT_LEFT_STATE"),
     "FOOT_LEFT a cycle late": Fault("delay", "FOOT_LEFT_STATE"),
@@ -33,7 +34,7 @@ _TOLERATED: Final = {
 
 
 def _imu(kind: str, cycles: int, *, tolerated: int) -> tuple[Case, ...]:
-    """Return a case for each IMU, and a case with a short fault of an IMU during which the walk must continue."""
+    """Return one case per IMU, and one case with a short fault during which the walk must continue."""
     return (
         *(Case(imu, (Fault(kind, imu, 0, cycles),), node=imu) for imu in _IMUS),
         Case(f"for {tolerated} cycles", (Fault(kind, _IMUS[0], 0, tolerated),), state=_ACTIVE, node=_IMUS[0]),
@@ -41,7 +42,7 @@ def _imu(kind: str, cycles: int, *, tolerated: int) -> tuple[Case, ...]:
 
 
 def _stuck(node: str, cycles: int) -> tuple[Fault, ...]:
-    """Return the fault of a stuck encoder, and a restart of its drive afterwards, which references the encoder."""
+    """Return a stuck encoder and a later restart of its drive. The restart references the encoder again."""
     return Fault("encoder_stuck", node, 0, cycles), Fault("reset", node, cycles + 30, 3)
 
 
@@ -88,7 +89,7 @@ SCENARIOS: Final = (
             ),
             *(
                 Case(f"{1e3 * by:g} mrad for 100 cycles", (Fault("encoder_jump", _STILL, 0, 100, by=by),), node=_STILL)
-                for by in (0.025, -0.025, 0.1, -1.0)  # a joint can move 20 mrad in five cycles
+                for by in (0.025, -0.025, 0.1, -1.0)  # larger than 20 mrad, the motion possible in five cycles
             ),
             Case(
                 "25 mrad, permanent",
@@ -135,7 +136,8 @@ SCENARIOS: Final = (
             for cell, force in zip(CELLS, (400.0, 0.0, -50.0, 61.0), strict=True)
         ),
     ),
-    # The feet report contact for 60 cycles, then none. After 100 cycles the robot counts as lifted, and the fault ends.
+    # For 60 cycles, injected forces simulate ground contact. The fault begins when they end and no foot is on the ground.
+    # After 100 cycles without contact, the HAL assumes that the robot was lifted on purpose, and the fault ends.
     Scenario(
         "F34",
         tuple(
@@ -182,7 +184,8 @@ SCENARIOS: Final = (
                 recovers=False,
                 checks=(start_is_rejected,),
             ),
-            # The controller follows the encoder until the joint reaches its limits.
+            # The controller compensates the drift by moving the joint. The reported position leaves its range only
+            # after the joint has reached its mechanical limit, so the detection takes up to 400 cycles.
             Case(
                 "RIGHT_SA at 2 rad/s",
                 (Fault("encoder_drift", "RIGHT_SA", rate=2.0),),

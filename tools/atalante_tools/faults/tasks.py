@@ -27,11 +27,11 @@ from atalante_tools.faults.verdict import (
     limit_violations,
 )
 
-#: Longest duration of a fault in an endurance run [cycles]. It is longer than a step.
+#: Longest duration of a fault in an endurance run [cycles]. It is longer than a walking step.
 HORIZON: Final = 1000
 #: Cycles between the first and the second fault of a pair.
 PAIR_DELAY: Final = 3
-#: Cases for the pairs of faults: (ID of the row, name of the case).
+#: Cases that a campaign also runs in pairs. Each entry has the ID of a fault and the name of one of its cases.
 REPRESENTATIVES: Final = (
     ("F03", "4 frames"),
     ("F04", "LEFT_SK"),
@@ -52,7 +52,7 @@ REPRESENTATIVES: Final = (
 
 @dataclass(frozen=True)
 class Endurance:
-    """Result of an endurance run: longest duration of a fault during which the walk continues."""
+    """Result of an endurance run: the longest duration of a fault that the walk survives."""
 
     id: str
     case: str
@@ -88,7 +88,7 @@ class EnduranceTask:
     id: str
 
     def __call__(self) -> Endurance:
-        """Shorten the fault until the walk continues; return the duration of the fault in cycles."""
+        """Shorten the fault until the walk survives it, and return the result."""
         case = SCENARIOS[self.id].permanent
         assert case is not None
         cycles = HORIZON
@@ -99,7 +99,7 @@ class EnduranceTask:
 
 @dataclass(frozen=True)
 class PairTask:
-    """Task to run two cases of `REPRESENTATIVES` together. The second begins `PAIR_DELAY` cycles after the first."""
+    """Task to run two cases of `REPRESENTATIVES` together. The second case begins `PAIR_DELAY` cycles after the first."""
 
     first: tuple[str, str]
     second: tuple[str, str]
@@ -184,7 +184,7 @@ def run_task(task: Task) -> Result:
 
 
 def _cycles_until_stop(case: Case, cycles: int) -> int | None:
-    """Run a permanent fault for `cycles` cycles; return the number of cycles until the walk ended, or None."""
+    """Run a permanent fault for `cycles` cycles; return the number of cycles until the walk stopped; None if it continued."""
     limited = replace(case, stimuli=tuple(_limited(stimulus, cycles) for stimulus in case.stimuli))
     run = observe(limited, cycles, recovery=False)
     for cycle in range(run.first, run.last + 1):
@@ -198,7 +198,7 @@ def _case_of(id_: str, name: str) -> Case:
 
 
 def _limited(stimulus: Stimulus, cycles: int) -> Stimulus:
-    """Return a stimulus; if it is permanent, limit its duration to `cycles`."""
+    """Return the stimulus. A permanent stimulus is limited to `cycles` cycles."""
     if stimulus.cycles is not None:
         return stimulus
     if isinstance(stimulus, Fault):
@@ -207,7 +207,7 @@ def _limited(stimulus: Stimulus, cycles: int) -> Stimulus:
 
 
 def _shifted(stimulus: Stimulus, cycles: int) -> Stimulus:
-    """Return a stimulus that starts `cycles` later."""
+    """Return the stimulus with its start delayed by `cycles` cycles."""
     return (
         stimulus.starting(stimulus.start + cycles)
         if isinstance(stimulus, Fault)

@@ -27,7 +27,7 @@ from atalante_tools.faults.scenario import Case
 _S = SupervisorState
 #: States in which the torques of the controller are sent to the drives.
 WALKING: Final = (_S.ACTIVE, _S.FULL_ASSIST, _S.FINISH_STEP)
-#: Accepted overshoot beyond the position limit while a drive stops its joint [rad].
+#: Accepted overshoot past the position limit while a drive stops its joint [rad].
 _OVERSHOOT: Final = 0.05
 #: Accepted ratio of joint velocity to velocity limit.
 _VELOCITY_RATIO: Final = 1.2
@@ -39,8 +39,8 @@ class Expectation:
 
     state: SupervisorState
     dtc: str  # regular expression for the diagnostic code; "": no code is expected
-    detected: int  # bound of the diagnostic [cycles]
-    reacted: int  # bound of the reaction [cycles]
+    detected: int  # time limit for the diagnostic [cycles]
+    reacted: int  # time limit for the reaction [cycles]
 
     @classmethod
     def of(cls, case: Case, row: Row) -> Expectation:
@@ -144,10 +144,10 @@ def limit_violations(run: Observation) -> list[str]:
     robot = run.robot
     found = run.commands.violations(robot)
     for sentence, wrong in (
-        ("a motor's torque was beyond its limit", np.abs(run.torque) > robot.torque_max * (1.0 + 1e-9)),
-        ("a joint was beyond its limit", run.position > robot.position_max + _OVERSHOOT),
-        ("a joint was beyond its limit", run.position < robot.position_min - _OVERSHOOT),
-        ("a joint was too fast", np.abs(run.velocity) > _VELOCITY_RATIO * robot.velocity_max),
+        ("a motor's torque was above its limit", np.abs(run.torque) > robot.torque_max * (1.0 + 1e-9)),
+        ("a joint was outside its position range", run.position > robot.position_max + _OVERSHOOT),
+        ("a joint was outside its position range", run.position < robot.position_min - _OVERSHOOT),
+        ("a joint was above its velocity limit", np.abs(run.velocity) > _VELOCITY_RATIO * robot.velocity_max),
     ):
         if wrong.any():
             row, joint = (int(index) for index in np.argwhere(wrong)[0])
