@@ -5,7 +5,7 @@ The protocol `Bus` has several transports. The HAL and the emulator run on any o
 - `socketcan.SocketCanBus`: a Linux CAN interface, such as `can0` of an adapter or `vcan0`;
 - `pair.PairBus`: two ends in one process, in lock-step;
 - `shared.SharedBus`: two ends in two processes, which run in parallel;
-- `python_can.PythonCanBus`: any interface that python-can supports (virtual, pcan, kvaser, ...);
+- `python_can.PythonCanBus`: an interface of python-can with CAN FD, see `adapters` (pcan, kvaser, slcan, ...);
 - `replay.ReplayBus`: a recorded log, read only.
 """
 

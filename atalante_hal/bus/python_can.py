@@ -1,4 +1,4 @@
-"""Bus on any python-can interface, for adapters without SocketCAN and for tests.
+"""Bus on a python-can interface with CAN FD, for adapters without SocketCAN and for tests.
 
 It takes about 6 us for each frame. Use `socketcan.SocketCanBus` for interfaces that the kernel supports, because it is faster.
 """
@@ -14,6 +14,7 @@ import can
 import numpy as np
 
 from atalante_hal.bus import BusAbsent, BusDown, BusFull, Stamps
+from atalante_hal.bus.adapters import refusal, reports_can_fd
 from atalante_hal.bus.batch import Batches, is_legal
 from atalante_hal.wire.frame import (
     FLAG_BRS,
@@ -30,6 +31,8 @@ from atalante_hal.wire.frame import (
 RECORD = struct.Struct("<IBB2x64s")
 ID_NUMBER = 0x1FFF_FFFF
 LINK_LOST = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF)
+#: Errors of the backends at opening: kvaser raises NameError without its library, pcan KeyError for an unknown channel.
+_OPEN_ERRORS = (can.CanError, OSError, ValueError, TypeError, ImportError, NameError, LookupError, AttributeError)
 
 
 class PythonCanBus:
@@ -42,11 +45,12 @@ class PythonCanBus:
         **options: Keyword arguments of `can.Bus`.
 
     Attributes:
-        dropped: Number of received messages that are not valid CAN frames, such as an FD message of 13 bytes. Frames lost in
-            the adapter are not counted, because python-can does not report them.
+        dropped: Number of received messages that are not valid CAN frames, such as an FD message of 13 bytes or a damaged line
+            of slcan. Frames lost in the adapter are not counted, because python-can does not report them.
 
     Raises:
-        BusAbsent: If python-can cannot open the channel or opens it for classic CAN only.
+        BusAbsent: If the interface is unknown or has no CAN FD (`adapters.refusal`), or if python-can cannot open the channel or
+            opens it for classic CAN only.
     """
 
     def __init__(self, interface: str, channel: str, capacity: int = 256, **options: Any) -> None:
@@ -57,6 +61,7 @@ class PythonCanBus:
         self._batches = Batches()
         self._closed = False
         self._bus = _open(interface, channel, options)
+        self._link_errors = _link_errors(interface)
 
     def send(self, frames: Frames) -> None:
         """Send each frame as a python-can message.
@@ -78,6 +83,8 @@ class PythonCanBus:
                 if error.error_code in LINK_LOST:
                     raise BusDown(f"{self.name} is down: {error}") from error
                 raise BusFull(f"{self.name} accepted {sent} of {len(frames)} frames: {error}", sent) from error
+            except self._link_errors as error:
+                raise BusDown(f"{self.name} is down: {error}") from error
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
         """Write the received messages to `frames[:n]` and return n, see `Bus.receive`.
@@ -99,8 +106,11 @@ class PythonCanBus:
         while count < room:
             try:
                 message = self._bus.recv(0.0 if count else timeout)
-            except can.CanError as error:
+            except self._link_errors as error:
                 raise BusDown(f"{self.name} cannot receive: {error}") from error
+            except (ValueError, LookupError):  # slcan cannot parse a damaged line
+                self.dropped += 1
+                continue
             if message is None:
                 break
             if pack(message, memory, count * FRAME_BYTES):
@@ -114,7 +124,11 @@ class PythonCanBus:
         """Shut down the python-can bus; a second call has no effect."""
         if not self._closed:
             self._closed = True
-            self._bus.shutdown()
+            lost: tuple[type[Exception], ...] = (*self._link_errors, ValueError)
+            try:
+                self._bus.shutdown()
+            except lost:  # remote cannot shut a lost connection down: ValueError
+                can.BusABC.shutdown(self._bus)
 
     def _require_open(self) -> None:
         if self._closed:
@@ -179,20 +193,30 @@ def pack(message: can.Message, memory: memoryview, offset: int) -> bool:
     return True
 
 
+def _link_errors(interface: str) -> tuple[type[Exception], ...]:
+    """Return the exceptions of an open bus that mean a lost link."""
+    if interface != "remote":
+        return (can.CanError, OSError)
+    from can_remote.websocket import WebsocketClosed
+
+    return (can.CanError, OSError, WebsocketClosed)
+
+
 def _open(interface: str, channel: str, options: dict[str, Any]) -> can.BusABC:
-    if interface not in can.VALID_INTERFACES:
-        known = ", ".join(sorted(can.VALID_INTERFACES))
-        raise BusAbsent(f"there is no CAN interface {interface!r}; use one of {known}")
+    if refused := refusal(interface, one_process=True):
+        raise BusAbsent(refused)
     if interface == "virtual":
         options = {"protocol": can.CanProtocol.CAN_FD} | options
+    # Own frames are not received: neovi, unlike the other backends, returns them by default.
+    options = {"fd": True, "receive_own_messages": False} | options
     try:
-        bus = can.Bus(interface=interface, channel=channel, fd=True, **options)
-    except (can.CanError, OSError, ValueError, TypeError, ImportError, NameError) as error:  # kvaser: NameError
+        bus = can.Bus(interface=interface, channel=channel, **options)
+    except _OPEN_ERRORS as error:
         raise BusAbsent(
-            f"python-can cannot open {interface}:{channel} for CAN FD: {error}; check the channel name and the driver, "
-            "and run `atalante doctor`"
+            f"python-can cannot open {interface}:{channel} for CAN FD: {error}; check the channel name and the driver with "
+            f"`atalante doctor -i {interface}`"
         ) from error
-    if bus.protocol is can.CanProtocol.CAN_20:
+    if bus.protocol is can.CanProtocol.CAN_20 and reports_can_fd(interface):
         bus.shutdown()
         raise BusAbsent(f"{interface}:{channel} must support CAN FD, got classic CAN only: use another interface")
     return bus

@@ -442,7 +442,7 @@ def test_full_virtual_bus_reports_the_number_of_sent_frames() -> None:
     ("interface", "options", "sentence"),
     [
         ("pigeon", {}, "no CAN interface 'pigeon'; use one of .*socketcan.*virtual"),
-        ("serial", {}, "cannot open serial:x for CAN FD: .*atalante doctor"),
+        ("pcan", {}, "cannot open pcan:x for CAN FD: .*atalante doctor -i pcan"),
         ("virtual", {"protocol": can.CanProtocol.CAN_20}, "virtual:x must support CAN FD, got classic CAN only"),
     ],
 )

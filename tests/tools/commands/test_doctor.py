@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
+import can
 import pytest
 from click.testing import CliRunner
 
+from atalante_hal.bus.adapters import ADAPTERS
 from atalante_tools.cli import cli
 from atalante_tools.commands import machine as machine_module
 from atalante_tools.commands.doctor import CheckResult, examine
@@ -27,6 +30,7 @@ class AnyMachine:
     priority: int = 99
     memory: int | None = None
     lacks: tuple[str, ...] = ()
+    opening: str | None = None
 
     def can_socket(self) -> str | None:
         return self.refusal
@@ -36,6 +40,9 @@ class AnyMachine:
 
     def interfaces(self) -> list[Interface]:
         return self.there
+
+    def open_channel(self, interface: str, channel: str) -> str | None:
+        return self.opening
 
     def realtime_priority(self) -> int:
         return self.priority
@@ -58,7 +65,7 @@ def needed(machine: AnyMachine, interface: str, *channels: str) -> list[str]:
     return [name for name, check in missing(machine, interface, *channels).items() if check.needed]
 
 
-@pytest.mark.parametrize(("interface", "channels"), [("embedded", ()), ("socketcan", ("vcan0",)), ("virtual", ("x",))])
+@pytest.mark.parametrize(("interface", "channels"), [("embedded", ()), ("socketcan", ("vcan0",)), ("pcan", ("x",))])
 def test_all_checks_pass_on_a_complete_machine(interface: str, channels: tuple[str, ...]) -> None:
     assert missing(AnyMachine(), interface, *channels) == {}
 
@@ -66,7 +73,7 @@ def test_all_checks_pass_on_a_complete_machine(interface: str, channels: tuple[s
 def test_a_kernel_without_can_fails_only_for_socketcan() -> None:
     bare = AnyMachine(refusal="Address family not supported by protocol", there=[])
     assert needed(bare, "embedded") == []
-    assert needed(bare, "virtual", "x") == []
+    assert needed(bare, "pcan", "x") == []
     assert needed(bare, "socketcan", "vcan0") == ["AF_CAN", "vcan", "vcan0"]
     assert needed(bare, "socketcan", "can0") == ["AF_CAN", "can0"]
     assert "modprobe can-raw" in missing(bare, "socketcan", "can0")["AF_CAN"].fix
@@ -116,10 +123,20 @@ def test_pybullet_is_required_for_embedded_and_pinocchio_always() -> None:
     assert missing(machine, "embedded")["zenoh"].fix == "pip install 'atalante-hal[telemetry]'"
 
 
-def test_an_unknown_interface_fails_with_the_list_of_python_can() -> None:
+def test_an_unknown_interface_fails_with_the_list_of_usable_interfaces() -> None:
     found = missing(AnyMachine(), "pigeon", "x")
     assert found["python-can"].needed
-    assert "virtual" in found["python-can"].fix
+    assert "there is no CAN interface 'pigeon'" in found["python-can"].text
+    assert "socketcan" in found["python-can"].fix
+    assert "virtual" not in found["python-can"].fix
+
+
+@pytest.mark.parametrize("interface", ["pcan", "socketcan"])
+def test_a_channel_that_cannot_be_opened_fails_with_the_error_of_the_bus(interface: str) -> None:
+    found = missing(AnyMachine(opening="no such device"), interface, "vcan0")
+    assert list(found) == ["vcan0"]
+    assert found["vcan0"].needed
+    assert found["vcan0"].text == "no such device"
 
 
 def test_missing_realtime_limits_are_reported_but_not_required() -> None:
@@ -215,7 +232,8 @@ def test_the_exit_code_is_1_and_the_error_lists_failed_checks(bare: AnyMachine) 
 
 def test_json_prints_one_check_per_line(bare: AnyMachine) -> None:
     result = CliRunner().invoke(cli, ["doctor", "-i", "socketcan", "-c", "vcan0", "--json"])
-    checks = [json.loads(line) for line in result.stdout.splitlines()]
+    *checks, last = [json.loads(line) for line in result.stdout.splitlines()]
+    assert last["known"]["can_fd"]
     assert {tuple(check) for check in checks} == {("name", "ok", "needed", "text", "fix")}
     assert [c["name"] for c in checks if c["needed"] and not c["ok"]] == ["AF_CAN", "vcan", "vcan0"]
     assert all(bool(c["fix"]) is not c["ok"] for c in checks)
@@ -225,3 +243,46 @@ def test_the_embedded_robot_has_no_channel() -> None:
     result = CliRunner().invoke(cli, ["doctor", "-c", "vcan0"])
     assert result.exit_code == 2
     assert "the embedded robot has no channel; to check vcan0, type -i socketcan -c vcan0" in result.stderr
+
+
+def opens(arguments: list[str]) -> bool:
+    """Return whether `atalante status` opens the bus. Without frames it then fails with code 1."""
+    result = CliRunner().invoke(cli, ["status", *arguments, "--for", "0.05"])
+    assert result.exit_code in (1, 2, 3), result.output
+    return result.exit_code == 1
+
+
+@pytest.mark.parametrize("interface", [*ADAPTERS, "pigeon"])
+def test_doctor_and_the_commands_agree_on_every_interface(interface: str) -> None:
+    """On this machine, without adapters; slcan and remote that open: see below."""
+    arguments = ["-i", interface, "-c", "0"]
+    result = CliRunner().invoke(cli, ["doctor", *arguments, "--json"])
+    *checks, last = map(json.loads, result.stdout.splitlines())
+    assert last["interface"] == interface
+    bus = [check["ok"] for check in checks if check["needed"] and check["name"] in ("python-can", "AF_CAN", "0")]
+    assert bus
+    assert all(bus) == opens(arguments)
+
+
+@pytest.mark.parametrize("reason", ["", "the driver is missing"])
+def test_doctor_and_the_commands_agree_on_a_channel(reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def bus(**options: object) -> object:
+        if reason:
+            raise can.CanInitializationError(reason)
+        return SimpleNamespace(protocol=can.CanProtocol.CAN_FD, recv=lambda timeout: None, shutdown=lambda: None)
+
+    monkeypatch.setattr(can, "Bus", bus)
+    arguments = ["-i", "kvaser", "-c", "0"]
+    result = CliRunner().invoke(cli, ["doctor", *arguments])
+    assert (result.exit_code == 0) == opens(arguments) == (not reason)
+    assert reason in result.stdout
+
+
+@pytest.mark.parametrize("interface", ADAPTERS)
+def test_the_facts_of_an_interface_are_printed(interface: str) -> None:
+    adapter, result = ADAPTERS[interface], CliRunner().invoke(cli, ["doctor", "-i", interface])
+    assert f"interface {interface}\n  CAN FD:     {'yes' if adapter.can_fd else 'no'}" in result.stdout
+    for text in (adapter.channel, adapter.install, adapter.note, adapter.tried, adapter.source):
+        assert text in result.stdout
+    for key, value in adapter.options:
+        assert f"    {key} = {value}\n" in result.stdout + "\n"

@@ -35,8 +35,9 @@ PATIENT = ("--mass", "75", "--height", "175")
         (["demo", *PATIENT, "--step-duration", "0"], "step duration must be"),
         (
             ["emulator", "-i", "virtual", "-c", "x"],
-            "virtual works inside one process only: use a CAN adapter, or Linux vcan",
+            "virtual works inside one process only: use a CAN FD adapter, or Linux vcan",
         ),
+        (["status", "-i", "gs_usb", "-c", "0"], "gs_usb supports classic CAN only in python-can"),
         (
             ["airwalk", "-i", "udp_multicast", "-c", "239.74.163.2"],
             "udp_multicast returns every sent frame to its sender",

@@ -1,12 +1,13 @@
 """Command `atalante doctor`: checks whether this computer is ready for a bus, and prints the commands that fix problems.
 
 Machine (commands/machine.py) -> examine -> CheckResult -> one line each, exit code
+interface -> Adapter (atalante_hal/bus/adapters.py) -> what is known of the interface
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import click
@@ -17,6 +18,7 @@ from atalante_tools.console.terminal import show_json
 from atalante_tools.session.body import engine_hint
 
 if TYPE_CHECKING:
+    from atalante_hal.bus.adapters import Adapter
     from atalante_tools.commands.machine import Interface, Machine
 
 #: Recommended length of a transmit queue [frames]. One cycle of all four buses sends 22 frames.
@@ -60,7 +62,7 @@ class CheckResult:
     default=EMBEDDED,
     show_default=True,
     metavar="NAME",
-    help="Interface to check: embedded, socketcan, or any other interface of python-can.",
+    help="Interface to check: embedded, socketcan, or another interface of python-can.",
 )
 @click.option(
     "-c",
@@ -73,11 +75,14 @@ class CheckResult:
 def command(interface: str, channel: str, as_json: bool) -> None:
     """Check whether this computer is ready, and print the commands that fix problems.
 
-    The exit code is 1 if the chosen interface requires something that is missing. The command changes nothing.
+    With -i, the command prints what is known of the interface: CAN FD, driver, form of the channel, bit timing, what was tried.
+    With -c, it opens the channels as every other command does, and closes them. It sends no frames and changes nothing.
+    The exit code is 1 if the chosen interface requires something that is missing.
 
     \b
     Example: atalante doctor
              atalante doctor -i socketcan -c vcan0
+             atalante doctor -i pcan
     """
     from atalante_tools.commands.machine import ThisMachine
 
@@ -87,6 +92,8 @@ def command(interface: str, channel: str, as_json: bool) -> None:
             show_json(asdict(check) | ({"fix": ""} if check.ok else {}))
         else:
             click.echo(line(check))
+    if interface != EMBEDDED:
+        _show_facts(interface, as_json)
     if missing := [check.name for check in checks if check.needed and not check.ok]:
         raise Failed(f"{interface} {channel}".rstrip() + f" is not ready: {', '.join(missing)}")
 
@@ -134,7 +141,7 @@ def examine(machine: Machine, interface: str, channels: Sequence[str]) -> Iterat
     yield from _packages(machine, interface)
     yield from _socketcan(machine, interface == "socketcan", channels)
     if interface not in (EMBEDDED, "socketcan"):
-        yield _python_can(interface)
+        yield from _python_can(machine, interface, channels)
     yield from _realtime(machine)
     for name, (purpose, package) in PROGRAMS.items():
         found = machine.program(name)
@@ -163,7 +170,10 @@ def _socketcan(machine: Machine, needed: bool, channels: Sequence[str]) -> Itera
     yield CheckResult("vcan", loaded, needed and wants_virtual, text, "modprobe vcan")
     present = {interface.name: interface for interface in machine.interfaces()} if supported else {}
     for name in dict.fromkeys([*channels, *present]) if needed or not channels else present:
-        yield _interface(name, present.get(name), needed and name in channels)
+        wanted = needed and name in channels
+        check = _interface(name, present.get(name), wanted)
+        error = machine.open_channel("socketcan", name) if wanted and check.ok else None
+        yield replace(check, ok=False, text=error) if error else check
     if not present and not channels:
         yield CheckResult("interfaces", False, needed, "there is no CAN interface", _create("vcan0"))
 
@@ -190,12 +200,58 @@ def _create(name: str) -> str:
     return f"ip link add {name} type vcan && ip link set {name} mtu {FD_MTU} txqueuelen {QUEUE} up"
 
 
-def _python_can(interface: str) -> CheckResult:
-    import can
+def _python_can(machine: Machine, interface: str, channels: Sequence[str]) -> Iterator[CheckResult]:
+    from atalante_hal.bus.adapters import ADAPTERS, refusal
 
-    known = interface in can.VALID_INTERFACES
-    text = f"python-can {'supports' if known else 'does not support'} {interface}"
-    return CheckResult("python-can", known, True, text, f"choose one of {', '.join(sorted(can.VALID_INTERFACES))}")
+    refused = refusal(interface)
+    adapter = ADAPTERS.get(interface)
+    install = adapter.install if adapter else ""
+    fix = install if install.startswith("pip ") else ""
+    usable = ", ".join(name for name in sorted(ADAPTERS) if not refusal(name))
+    text = refused or (f"{interface} supports CAN FD" if adapter else f"{interface} is an interface of a plug-in")
+    yield CheckResult("python-can", not refused, True, text, f"choose one of {usable}")
+    for channel in channels if not refused else ():
+        error = machine.open_channel(interface, channel)
+        yield CheckResult(channel, error is None, True, error or "opened for CAN FD", fix)
+
+
+def facts(adapter: Adapter) -> str:
+    """Return what is known of an interface as text for the terminal.
+
+    Args:
+        adapter: Facts about the interface.
+    """
+    rows = [
+        ("CAN FD", "yes" if adapter.can_fd else "no: it cannot be used"),
+        ("install", adapter.install or "nothing beside python-can"),
+        ("channel", adapter.channel),
+        ("bit timing", adapter.setup or ("see below" if adapter.options else "none to set")),
+        ("timestamps", adapter.stamps),
+        ("note", adapter.note),
+        ("tried", adapter.tried),
+        ("source", adapter.source),
+    ]
+    if not adapter.can_fd:
+        rows = [row for row in rows if row[0] not in ("bit timing", "timestamps")]
+    lines = [f"\ninterface {adapter.name}", *(f"  {name + ':':<12}{text}" for name, text in rows if text)]
+    if adapter.options:
+        lines += [
+            "  ~/can.conf for 1 Mbit/s and 5 Mbit/s:",
+            *(f"    {line}" for line in adapter.configuration.splitlines()),
+        ]
+    return "\n".join(lines)
+
+
+def _show_facts(interface: str, as_json: bool) -> None:
+    from atalante_hal.bus.adapters import ADAPTERS
+
+    adapter = ADAPTERS.get(interface)
+    if as_json:
+        show_json({"interface": interface, "known": asdict(adapter) if adapter else None})
+    elif adapter:
+        click.echo(facts(adapter))
+    else:
+        click.echo(f"\ninterface {interface}: nothing is known of it")
 
 
 def _realtime(machine: Machine) -> Iterator[CheckResult]:

@@ -42,6 +42,14 @@ class Machine(Protocol):
     def interfaces(self) -> list[Interface]:
         """Return all CAN interfaces of the kernel."""
 
+    def open_channel(self, interface: str, channel: str) -> str | None:
+        """Open a channel as every command does, and close it. Return the error message, or None on success.
+
+        Args:
+            interface: Name of the interface in python-can.
+            channel: Name of the channel.
+        """
+
     def realtime_priority(self) -> int:
         """Return the highest SCHED_FIFO priority that this user may request. 0 means that no priority is allowed."""
 
@@ -91,6 +99,21 @@ class ThisMachine:
             virtual = not (entry / "device").exists()
             found.append(Interface(entry.name, virtual, bool(int(flags, 16) & _UP), int(mtu), int(queue)))
         return found
+
+    def open_channel(self, interface: str, channel: str) -> str | None:
+        """Open a channel with `open_bus` and close it. Return the error message, or None on success.
+
+        Args:
+            interface: Name of the interface in python-can.
+            channel: Name of the channel.
+        """
+        from atalante_hal.bus import BusError, open_bus
+
+        try:
+            open_bus(interface, channel).close()
+        except BusError as error:
+            return str(error)
+        return None
 
     def realtime_priority(self) -> int:
         """Return the limit RLIMIT_RTPRIO, or 99 if the process has CAP_SYS_NICE."""

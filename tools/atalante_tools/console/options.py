@@ -19,12 +19,6 @@ if TYPE_CHECKING:
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 EMBEDDED: Final = "embedded"
-#: Interfaces of python-can that cannot connect HAL and robot, each with the reason.
-NO_WIRE: Final = {
-    "virtual": "works inside one process only",
-    "udp_multicast": "returns every sent frame to its sender, which a HAL mistakes for a second HAL",
-}
-
 #: Option `--json`. JSON objects go to stdout, all other text goes to stderr.
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON objects on stdout, one per line.")
 
@@ -251,7 +245,7 @@ def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command]
             default=EMBEDDED if embedded else "socketcan",
             show_default=True,
             metavar="NAME",
-            help="CAN interface by its name in python-can, for example socketcan, pcan or kvaser."
+            help="CAN FD interface by its name in python-can, for example socketcan, pcan or kvaser; see atalante doctor -i NAME."
             + (" With embedded, the command itself emulates the robot." if embedded else ""),
         ),
         click.option(
@@ -277,6 +271,12 @@ def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command]
     return options_as("target", functools.partial(_target, embedded=embedded), options)
 
 
+def _refusal(interface: str) -> str:
+    from atalante_hal.bus.adapters import ADAPTERS, refusal
+
+    return refusal(interface) if interface in ADAPTERS else ""  # an unknown interface is an error of the open bus
+
+
 def _target(interface: str, channel: str, lockstep: bool | None = None, *, embedded: bool) -> Target:
     if interface == EMBEDDED:
         if not embedded:
@@ -287,10 +287,8 @@ def _target(interface: str, channel: str, lockstep: bool | None = None, *, embed
             raise click.UsageError(
                 f"the embedded robot has no channel; to use {channel}, type -i socketcan -c {channel}"
             )
-    elif interface in NO_WIRE:
-        raise click.UsageError(
-            f"{interface} {NO_WIRE[interface]}: use a CAN adapter, or Linux vcan (`atalante doctor -i socketcan -c vcan0`)"
-        )
+    elif refused := _refusal(interface):
+        raise click.UsageError(refused)
     elif not channel:
         raise click.UsageError(f"{interface} requires a channel: -c vcan0, or a channel map of the four buses")
     return Target(interface, channel, interface == EMBEDDED if lockstep is None else lockstep)
