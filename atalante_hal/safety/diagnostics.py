@@ -1,8 +1,8 @@
 """Table of the diagnostic trouble codes (DTCs), each with its reaction, severity and meaning.
 
 `message monitor and other checks -> fault memory -> state machine`: the checks raise codes, and the state machine acts on the
-worst reaction of the confirmed codes. A code is pending while the fault can be ridden through (a lost frame, a late cycle). It is
-confirmed when the fault exceeds its bound. Only a confirmed code causes a reaction. The fault matrix uses the same names.
+worst reaction of the confirmed codes. A code is pending while the fault can be tolerated (a lost frame, a late cycle). It is
+confirmed when the fault exceeds its limit. Only a confirmed code causes a reaction. The fault matrix uses the same names.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ class Dtc(StrEnum):
     EMCY_ENCODER = "EMCY_7xxx", _R.LOWER, _S.ERROR, "emergency of a node: encoder or another sensor"
     EMCY_COMMUNICATION = "EMCY_8xxx", _R.HOLD, _S.ERROR, "emergency of a node: communication"
     EMCY_OTHER = "EMCY_xxxx", _R.FAULT, _S.ERROR, "emergency of a node: anything else"
-    OVER_TEMP = "OVER_TEMP", _R.LOWER, _S.ERROR, "a drive is too hot to hold"
-    DERATED = "DERATED", _R.HOLD, _S.WARNING, "a hot drive has less torque; confirmed: far less than the other leg"
+    OVER_TEMP = "OVER_TEMP", _R.LOWER, _S.ERROR, "a drive is too hot to hold its position"
+    DERATED = "DERATED", _R.HOLD, _S.WARNING, "a hot drive has less torque; confirmed if far less than the other leg"
     UNDER_VOLTAGE = "UNDER_VOLTAGE", _R.HOLD, _S.ERROR, "the supply voltage is too low"
     SUPPLY_LOW = "SUPPLY_LOW", _R.FINISH_STEP, _S.WARNING, "the supply voltage is low"
     # Faults that drives report. A drive then holds its position without a command of the HAL.
@@ -96,7 +96,7 @@ class Dtc(StrEnum):
     IMU_SATURATED = "IMU_SATURATED", _R.FULL_ASSIST, _S.WARNING, "an IMU reading is at the end of its measuring range"
     IMU_STUCK = "IMU_STUCK", _R.FULL_ASSIST, _S.WARNING, "the gyro reading of an IMU does not change"
     FOOT_CELL = "FOOT_CELL", _R.FULL_ASSIST, _S.WARNING, "a force cell contradicts the other cells of its foot"
-    CONTACT_IMPLAUSIBLE = "CONTACT_IMPLAUSIBLE", _R.HOLD, _S.ERROR, "both feet report no load on the ground"
+    CONTACT_IMPLAUSIBLE = "CONTACT_IMPLAUSIBLE", _R.HOLD, _S.ERROR, "neither foot reports a load on the ground"
     # Bus.
     BUS_FLOOD = "BUS_FLOOD", _R.HOLD, _S.ERROR, "more frames arrived than the HAL reads in a cycle"
     BUS_OFF = "BUS_OFF", _R.HOLD, _S.ERROR, "the CAN controller is bus-off"
@@ -129,7 +129,7 @@ class Finding:
     node: str  # DBC name of the affected node
     value: float  # measured value; quantity and unit depend on the code
     confirmed: bool  # True: confirmed, its reaction follows; False: pending, no reaction yet
-    text: str  # one sentence for the operator; empty: node name and meaning of the code
+    text: str  # one sentence for the operator; if empty, node name and meaning of the code are used
 
 
 def number_of(bits: int) -> int:

@@ -81,7 +81,7 @@ class Entry:
 class FaultMemory:
     """Set of active diagnostics of all nodes.
 
-    Call `raise_dtc` for every diagnostic that holds in a cycle, then `close_cycle`, which ends every diagnostic that was not
+    Call `raise_dtc` for every fault that is present in a cycle, and then `close_cycle`. It ends every diagnostic that was not
     raised in this cycle. An event is logged when a diagnostic becomes active, and another one when it becomes confirmed.
     """
 
@@ -89,7 +89,7 @@ class FaultMemory:
         #: Logged events, in order of time.
         self.events = EventLog()
         self.active: dict[tuple[Dtc, str], Entry] = {}
-        #: Bit set of the pending and confirmed codes, as of the last `close_cycle`, see `diagnostics.dtcs_of`.
+        #: Bit set of the pending and confirmed codes, at the last `close_cycle`, see `diagnostics.dtcs_of`.
         self.bits = 0
         self.confirmed: frozenset[Dtc] = frozenset()
         self._logged_at: dict[tuple[Dtc, str, bool], int] = {}
@@ -104,7 +104,7 @@ class FaultMemory:
             dtc: diagnostic trouble code.
             node: DBC name of the affected node.
             value: measured value; quantity and unit depend on the code.
-            confirmed: True if the fault exceeds its bound, so that its reaction is due.
+            confirmed: True if the fault exceeds its limit, so that its reaction is due.
             text: one sentence for the operator; default: node name and meaning of the code.
         """
         entry = self.active.get((dtc, node))

@@ -23,7 +23,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: NMT states (CiA 301) of a node that has just started, and of a node in normal operation.
 BOOT_UP, OPERATIONAL = 0, 5
-#: Largest `Check` whose data is new. It is a plain integer because numpy compares that ten times faster.
+#: Largest `Check` result of a frame with new data. It is a plain integer, because numpy compares integers ten times faster.
 _FRESH = int(Check.SOME_LOST)
 
 
@@ -31,7 +31,7 @@ class _Status(NamedTuple):
     node: str
     drive: bool  # True if the node is powered by the motor supply
     row: int  # row of the status message in the process image
-    timeout: int  # cycles
+    timeout: int  # timeout of the status message [cycles]
     state: int  # index of NodeState in the values of the process image
     dbc_hash: int  # index of DbcHash in the same values
     supply: int  # index of SupplyVoltage in the same values
@@ -71,14 +71,14 @@ class Heartbeats:
         }
         self._status_of = {codec.messages[s.row].frame_id: s for s in self._statuses}
         self._amplitude, self._amplitude_row = codec.slice("Amplitude"), codec.rows["HAPTICS_STATE"]
-        self._seen = 0  # cycle up to which the ages of the process image are counted
-        #: Node -> diagnostic and error code of its last emergency, until the error is cleared.
+        self._seen = 0  # last cycle that the ages in the process image include
+        #: Node -> diagnostic and error code of its active emergency. The entry is removed when the error is cleared.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
-        #: Emergencies since the last `judge` whose reaction is INFO: node, diagnostic, error code.
+        #: Emergencies with the reaction INFO since the last `judge`: node, diagnostic, error code.
         self._notices: list[tuple[str, Dtc, int]] = []
         self._reset: set[str] = set()  # nodes that restarted since the last `judge`
-        #: Row -> evidence of two senders, 1 to `FULL`, updated with each frame. Rows without evidence may be missing.
+        #: Row of a message -> evidence that the message has two senders, 0 to `FULL`. A missing row has no evidence.
         self._evidence: dict[int, int] = {}
         #: Nodes that sent a boot-up message. The safety monitor clears this set after it has used it.
         self.booted: set[str] = set()
@@ -87,7 +87,7 @@ class Heartbeats:
         self.quiet = True
 
     def accept(self, frames: Frames, cycle: int, vibration: Vector) -> list[int]:
-        """Process the frames of a cycle that are not in the fast process image, one by one and in order.
+        """Process the received frames that do not belong to the fast process image, one by one and in order.
 
         Args:
             frames: received frames, shape (n,).
@@ -145,13 +145,13 @@ class Heartbeats:
             self._judge_status(cycle, memory, status)
 
     def overdue(self, cycle: int) -> bool:
-        """Return whether a status message timed out; call it periodically, because a lost message triggers no other check."""
+        """Return whether a status message timed out. Call this periodically, because `judge` is skipped while all is well."""
         self._age(cycle)
         ages = self.image.age[self._status_rows]
         return bool(((ages >= self._timeouts) & (ages < NEVER)).any())
 
     def acknowledge(self, still_faulty: set[str]) -> None:
-        """Clear the emergencies of all nodes except the drives that are still in FAULT; called when the operator presses START.
+        """Clear the emergencies of all nodes except the drives that are still in FAULT. Call this when START is pressed.
 
         Args:
             still_faulty: DBC names of the drives that are still in FAULT.
@@ -161,7 +161,7 @@ class Heartbeats:
     def explains_fault(self, node: str) -> bool:
         """Return whether an emergency explains the drive state FAULT of a node in this cycle.
 
-        The emergency is active, or it was cleared in this cycle, in which the state frame may still report FAULT.
+        An emergency that was cleared in this cycle also counts, because the state frame of this cycle may still report FAULT.
 
         Args:
             node: DBC name of the drive.
@@ -184,13 +184,13 @@ class Heartbeats:
             self._seen = cycle
 
     def _suspect(self, row: int, *, rival: bool) -> None:
-        """Update the evidence of two senders of a row with one more frame.
+        """Update the evidence that a message has two senders, after each of its frames.
 
         A restarted sender can repeat the last counter once. Two senders repeat it often.
 
         Args:
             row: row of the frame in the process image.
-            rival: True if the frame has the last counter but other bytes.
+            rival: True if the frame has the same counter as the previous frame, but other bytes.
         """
         before = self._evidence.get(row, 0)
         if rival or before:

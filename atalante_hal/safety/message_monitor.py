@@ -10,8 +10,8 @@ Two senders of one message are detected by a second intact frame in the same cyc
 accepted frame and other bytes, or a counter out of sequence. Four such cycles in a row confirm the diagnostic, and the message
 loses its trust.
 
-In single support it is safer to finish the step than to stop. If a joint of the swing leg times out, the step is finished first.
-If no message has arrived after twice the timeout, 10 cycles, the robot goes to HOLD as for any other joint.
+In single support it is safer to finish the walking step than to stop. So if a joint of the swing leg times out, the robot first
+finishes the step. If no message has arrived after twice the timeout (10 cycles), the robot goes to HOLD as for any other joint.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
 #: Check results of rejected frames that have the correct format and CRC.
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)
 _FRESH = int(Check.SOME_LOST)
-#: Age of the data of a swing leg joint at which the robot goes to HOLD, in multiples of the message timeout.
+#: The robot goes to HOLD when the data of a swing leg joint is this many timeouts old.
 SWING_TIMEOUTS = 2
 
 
@@ -76,7 +76,7 @@ class MessageMonitor:
         self._confirms = [kind != "pendant" for kind in kinds]
         self._needed = [row for row, kind in enumerate(kinds) if kind != "pendant"]
         self.qualification = [Qualification()] * len(messages)
-        #: Evidence that each row has two senders, 0 to `FULL`.
+        #: For each row: evidence that its message has two senders, 0 to `FULL`.
         self._evidence = [0] * len(messages)
         #: True for each row that was trusted at least once. Other rows may belong to nodes that are not connected.
         self._known = [False] * len(messages)
@@ -88,7 +88,7 @@ class MessageMonitor:
 
     @property
     def nodes_well(self) -> bool:
-        """Return whether every message is trusted, without regard to the pendant."""
+        """Return whether every message except the pendant message is trusted."""
         return all(self.qualification[row].trusted for row in self._needed)
 
     def trusts(self, row: int) -> bool:
@@ -125,7 +125,7 @@ class MessageMonitor:
         self.settled = image.all_fresh and not any(self._evidence) and all(q is SETTLED for q in self.qualification)
 
     def _judge_senders(self, cycle: int, memory: FaultMemory, row: int, rival: bool) -> bool:
-        """Update the evidence that a row has two senders, and return whether two senders are confirmed.
+        """Update the evidence that a message has two senders, and return whether two senders are confirmed.
 
         Args:
             cycle: number of the current cycle.
@@ -184,7 +184,7 @@ class MessageMonitor:
 def rivals_of(refused: Sequence[tuple[int, Check]], checks: Sequence[int]) -> frozenset[int]:
     """Return the rows with evidence of a second sender in this cycle.
 
-    The row has at least two intact frames in this cycle, and they cannot be from one sender.
+    Each of these rows received at least two intact frames in this cycle that cannot be from the same sender.
 
     Args:
         refused: row and check result of each rejected frame.
@@ -192,7 +192,7 @@ def rivals_of(refused: Sequence[tuple[int, Check]], checks: Sequence[int]) -> fr
     """
     intact = Counter(row for row, result in refused if result in _INTACT)
     for row in intact:
-        intact[row] += checks[row] <= _FRESH or checks[row] == Check.IMPLAUSIBLE  # committed first
+        intact[row] += checks[row] <= _FRESH or checks[row] == Check.IMPLAUSIBLE  # the committed frame counts as well
     return frozenset(row for row, result in refused if result in _RIVAL and intact[row] > 1)
 
 

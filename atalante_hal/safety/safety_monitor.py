@@ -2,8 +2,9 @@
 
     process image, heartbeats, bus faults, plausibility, loop, controller -> fault memory -> state machine -> verdict
 
-The HAL transfers the data of each cycle and acts on the verdict of the safety monitor, which sends nothing itself. The evaluation
-is skipped in a perfect cycle in which all its inputs are the same as before, because its result could not change.
+The HAL transfers the data of each cycle and acts on the verdict. The safety monitor itself sends nothing. The evaluation is
+skipped in a cycle without a fault in which the pendant and the drives report the same values as before, because the result could
+not change.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Maximum duration of FINISH_STEP [cycles]; longer than a step.
+#: Maximum duration of FINISH_STEP [cycles]; longer than a walking step.
 FINISH_STEP_CYCLES = 2000
 
 #: DBC names of the drives, in joint order.
@@ -58,7 +59,7 @@ class SafetyMonitor:
     Attributes:
         reason: reason for the present state, one sentence for the operator.
         moving: True if the controller's torques are sent to the drives.
-        step: step number reported by the controller; None if the controller does not walk.
+        step: number of the walking step, reported by the controller; None if the controller does not walk.
         start_wanted: cycles left in which a pressed START can change the state; 0 if no START is being processed.
         enabling: True while drives are being enabled; a drive that is already enabled receives torque.
         lowered: DBC names of the drives that cannot hold and are being lowered.
@@ -104,10 +105,10 @@ class SafetyMonitor:
         self._reports: list[Finding] = []  # faults that loop and controller reported since the last `judge`
         self._acknowledged = False  # True if START was pressed in this cycle
         self._ending = False
-        self._barred = False  # True if another HAL was detected in OFF or READY
+        self._barred = False  # True if another HAL was detected while this HAL was in OFF or READY
         self._assistance_factor = state.assistance_factor  # assistance factor set by the operator
         self._leading = False  # True while the assistance factor ramps to 1 or back
-        #: Step when FINISH_STEP began, and cycle in which FINISH_STEP ends at the latest.
+        #: Number of the walking step in which FINISH_STEP began, and latest end of FINISH_STEP [cycle number].
         self._finish: tuple[int | None, int] = None, 0
         self._drives_judged = b""  # drive states and temperatures of the last evaluation
 
@@ -170,7 +171,7 @@ class SafetyMonitor:
         self._ending, self._steady = True, False
 
     def look_for_heartbeats(self) -> None:
-        """Check for status messages that timed out; call it periodically, because a lost message triggers no other check."""
+        """Check for status messages that timed out. Call this periodically, because cycles without a fault are not evaluated."""
         if self._heartbeats.overdue(self._state.cycle):
             self._steady = False
 
@@ -199,7 +200,9 @@ class SafetyMonitor:
         nodes_well = message_monitor.nodes_well and self._heartbeats.known
         self._judge_drives(nodes_well)
         if self._barred:
-            memory.raise_dtc(cycle, Dtc.HAL_DUPLICATE, "HAL", text="another HAL was there first: end one, start again")
+            memory.raise_dtc(
+                cycle, Dtc.HAL_DUPLICATE, "HAL", text="another HAL sends on this bus: end one, start again"
+            )
         row = pendant.row
         pendant.hear(message_monitor.trusts(row), qualifying=message_monitor.hears(row), beside=self._image.beside(row))
         memory.close_cycle(cycle)
@@ -333,7 +336,7 @@ class SafetyMonitor:
         self.memory.events.append(Event(state.cycle, after.name, text, severity, value=after))
 
     def _lead_assistance(self) -> None:
-        """Set the assistance factor: the operator's value, or a ramp to 1 in FULL_ASSIST and FINISH_STEP and back."""
+        """Set the assistance factor to the operator's value, or ramp it to 1 in FULL_ASSIST and FINISH_STEP, and back after."""
         state, wanted = self._state, self._pendant.assistance_factor
         if wanted is not None:
             self._assistance_factor = wanted

@@ -23,7 +23,7 @@ ENABLE_CYCLES = 200
 #: Prefix of the text of a refused START.
 REFUSED = "START refused: "
 _S = SupervisorState
-#: States in which START only acknowledges faults, which may take some cycles to clear.
+#: States in which START only acknowledges faults. An acknowledged fault may take some cycles to clear.
 _ACKNOWLEDGING = (_S.LOWER, _S.FAULT)
 #: States in which START enables the drives.
 _ENABLING = (_S.READY, _S.HOLD)
@@ -49,7 +49,7 @@ class StartRequest(NamedTuple):
 
     supervisor: SupervisorState  # state of the state machine
     pressed: bool  # True in the cycle in which START is pressed, False while the drives are being enabled
-    cycles_left: int  # cycles left in which the drives must be enabled
+    cycles_left: int  # remaining cycles until all drives must be enabled
     ending: bool  # True if the program is ending
     stop_requested: bool  # True if the operator requests STOP or HOLD
     dead_man: bool  # True if the dead-man is pressed and the pendant has not timed out
@@ -90,7 +90,7 @@ def refusal(robot: Robot, request: StartRequest) -> Refusal | None:
 
 
 def _reason(request: StartRequest) -> str:
-    """Return why the drives must not be enabled further, apart from their torques; empty if they may."""
+    """Return why the start must end, without a check of the drive torques; empty if the start may continue."""
     if request.ending:
         return "the program is ending"
     if request.stop_requested or not request.dead_man:
@@ -108,7 +108,7 @@ def missing_text(missing: Collection[str]) -> str:
     Args:
         missing: DBC names of the nodes that are not well.
     """
-    return f"not heard or not trusted yet: {', '.join(sorted(missing))}"
+    return f"no answer or not trusted yet: {', '.join(sorted(missing))}"
 
 
 def entry_text(state: SupervisorState, missing: Collection[str]) -> str:
@@ -154,5 +154,5 @@ def implausible_torque(robot: Robot, drive_state: Vector, torque: Vector) -> str
         return None
     joint = int(wrong[0])
     state = _NAMES.get(float(drive_state[joint]), f"state {drive_state[joint]:g}")
-    limit = f"its limit of {robot.torque_max[joint]:.0f} Nm" if on[joint] else f"{idle:g} Nm, it makes no torque"
+    limit = f"its limit of {robot.torque_max[joint]:.0f} Nm" if on[joint] else f"{idle:g} Nm, because it is not enabled"
     return f"the drive of {JOINTS[joint]} reports {torque[joint]:.0f} Nm in {state}; must be within {limit}"

@@ -8,8 +8,9 @@ drive has restarted, see `reference`.
 *Range.* A joint must be within its position limits, extended by `position_tolerance`.
 
 *Velocity.* The mean reported velocity between two samples, by the trapezoidal rule, must match the change of the encoder
-position. The low-pass filter of the drive lets them differ for a few cycles, but not for fifty. The time of a sample is the cycle
-in which it was measured. So a late or lost frame changes only the interval between two samples, and not the result.
+position. Because of the low-pass filter of the drive they may differ for a few cycles, but not for `VELOCITY_SAMPLES` samples in
+a row. The time of a sample is the cycle in which it was measured. So a late or lost frame changes the interval between two
+samples, but not the result of the comparison.
 """
 
 from __future__ import annotations
@@ -69,12 +70,12 @@ class EncoderChecks:
         )
         self._polarity = robot.polarity.tolist()
         self._period, self._every = period, every
-        # Twice the velocity error is a linear function of both samples. These are its coefficients.
+        # Twice the deviation of the velocity is a linear function of two consecutive samples. These are its coefficients.
         time = every * period
         self._of_later, self._of_earlier = np.array([[-2.0 / time, 1.0], [2.0 / time, 1.0]])
         self._earlier = np.zeros((2, len(JOINTS)))  # position [rad] and velocity [rad/s] of the last sample
         self._no_age = np.zeros(len(JOINTS), np.int64)
-        self._earlier_age: Cycles = np.full(len(JOINTS), NEVER)  # age at the last sample
+        self._earlier_age: Cycles = np.full(len(JOINTS), NEVER)  # age of the values of each joint at the last sample
         self._twice_allowed = 2.0 * robot.sensors.velocity_error * robot.gear
         self._wrong = [0] * len(JOINTS)
         self._wrong_findings: tuple[Finding, ...] = ()
@@ -83,7 +84,7 @@ class EncoderChecks:
         self.within_reach()  # compile the function before the first cycle
 
     def within_reach(self) -> bool:
-        """Return whether each joint is in its range and moved at most as far as possible in one cycle."""
+        """Return whether every joint is in its range and moved by no more than is possible in one cycle."""
         ranges = self._low, self._high
         return not self.outside and self._within_reach(self._now.position, self._before.position, self._reach, *ranges)
 
@@ -98,7 +99,7 @@ class EncoderChecks:
         travel, noise = float(self._travel[joint]), float(self._noise[joint])
         confirmed = self.jumps[joint] >= JUMPS_TO_CONFIRM
         moved = abs(now - before)
-        good = not confirmed and not moved > cycles * travel + noise  # accepts NaN: there is no previous value
+        good = not confirmed and not moved > cycles * travel + noise  # NaN passes: there is no previous value yet
         if not good:
             lost = self._lost[joint] = followed(
                 self._lost.get(joint, Lost(before, 0, before)), now, cycles, travel, noise
@@ -115,7 +116,7 @@ class EncoderChecks:
         return False
 
     def reference(self, joint: int) -> None:
-        """Clear the jumps of a joint. Its encoder is used again from the next value on.
+        """Reset the jump count of a joint, so that its encoder is used again from the next value on.
 
         Args:
             joint: index of the joint in JOINTS.
@@ -153,14 +154,14 @@ class EncoderChecks:
         return bool(self._wrong_findings)
 
     def _error_between(self, age: Cycles) -> tuple[Vector, list[bool]]:
-        """Return twice the velocity error of each joint, and whether each joint is compared.
+        """Return twice the deviation of each velocity from the encoder motion, and whether each joint is compared.
 
         Args:
             age: age of the values of each joint [cycles], shape (12,).
 
         Returns:
-            Twice the velocity error [rad/s, motor side], 0 for a joint that is not compared, shape (12,); and whether each joint
-            is compared, length 12.
+            Twice the deviation [rad/s, motor side], 0 for a joint that is not compared, shape (12,); and whether each joint is
+            compared, length 12.
         """
         motion, earlier = self._now.motion, self._earlier
         cycles = self._every + self._earlier_age - age
@@ -173,9 +174,9 @@ class EncoderChecks:
         """Count the consecutive wrong velocities of each joint, and update the findings.
 
         Args:
-            error: twice the velocity error of each joint [rad/s, motor side].
-            right: whether the error of each joint is within its limit.
-            compared: whether each joint was compared; a joint that was not compared keeps its count. None: all were compared.
+            error: twice the deviation of the velocity of each joint [rad/s, motor side].
+            right: whether the deviation of each joint is within its limit.
+            compared: whether each joint was compared; None if all were. A joint that was not compared keeps its count.
         """
         self._wrong = [
             wrong if compared is not None and not compared[joint] else 0 if right[joint] else wrong + 1
@@ -229,7 +230,7 @@ def followed(lost: Lost, now: float, cycles: int, travel: float, noise: float) -
         now: received position [rad].
         cycles: time from the last good position to the received one [cycles].
         travel: largest motion of the joint in one cycle [rad].
-        noise: noise bound of the encoder [rad].
+        noise: largest change of the position due to encoder noise [rad].
     """
     step = now - lost.last
     jumped = abs(step) > (cycles - lost.cycles) * travel + noise

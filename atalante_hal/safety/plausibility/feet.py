@@ -5,7 +5,8 @@ is free while the other three carry load, for longer than the foot can rock. A c
 `stillness`.
 
 *Contact.* Walking has no flight phase. So a robot that stood on the ground cannot swing both feet. Both feet may swing if the
-robot is suspended from the start, or after it has been lifted for `LIFTED_CYCLES`, which requires a new START.
+robot has been suspended since the program began, or after it has been lifted for `LIFTED_CYCLES`. A robot that was lifted is in
+HOLD and requires a new START.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ class FootChecks:
         """Check the vertical forces of both feet.
 
         Args:
-            updated: whether the left and the right foot have new values since the last call. Only then their cells are checked.
+            updated: whether the left and the right foot have new values since the last call. The cells of a foot are checked
+                only if it has new values.
 
         Returns:
             Whether a cell or the ground contact is implausible.

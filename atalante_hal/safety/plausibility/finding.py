@@ -48,10 +48,12 @@ class Ages(NamedTuple):
 
 
 class Rows:
-    """Rows of the sensor messages in the process image.
+    """Rows and timeouts of the sensor messages in the process image.
+
+    A check uses only values that are younger than the timeout of their message.
 
     Args:
-        codec: codec of the process image. Values are compared only if they are younger than the timeout of their message.
+        codec: codec of the process image.
     """
 
     def __init__(self, codec: Codec) -> None:

@@ -31,9 +31,9 @@ class Imus:
         self._now = now
         self._gyro_end, self._accel_end = (_end_of_range(codec, signal) for signal in ("GyroX", "AccelX"))
         self._norm_error = robot.sensors.quaternion_error
-        #: IMU index -> norm of the quaternion of each IMU without unit norm.
+        #: IMU index -> norm of its quaternion, for each IMU with a quaternion without unit norm.
         self.no_attitude: dict[int, float] = {}
-        #: IMU index -> largest reading [rad/s or m/s2] of each saturated IMU.
+        #: IMU index -> largest reading [rad/s or m/s2], for each saturated IMU.
         self.saturated: dict[int, float] = {}
         self._confirmed: dict[int, bool] = {}
         self._usable = compiled(usable)
@@ -91,7 +91,7 @@ def usable(
         quaternion: attitude of each IMU, shape (4, 4), wxyz.
         gyro: angular velocity of each IMU, shape (4, 3) [rad/s].
         accel: specific force at each IMU, shape (4, 3) [m/s2].
-        norm_error: tolerance of the squared norm of a quaternion around 1.
+        norm_error: largest deviation of the squared norm of a quaternion from 1.
         gyro_end: angular velocity from which a gyro counts as saturated [rad/s].
         accel_end: specific force from which an accelerometer counts as saturated [m/s2].
     """
@@ -115,7 +115,7 @@ def largest(readings: Vector) -> float:
 
 
 def _end_of_range(codec: Codec, name: str) -> float:
-    """Return the reading from which an IMU signal counts as saturated: half a step below its maximum."""
+    """Return the reading from which an IMU signal counts as saturated: its maximum minus half its resolution."""
     signal = next(signal for _, signal in codec.signals if signal.name == name)
     return signal.maximum - 0.5 * signal.factor
 

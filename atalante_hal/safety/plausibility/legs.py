@@ -4,20 +4,20 @@ The joints FH, TH, SH and SK of a leg lie between the pelvis IMU and the tibia I
 So the attitude of the tibia relative to the pelvis is Rx(FH) Rz(TH) Ry(SH + SK). The two IMUs give these three angles, and the
 four encoders must agree with them.
 
-*Drift.* An encoder that drifts at rate d is detected after the time attitude_error / d plus `DRIFT_SAMPLES` samples: within 1000
-cycles above 0.035 rad/s, later below. Some drifts cannot be detected or separated. SA and HA have no IMU beyond them, so their
-drift is not detected. SH and SK that drift in opposite directions are not detected, and a drift of SH cannot be separated from
-a drift of SK. An IMU that drifts has the same effect as an encoder that drifts. The heading of a healthy IMU drifts as well,
-which affects only TH.
+*Drift.* An encoder that drifts at rate d is detected after the time attitude_error / d plus `DRIFT_SAMPLES` samples. A drift of
+more than 0.035 rad/s is detected within 1000 cycles, and a slower drift takes longer. Some drifts cannot be detected or
+separated. The foot has no IMU, so a drift of SA or HA is not detected. Opposite drifts of SH and SK cancel and are not detected,
+and a drift of SH cannot be separated from a drift of SK. A drift of an IMU has the same effect as a drift of an encoder. The
+heading of an IMU without a fault also drifts, but this affects only TH.
 
 *Standstill.* While the reading of an encoder is constant, the difference between encoders and IMUs about its axis is also
 constant if the joint is at rest. If the joint moves, the difference changes by its motion. The check uses this change, so that a
-stuck encoder is detected long before the difference reaches `attitude_error`. The threshold includes the effect of an IMU that is
-not mounted straight (`misalignment`) when the leg turns about another axis. If the readings of SH and SK are both constant, both
+stuck encoder is detected long before the difference reaches `attitude_error`. The threshold also covers the effect
+of a misaligned IMU (`misalignment`) while the leg turns about another axis. If the readings of SH and SK are both constant, both
 are reported. Unlike `stillness`, this check needs no torque, so it also covers a joint that is moved by its neighbours.
 
-*Age.* Values from earlier cycles are extrapolated to this cycle with the velocity reported with them. The thresholds are extended
-by `velocity_error` for that time.
+*Age.* Values from earlier cycles are extrapolated to this cycle with the velocity of the same message. The thresholds are
+extended by `velocity_error` times the age of the values.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from atalante_hal.wire.process_image import NEVER
 DRIFT_SAMPLES = 4
 #: Number of consecutive samples after which a stuck encoder is reported.
 STANDSTILL_SAMPLES = 2
-#: Largest change per sample of an encoder error that counts as IMU drift [rad]. Healthy IMUs drift less than a tenth of this.
+#: Drift of the IMUs that the standstill check tolerates per sample [rad]. IMUs without a fault drift less than a tenth of this.
 _IMU_DRIFT = 2e-5
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
@@ -53,7 +53,7 @@ class _Comparison(NamedTuple):
 
     angles: tuple[float, float, float]  # angles FH, TH, SH + SK from the IMUs [rad]
     errors: tuple[float, float, float]  # encoder angles minus `angles` [rad]
-    doubt: float = 0.0  # uncertainty of the errors if the values are from different cycles [rad]
+    doubt: float = 0.0  # uncertainty of `errors` if the values are from different cycles [rad]
 
 
 class Legs:
@@ -155,7 +155,7 @@ class Legs:
                 continue
             change = comparison.errors[axis] - moved.errors[axis]
             turned = max(abs(angle - moved.angles[i]) for i, angle in enumerate(comparison.angles))
-            # Without a rotation of the leg, a change of the error comes from an earlier jump or drift.
+            # If the leg has not turned, the error changed because of a jump or drift, and not because the encoder is stuck.
             allowed = self._attitude_change + self._misalignment * turned + comparison.doubt + moved.doubt
             if min(abs(change), turned) <= allowed:
                 self._turned[joint] = 0
@@ -175,8 +175,8 @@ def hip_angles(pelvis: list[float], tibia: list[float]) -> tuple[float, float, f
     """Return the angles FH, TH and SH + SK of the rotation Rx Rz Ry from the tibia frame to the pelvis frame [rad].
 
     Args:
-        pelvis: attitude of the pelvis IMU, quaternion wxyz, sensor to world, of unit norm within the resolution of the wire.
-        tibia: attitude of the tibia IMU, as for `pelvis`.
+        pelvis: attitude of the pelvis IMU, quaternion wxyz, sensor to world, of unit norm within the resolution of its signals.
+        tibia: attitude of the tibia IMU, in the same form.
     """
     # Relative attitude: conj(pelvis) * tibia.
     a, b, c, d = pelvis
@@ -214,7 +214,7 @@ def extrapolated(quaternion: list[float], gyro: list[float], time: float) -> lis
 
 
 def _follow_imu_drift(moved: _Comparison, axis: int, change: float) -> _Comparison:
-    """Move the error of one axis towards its present value, by at most `_IMU_DRIFT`."""
+    """Return a copy of `moved` in which the error of one axis is adjusted by `change`, limited to +-`_IMU_DRIFT`."""
     errors = list(moved.errors)
     errors[axis] += max(-_IMU_DRIFT, min(_IMU_DRIFT, change))
     return moved._replace(errors=(errors[0], errors[1], errors[2]))

@@ -3,8 +3,8 @@
     process image -> one slow check in turn (standstill, velocity, feet, legs, monitor of checks that lack data) -> jump, range,
     IMUs -> state
 
-In a plausible cycle only the encoders and the IMUs are checked, and the slow checks take turns. The new values of a message that
-fails a check are rejected: the message keeps its previous values, and their age grows. Each check uses only the messages it
+Each cycle checks the encoders and the IMUs, and runs at most one slow check. If the new values of a joint or an IMU fail their
+check, they are rejected: the message keeps its previous values, and their age grows. Each check uses only the messages it
 needs, with the ages of their values. So a fault of one message does not disable a check of another message.
 """
 
@@ -191,7 +191,7 @@ class Plausibility:
             self._force[cell] = 0.0
 
     def _restore_cells(self) -> None:
-        """Restore the measured forces of faulty cells, because the checks of a foot without new values need them."""
+        """Restore the measured forces of the faulty cells of each foot without new values, because its checks need them."""
         for (foot, cell), force in self._measured_forces.items():
             if self._image.check[self._rows.foot[foot]] > _FRESH:
                 self._force[foot, cell] = force

@@ -1,12 +1,12 @@
 """Standstill checks, which detect stuck encoders, and gyros or force cells without noise.
 
-All signals are sampled every few cycles, and samples in a row with exactly the same value are counted. A sample that was not
-measured after the last one is ignored.
+All signals are sampled every few cycles, and consecutive samples with exactly the same value are counted. A signal is
+skipped if it was not measured again since its last sample.
 
 The reading of an encoder may be constant because the joint is at rest. An encoder is stuck only under two conditions. First, the
 torque of the drive has varied by at least `breakaway` since the reading last changed; this is more than twice the dry friction of
 the joint. Second, the joint is not at its end stop, which holds it against any torque. A stuck encoder of a joint without torque
-is not detected here until the joint is driven. The module `legs` also detects some of these with the IMUs.
+is not detected here until the joint is driven. The module `legs` detects some of these encoders with the IMUs.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 STUCK_CYCLES = 50
 #: Longest time to detect a frozen gyro or force cell, from the first repeated sample [cycles].
 FROZEN_CYCLES = 100
-#: Largest distance from a position limit at which a joint counts as at its end stop [rad].
+#: A joint counts as being at its end stop if it is closer than this distance to a position limit [rad].
 _AT_STOP = 0.005
 _NEVER = 1 << 30
 
@@ -90,7 +90,7 @@ class Stillness:
             whole: True if the values of all rows are of this cycle. If False, the ages in the process image are used.
 
         Returns:
-            Whether any signal has repeated its value for too long; an encoder must pass further checks to be a finding.
+            Whether any signal has been constant for too long. For an encoder this alone is not a finding yet.
         """
         same, repeats = self._same, self._repeats
         np.equal(self._values, self._sampled, same)
@@ -113,7 +113,7 @@ class Stillness:
         return over
 
     def _newer(self) -> npt.NDArray[np.bool_]:
-        """Return for each measured value whether it is newer than its last sample."""
+        """Update the ages of the last samples, and return for each value whether it was measured after its last sample."""
         self._sampled_age += self._every
         newer = self._age < self._sampled_age
         np.copyto(self._sampled_age, self._age, where=newer)

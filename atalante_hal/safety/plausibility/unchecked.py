@@ -51,8 +51,8 @@ class Unchecked:
     def judge(self, age: Cycles | None) -> bool:
         """Update the time for which each check could not run.
 
-        The time of a check grows if one of its rows has data without usable values. It is kept if one of its rows timed out
-        without such data. Otherwise it is reset.
+        The time of a check grows if one of its messages arrives, but without usable values. If one of its messages timed out for
+        another reason, the time does not change. Otherwise it is reset.
 
         Args:
             age: age of each row of the process image [cycles], shape (rows,). A row with an age of `NEVER` or more never had

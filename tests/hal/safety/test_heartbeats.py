@@ -170,7 +170,7 @@ def test_emergency_lasts_until_the_node_clears_it(well: Nodes):
         assert well.judge() == {("OVER_TEMP", "LEFT_SK"): True}
         assert well.heartbeats.quiet is False
         well.now += 1
-    assert well.memory.events[0].text == "LEFT_SK: a drive is too hot to hold (emergency 0x4310)"
+    assert well.memory.events[0].text == "LEFT_SK: a drive is too hot to hold its position (emergency 0x4310)"
     assert well.memory.events[0].value == 0x4310
     well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0))
     assert well.judge() == {}

@@ -546,7 +546,7 @@ def test_missing_node_refuses_the_start_in_hold_with_the_reason(make_rig):
     rig.run(2)
     rig.operator.start()
     rig.run(2)
-    assert rig.hal.reason == "START refused: not heard or not trusted yet: LEFT_SK"
+    assert rig.hal.reason == "START refused: no answer or not trusted yet: LEFT_SK"
     assert rig.run(ENABLE_CYCLES + 50).supervisor is S.HOLD
     rig.operator.start()
     assert rig.until(S.ACTIVE, 20).supervisor is S.ACTIVE

@@ -32,7 +32,7 @@ def test_permitted_torque_depends_on_the_drive_state(state: DriveState, joint: i
     torque[joint] = sign * np.nextafter(most, np.inf)
     why = implausible_torque(ROBOT, states, torque)
     assert why is not None
-    limit = f"its limit of {ROBOT.torque_max[joint]:.0f} Nm" if on else "2 Nm, it makes no torque"
+    limit = f"its limit of {ROBOT.torque_max[joint]:.0f} Nm" if on else "2 Nm, because it is not enabled"
     assert why == f"the drive of {JOINTS[joint]} reports {sign * most:.0f} Nm in {state.name}; must be within {limit}"
 
 
@@ -45,7 +45,7 @@ def test_torque_of_nan_or_infinity_is_implausible(torque: float):
 
 def test_torque_in_an_unknown_drive_state_is_implausible():
     why = implausible_torque(ROBOT, np.full(12, 99.0), np.full(12, 3.0))
-    assert why == "the drive of left_FH reports 3 Nm in state 99; must be within 2 Nm, it makes no torque"
+    assert why == "the drive of left_FH reports 3 Nm in state 99; must be within 2 Nm, because it is not enabled"
 
 
 OFF_TORQUE = np.full(12, 3.0)  # Nm, more than a disabled drive may report
@@ -67,11 +67,11 @@ ILL = {"diagnostic": "an encoder is stuck"}
 UNWELL = {"nodes_well": False, "missing": {"LEFT_SK", "IMU_TORSO"}}
 STOP, RELEASED = "the operator asked to stop", "the dead-man was released or the pendant is lost"
 FAILED = "the drives were not enabled within 200 cycles"
-TORQUE = "the drive of left_FH reports 3 Nm in SWITCH_ON_DISABLED; must be within 2 Nm, it makes no torque"
+TORQUE = "the drive of left_FH reports 3 Nm in SWITCH_ON_DISABLED; must be within 2 Nm, because it is not enabled"
 
 
 def test_entry_text_of_off_names_the_missing_nodes():
-    assert entry_text(S.OFF, {"LEFT_SK", "IMU_TORSO"}) == "not heard or not trusted yet: IMU_TORSO, LEFT_SK"
+    assert entry_text(S.OFF, {"LEFT_SK", "IMU_TORSO"}) == "no answer or not trusted yet: IMU_TORSO, LEFT_SK"
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_entry_text_of_off_names_the_missing_nodes():
         (ENABLING, {"stop_requested": True, "dead_man": False, **ILL}, STOP),
         (ENABLING, {"dead_man": False, **ILL}, RELEASED),
         (ENABLING, {**ILL, **UNWELL}, ILL["diagnostic"]),
-        (ENABLING, {**UNWELL, "cycles_left": 0}, "not heard or not trusted yet: IMU_TORSO, LEFT_SK"),
+        (ENABLING, {**UNWELL, "cycles_left": 0}, "no answer or not trusted yet: IMU_TORSO, LEFT_SK"),
         (ENABLING, {"cycles_left": 0, "torque": OFF_TORQUE}, FAILED),
         (ENABLING, {"torque": OFF_TORQUE}, TORQUE),
         (ENABLING, {"supervisor": S.HOLD, "torque": OFF_TORQUE}, TORQUE),
@@ -156,7 +156,7 @@ def test_torque_of_a_disabled_drive_refuses_the_start(make_rig, joint: int, torq
     assert rig.hal.state.supervisor is S.READY
     assert refused(rig) == [
         f"START refused: the drive of {JOINTS[joint]} reports {torque:.0f} Nm in SWITCH_ON_DISABLED; "
-        "must be within 2 Nm, it makes no torque"
+        "must be within 2 Nm, because it is not enabled"
     ]
     assert rig.hal.reason == refused(rig)[0]
     signal.value = None

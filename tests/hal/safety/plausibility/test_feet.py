@@ -151,7 +151,7 @@ class TestFeetAlone:
         feet.judge(LOADED, UNLOADED)
         for _ in range(20):
             feet.judge(UNLOADED, UNLOADED)
-        assert [f.text for f in feet.checks.findings()] == ["both feet report no load on the ground"]
+        assert [f.text for f in feet.checks.findings()] == ["neither foot reports a load on the ground"]
         assert not feet.judge(LOADED, UNLOADED)
         assert feet.checks.findings() == ()
 
@@ -169,7 +169,7 @@ class TestContact:
         assert 16 < robot.until_found(Dtc.CONTACT_IMPLAUSIBLE, 24, lambda now: None) <= 20
         finding = only(robot.checks.findings)
         assert (finding.node, finding.value, finding.confirmed) == ("FOOT_LEFT", 20.0, True)
-        assert "both feet" in finding.text
+        assert "neither foot" in finding.text
         assert only(robot.run(72)) is finding
         assert robot.run(12) == ()
         assert robot.run(100) == ()
