@@ -1,9 +1,9 @@
-"""Run your own controller: a controller that holds the pose in which the operator presses START.
+"""Run your own controller: it holds the pose that the robot has when the operator presses START.
 
 Run it:  python examples/hold_pose.py                       on an emulated robot, for two seconds of robot time
          python examples/hold_pose.py socketcan vcan0       on a robot or an emulator on a CAN bus
 
-Prints the reason why the robot went to HOLD at the end, and the joint angles [deg].
+Prints why the robot changed to HOLD at the end, and the joint angles [deg].
 """
 
 import sys
@@ -16,12 +16,12 @@ from atalante_tools.session.rig import open_hal
 
 
 class Spring:
-    """PD controller that holds the pose of the start."""
+    """PD controller that holds the start pose."""
 
     telemetry, telemetry_fields = np.zeros(0), ()
 
     def reset(self, state):
-        """Store the pose to hold."""
+        """Store the measured pose as the pose to hold."""
         self.rest = state.position.copy()
 
     def update(self, state):

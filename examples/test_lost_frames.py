@@ -1,4 +1,4 @@
-"""Test that four lost frames in a row of a drive leave the robot ACTIVE, and that five lead to HOLD.
+"""Test that the robot stays ACTIVE after four consecutive lost frames of a drive, and that five lead to HOLD.
 
 Run it:  pytest examples/test_lost_frames.py
 

@@ -1,4 +1,4 @@
-"""Structured arrays for compiled kernels, typed by a class of their fields. `class of a record -> dtype, array`.
+"""Structured arrays for compiled kernels. A record class declares their fields. `record class -> dtype, array`.
 
 A record class only declares fields; it is never instantiated. Its arrays are NumPy structured arrays, whose fields numba reads
 and writes as attributes. The class gives the type checker the type of each field and the reader its unit.

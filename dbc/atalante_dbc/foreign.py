@@ -1,6 +1,6 @@
 """Lenient loader for any DBC: message layouts for the validator and for bulk decoding.
 
-`loader.load` is strict, because its network controls a robot. This loader accepts every DBC that cantools can parse. It uses the
+`loader.load` is strict, because its result controls a robot. This loader accepts every DBC that cantools can parse. It uses the
 attributes of this project if the file contains them. A message with an ambiguous layout is rejected with the reason.
 """
 
@@ -30,9 +30,10 @@ _WORD = 64
 _FLOAT_BITS = (16, 32, 64)
 #: E2E Profile 5 header: name -> (start bit, number of bits), as in `loader`.
 _E2E_HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
-#: Values of GenMsgSendType that stand for a cyclic message.
+#: GenMsgSendType of a cyclic message, in lower case. An empty text is a message without GenMsgSendType.
 _CYCLIC = ("", "cyclic", "cyclicx", "periodic", "fixedperiodic", "fixed_periodic")
-#: J1939: identifier masks of a parameter group. If the PDU format is below 240, the next byte is the destination address.
+#: J1939: masks of the identifier bits that identify a parameter group, with and without destination address. If the PDU format
+#: is below 240, the identifier contains the destination address, which is not part of the group.
 _PGN_PEER, _PGN_BROADCAST, _PDU2 = 0x03FF0000, 0x03FFFF00, 240
 _QUOTED = re.compile(r'"[^"]*"')
 _WRITTEN = re.compile(r"\bBO_\s+(\d+)\s+(\w+)\s*:|\bSG_\s+(\w+)\s+(M|m\d+M?)?\s*:")
@@ -55,14 +56,14 @@ class Field:
     invalid_raw: int | None  # unsigned raw code that means "no value"; None: no such code
     choices: Mapping[int, str]  # raw value -> name; empty: no value table
     receivers: tuple[str, ...]
-    #: Multiplexers of the signal with the raw values that select it; empty: the signal is in every frame.
+    #: Multiplexers of the signal, each with the raw values that select the signal; empty: the signal is in every frame.
     selectors: tuple[tuple[str, frozenset[int]], ...]
 
     @property
     def first_bit(self) -> int:
         """Return the position of the start bit, counted in the byte order of the signal.
 
-        Intel counts from the least significant bit of byte 0, Motorola from the most significant bit of byte 0.
+        The count starts at the least significant bit of byte 0 (Intel) or at the most significant bit of byte 0 (Motorola).
         """
         return self.start ^ 7 if self.big_endian else self.start
 
@@ -180,7 +181,7 @@ def catalogue(path: Path) -> Catalogue:
 
 
 class _DbcText:
-    """Identifiers, names and multiplexer marks of a DBC text, with repetitions, which cantools removes."""
+    """Identifiers, names and multiplexer marks of a DBC text, including duplicates. cantools removes the duplicates."""
 
     def __init__(self, text: str) -> None:
         self.ids: Counter[int] = Counter()
@@ -266,7 +267,7 @@ def _selectors(message: RawMessage) -> dict[str, tuple[tuple[str, frozenset[int]
 
 
 def _multiplexers(message: RawMessage) -> dict[str, frozenset[int]]:
-    """Return the raw values of each multiplexer that occur in its signals or in its value table."""
+    """Return for each multiplexer the raw values that select a signal or have a name in its value table."""
     known: dict[str, frozenset[int]] = {}
     for multiplexer in (s for s in message.signals if s.is_multiplexer):
         values = {int(value) for value in multiplexer.choices or {}}
@@ -351,7 +352,7 @@ def _definitions(database: Database) -> Mapping[str, Any]:
 
 
 def _of(item: Any, name: str) -> object:
-    """Return an attribute of a database, node, message or signal, or its default; None if it is not defined."""
+    """Return the value of an attribute of a database, node, message or signal, else its default; None if it is undefined."""
     if item.dbc is None:
         return None
     attributes, definitions = item.dbc.attributes or {}, item.dbc.attribute_definitions or {}
@@ -366,7 +367,7 @@ def _of(item: Any, name: str) -> object:
 
 
 def _number(value: object) -> float | None:
-    """Return an attribute value as a number, or None if it is not positive. A DBC attribute of 0 means "not set"."""
+    """Return an attribute value as a number; None if it is not a positive number. In a DBC, 0 means "not set"."""
     try:
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):

@@ -90,7 +90,7 @@ def _require_no_problems(path: Path, found: Iterator[tuple[int, str]]) -> None:
 
 
 class _Lines:
-    """Line numbers of messages and signals, which cantools does not keep."""
+    """Line numbers of messages and signals. cantools does not store them."""
 
     def __init__(self, text: str) -> None:
         self.messages: list[tuple[int, int, str]] = []  # (line, frame id, name) of each message, with duplicates
@@ -199,7 +199,10 @@ def _range_problems(signal: RawSignal) -> Iterator[str]:
     )
     raw = sorted(((signal.minimum - signal.offset) / signal.scale, (signal.maximum - signal.offset) / signal.scale))
     if raw[0] < low - 1e-6 or raw[1] > high + 1e-6:
-        yield f"must have a range that fits {signal.length} bits of {signal.scale}, got [{signal.minimum}|{signal.maximum}]"
+        yield (
+            f"must have a range that fits {signal.length} bits with factor {signal.scale}, "
+            f"got [{signal.minimum}|{signal.maximum}]"
+        )
     invalid = _invalid_raw(signal)
     if invalid is not None:
         value = invalid - (1 << signal.length) if signal.is_signed and invalid >> signal.length - 1 else invalid
@@ -263,7 +266,7 @@ def _invalid_raw(signal: RawSignal) -> int | None:
 
 
 def _attribute(item: Any, name: str) -> int | str:
-    """Return an attribute of a node, message or signal, or its default. The value of an enumeration is its name."""
+    """Return the value of an attribute of a node, message or signal, else its default; for an enumeration, the name."""
     attributes = item.dbc.attributes if item.dbc is not None else {}
     if name in attributes:
         definition, value = attributes[name].definition, attributes[name].value

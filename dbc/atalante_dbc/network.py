@@ -109,7 +109,7 @@ class Network:
         return tuple(m for m in self.messages if m.sender == node)
 
     def received_by(self, node: str) -> tuple[Message, ...]:
-        """Return the messages of which a node receives at least one signal."""
+        """Return the messages that have at least one signal for a node."""
         return tuple(m for m in self.messages if node in m.receivers)
 
     def bus_load(self) -> dict[str, float]:
@@ -125,7 +125,9 @@ _T = TypeVar("_T", Signal, Node)
 
 
 def wire_time(length: int, nominal_bitrate: float = 1e6, data_bitrate: float = 5e6) -> float:
-    """Return the longest duration [s] of a CAN FD frame with 11-bit identifier on the bus, with stuff bits (ISO 11898-1).
+    """Return the longest time [s] for which a CAN FD frame occupies the bus, with 11-bit identifier and stuff bits.
+
+    The bit counts are those of ISO 11898-1.
 
     The nominal phase with interframe space has 33 bits. The data phase has 5 + 8 n bits for n payload bytes, and one stuff bit
     per four of these bits. The CRC with fixed stuff bits and delimiters adds 28 bits, or 33 bits if n is above 16.

@@ -1,4 +1,4 @@
-"""Idealization u_i and feedforward u_f of the assisted joints: SH and SK of the swing leg. `model, gait -> u_i, u_f`."""
+"""Idealization u_i and feedforward u_f of the assisted joints, SH and SK of the swing leg. `model, gait -> u_i, u_f`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Assistance:
 
     Attributes:
         inertia: mass matrix and separate inertias of SH and SK.
-        feedforward: Bezier control points of u_f, on the same inertias as u_v, shape (2, 8) [Nm]; None: no feedforward.
+        feedforward: Bezier control points of u_f, which acts on the same inertias as u_v, shape (2, 8) [Nm]; None: no u_f.
         laws: parameters of `idealization.merge`, shape (1,).
         rows: u_f of SH and SK for each cycle, shape (n, 2) [Nm].
     """

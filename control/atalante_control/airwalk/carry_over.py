@@ -1,4 +1,4 @@
-"""Carry-over of the torque at a step change: the step of the command is compensated, and the compensation fades out.
+"""Carry-over of the torque at a step change: the torque jump is compensated, and the compensation fades out.
 
 `torque before the change, torque of the new control law -> continuous torque`
 """
@@ -17,7 +17,7 @@ from atalante_hal.types import Vector
 
 
 class Carry:
-    """Values of one carry-over."""
+    """Torques of one carry-over."""
 
     pending: bool  # true until the first torque after the change is computed
     before: Annotated[Vector, len(JOINTS)]  # Nm, torque before the change
@@ -36,7 +36,7 @@ class CarryOver:
         """Compute the factors of the fade-out.
 
         Args:
-            duration: time in which the torque step fades out [s].
+            duration: time in which the compensation of the torque jump fades out [s].
         """
         ramp = np.arange(round(duration / PERIOD)) * (PERIOD / duration)
         self.blend: Vector = 0.5 + 0.5 * np.cos(math.pi * ramp)
@@ -48,7 +48,7 @@ class CarryOver:
         return bool(self.records[0].pending)
 
     def start(self, before: Vector) -> None:
-        """Start the carry-over at a change of the control law.
+        """Start the carry-over at a step change or at the start of the motion.
 
         Args:
             before: torque before the change, shape (12,) [Nm]; copied.
@@ -62,7 +62,7 @@ class CarryOver:
 
 
 def add_carried(carries: Records[Carry], blend: Vector, cycle: int, torque: Vector) -> None:
-    """Add the carried torque to the torque command. The first call after a change computes it.
+    """Add the carried torque to the torque command. The first call after a change computes the carried torque.
 
     Args:
         carries: `CarryOver.records`; `pending` is cleared.

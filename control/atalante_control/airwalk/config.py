@@ -23,18 +23,18 @@ class AirwalkConfig:
 
     gains: PidGains = AIR_GAINS
     friction: Friction = field(default_factory=Friction)
-    alpha: float = 0.4  # fraction of the step after which re-centring reaches the nominal trajectory
-    guide_rate: Pair = (28.0, 44.0)  # rad/s, natural frequency of the stiffest backup policy on SH and SK
-    gentler: tuple[float, ...] = (0.5, 0.7)  # fractions of guide_rate of the softer guides, ascending
-    guide_margin: float = 0.25  # smallest certificate margin of a softer guide, as a fraction of the guide width
-    guide_damping: float = 1.05  # damping ratio of the backup policy; the loop is monotone if it is at least 1
+    alpha: float = 0.4  # end of the re-centring, as a fraction of the step duration
+    guide_rate: Pair = (28.0, 44.0)  # rad/s, natural frequencies of the stiffest guide on SH and SK
+    gentler: tuple[float, ...] = (0.5, 0.7)  # natural frequencies of the softer guides / guide_rate, ascending
+    guide_margin: float = 0.25  # smallest certificate margin with which a softer guide is used, fraction of the width
+    guide_damping: float = 1.05  # damping ratio of the backup policy; with a ratio of at least 1 the loop is monotone
     # Nm, bounds of the disturbance u_ext of SH and SK, as torques on the separate inertias (see `certificate`).
-    # In PyBullet, coupling, delay and friction residuals stay below 14 Nm (SH) and 20 Nm (SK) in 95 % of the cycles.
-    # With a friction error of 20 %, these values are 43 Nm (SH) and 26 Nm (SK).
+    # In PyBullet, the disturbance from coupling, delay and friction is below 14 Nm (SH) and 20 Nm (SK) in 95 % of the cycles.
+    # If the friction parameters are wrong by 20 %, these values are 43 Nm (SH) and 26 Nm (SK).
     disturbance: tuple[Pair, Pair] = ((-30.0, 30.0), (-20.0, 20.0))
     points: int = 100  # number of intervals of the prediction grid over one step
     overlap: float = 0.1  # s, length of the prediction beyond the end of the step
-    zeta: float = 0.01  # s, gain of the derivative term of the guide
+    zeta: float = 0.01  # s, gain of the derivative term lambda_d of the guide filter
     hand_over: HandOver = field(default_factory=HandOver)
     #: True: u_v is converted with the mass matrix of SH and SK. False: u_v is applied directly, as in the paper.
     decoupled: bool = True
@@ -43,7 +43,7 @@ class AirwalkConfig:
     ankle_offset: float = math.radians(1.0)  # rad, added to both sagittal ankles
     fade: float = 0.9  # assistance factor Xi above which the baseline torque is blended in
     startup: float = 2.0  # s, duration of the motion from the measured pose to the first pose of the gait
-    blend: float = 0.03  # s, time in which a torque step at the step change fades out
+    blend: float = 0.03  # s, time in which the compensation of a torque jump fades out (see `carry_over`)
     active: float = 0.05  # weight of the backup torque above which the filter counts as active
 
     def __post_init__(self) -> None:

@@ -11,13 +11,13 @@ decided as follows:
 - *Assistance factor.* Xi changes only at a step change, where the reference is re-centred and the torque is carried over.
   The guide therefore never moves during a step, and the certificate of each step stays valid for any input of the operator.
 - *Xi towards 1.* The assisted joints get w u_t + (1 - w) (u_i + u_f + u_v). The weight w is a smoothstep from 0 at Xi = 0.9 to
-  exactly 1 at Xi = 1, where the torque is bitwise equal to the baseline torque. Their integrals are scaled by the same w.
+  exactly 1 at Xi = 1, where the torque is bitwise equal to the baseline torque. Their integral gains are scaled by the same w.
   No guide is certified for Xi between 0.9 and 1.
-- *Gains.* A stiff backup policy is needed in a narrow guide, but exceeds the available torque in a wide one. Each step uses the
-  lowest of a few gains with which its guide is certified, with a margin, at its Xi. The command is continuous in Xi except
-  where the gains change.
+- *Gains.* A stiff backup policy is needed in a narrow guide, but exceeds the available torque in a wide one. There are a few sets
+  of gains. Each step uses the lowest set for which the guide is certified with a margin at the Xi of the step. The command is
+  continuous in Xi except where the set of gains changes.
 - *Carry-over.* At a step change the re-centring sets the tracking error to zero, a leg changes from one control law to the
-  other, and the horizon returns to its full length. The resulting torque step is compensated, and the compensation fades out
+  other, and the horizon returns to its full length. The resulting torque jump is compensated, and the compensation fades out
   within `blend`, so the command is continuous. This is part of the baseline and is the same with and without assistance.
 """
 
@@ -154,11 +154,11 @@ class AirwalkController:
 
     @property
     def desired(self) -> Vector:
-        """Return q_des [rad], then q_des' [rad/s] of the last cycle of a step, shape (24,)."""
+        """Return q_des [rad], then q_des' [rad/s] of the last cycle, shape (24,). The start motion does not change it."""
         return self._outputs.desired
 
     def guide_at(self, xi: float) -> GuideFilter:
-        """Return the guide of lowest gains that is certified at Xi with `guide_margin`, or else the stiffest guide.
+        """Return the guide that is used at an assistance factor, see `StepGuides.at`.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -201,7 +201,7 @@ class AirwalkController:
     # -- one cycle ---------------------------------------------------------------------------------------------------
 
     def update(self, state: State) -> Command:
-        """Compute the command of one cycle: the step switch, then the compiled kernel (`kernel.run`).
+        """Compute the command of one cycle: change the step if it is over, then run the compiled kernel (`kernel.run`).
 
         Args:
             state: measured state of the robot.
@@ -247,7 +247,7 @@ class AirwalkController:
         return self._command
 
     def _change_step(self, state: State, stance: int) -> None:
-        """Start a step: re-centre the reference, start the guide and carry the torque over."""
+        """Start a step: re-centre the desired trajectory, start the guide, and start the carry-over of the torque."""
         self._changed_at, self._stance = state.cycle, stance
         self._command.step = (self._command.step or 0) + 1
         xi = min(1.0, max(0.0, state.assistance_factor))
@@ -269,7 +269,7 @@ class AirwalkController:
         step.xi, step.share, step.intensity = xi, share, intensity(xi)
 
     def _start_guide(self, xi: float, deviation: Deviation, joints: tuple[int, int]) -> None:
-        """Start the guide of a step for the two assisted joints, and count a deviation beyond the certified hand-over."""
+        """Start the guide of a step. Count the step change if a deviation is larger than the certificate assumes."""
         hip, knee = joints
         angles = float(deviation.angle[hip]), float(deviation.angle[knee])
         rates = float(deviation.rate[hip]), float(deviation.rate[knee])

@@ -27,13 +27,13 @@ _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 
 
 class Measured(NamedTuple):
-    """Measurements of this cycle and torque sent in the last cycle, copied from `State`."""
+    """Measurements of this cycle, and torque command of the previous cycle."""
 
     q: Vector  # (12,) rad
     qd: Vector  # (12,) rad/s
     attitudes: Vector  # (4, 4) attitude of each IMU, unit quaternion wxyz, sensor frame to world
     gyros: Vector  # (4, 3) rad/s, angular velocity of each IMU in its own frame
-    sent: Vector  # (12,) Nm, torque of the last cycle after the limiter
+    sent: Vector  # (12,) Nm, torque command of the previous cycle after the limiter
 
 
 class Parts(NamedTuple):

@@ -50,14 +50,14 @@ class GaitReference:
         time: Vector = np.arange(gait.cycles + 1, dtype=np.float64) * PERIOD
         (c0, c1), (c0d, c1d), _ = deadbeat.basis(time)
         end = self._end = int(np.searchsorted(time, deadbeat.end))
-        self._basis = np.zeros((2, end, 2 * _N))  # rows (s, s') per rad of s(0), then per rad/s of s'(0)
+        self._basis = np.zeros((2, end, 2 * _N))  # rows (s, s') for s(0) = 1 rad, then for s'(0) = 1 rad/s
         self._basis[0, :, :_N], self._basis[0, :, _N:] = c0[:end, None], c0d[:end, None]
         self._basis[1, :, :_N], self._basis[1, :, _N:] = c1[:end, None], c1d[:end, None]
         self._added = np.zeros_like(self._basis)
         self._angles, self._rates = (
             np.zeros(2 * _N),
             np.zeros(2 * _N),
-        )  # s(0) and s'(0), repeated for both halves of a row
+        )  # s(0) and s'(0), each stored twice, because a row has angles and speeds
 
     def start_step(self, stance: int, position: Vector, velocity: Vector) -> Deviation:
         """Re-centre the step on the measured motion.
@@ -81,7 +81,7 @@ class GaitReference:
         return Deviation(angles[:_N], rates[:_N])
 
     def row(self, stance: int, cycle: int) -> Vector:
-        """Return q_des [rad], then q_des' [rad/s] of a cycle, shape (24,). Do not write into it.
+        """Return q_des [rad], then q_des' [rad/s] of a cycle, shape (24,). The caller must not change the array.
 
         Args:
             stance: stance leg, LEFT or RIGHT.
@@ -92,7 +92,7 @@ class GaitReference:
 
 
 class StartMotion:
-    """Quintic from rest at the measured pose to the first pose and speed of the gait.
+    """Quintic trajectory from rest at the measured pose to the first pose and speed of the gait.
 
     Attributes:
         cycles: duration in cycles.

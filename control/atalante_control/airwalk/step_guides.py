@@ -43,7 +43,7 @@ class StepGuides:
         assistance: Assistance,
         torque_limits: Vector,
     ) -> None:
-        """Build the filters and compute up to which assistance factor each one is used.
+        """Build the filters, and compute the largest assistance factor for which each filter is used.
 
         Args:
             config: parameters of the controller.
@@ -60,13 +60,13 @@ class StepGuides:
             GuideFilter(guide_config, shape, deadbeat, nominal, following, assistance.feedforward)
             for guide_config in guide_configs(config, assistance.inertia, torque_limits)
         ]
-        #: Largest assistance factor at which each filter is used; the stiffest filter has no entry.
+        #: Largest assistance factor for which each filter is used; the stiffest filter has no entry.
         self._largest = [
             largest_assistance(guide, config.guide_margin, config.hand_over) for guide in self.filters[:-1]
         ]
 
     def at(self, xi: float) -> GuideFilter:
-        """Return the filter of lowest gains that is certified at Xi with `guide_margin`, or else the stiffest filter.
+        """Return the filter with the lowest gains that is certified at Xi with `guide_margin`; if none is, the stiffest filter.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -77,8 +77,8 @@ class StepGuides:
     def certificate(self, xi: float) -> Certificate:
         """Return the certificate of the filter used at an assistance factor.
 
-        A guide is not certified where the running control law differs from the certified one: while the baseline fades in, at
-        Xi = 1, and with `AirwalkConfig.decoupled` off.
+        A guide is not certified where the controller uses another control law than the certificate assumes: for Xi above
+        `AirwalkConfig.fade`, and with `AirwalkConfig.decoupled` off.
 
         Args:
             xi: assistance factor in [0, 1].

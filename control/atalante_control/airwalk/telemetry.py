@@ -1,4 +1,4 @@
-"""Telemetry and statistics of the controller: `q_des, errors, guide -> recorded telemetry, statistics of the guide`."""
+"""Telemetry and statistics of the controller: `q_des, tracking errors, guide -> recorded telemetry, statistics`."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Pair = tuple[float, float]
 
 
 class Telemetry:
-    """Telemetry of one cycle. Pairs are values of SH and SK of the swing leg."""
+    """Telemetry of one cycle. A pair has the values of SH and SK of the swing leg, except `guide`."""
 
     q_des: Annotated[Vector, len(JOINTS)]  # rad
     error: Annotated[Vector, 2]  # rad, q - q_des
-    q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the guide on the side of the error
-    guide: Annotated[Vector, 2]  # rad, distances from q_des of SH to the guide, upper and lower
+    q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the bound of the guide on the side of the error
+    guide: Annotated[Vector, 2]  # rad, distances from q_des to the upper and to the lower bound of the guide
     h: Annotated[Vector, 2]  # safe backward image function
     gate: Annotated[Vector, 2]  # lambda + (1 - lambda) lambda_d, published as `lambda`
     filter_active: Annotated[Vector, 2]  # 1 where the filter is active
@@ -58,7 +58,7 @@ class AirwalkStatistics:
     active: int = 0  # number of counted cycles with the filter active on at least one joint
     max_ratio: float = 0.0  # largest |e| / q_bound
     min_h_at_start: float = 1.0  # smallest safe backward image function h in the first cycle of a step
-    hand_overs_exceeded: int = 0  # number of step changes with a deviation beyond the certified hand-over
+    hand_overs_exceeded: int = 0  # number of step changes with a deviation larger than the certificate assumes
     factors: set[float] = field(default_factory=set)  # assistance factors of the steps
 
     @property

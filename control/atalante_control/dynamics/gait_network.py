@@ -31,10 +31,10 @@ INPUTS = {"mass": "kg", "height": "m", "step_length": "m", "step_duration": "s"}
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # largest number of neurons of a layer
-#: Tolerance of the check that the last layer gives joint angles that are continuous at the step change [rad].
+#: Largest jump of a joint angle at the step change that the last layer may cause, which allows for rounding [rad].
 _PERIODICITY_DEFECT = 1e-9
-_ANGLE_MAX = 2.0 * np.pi  # rad, largest absolute value of a control point
-#: Largest difference of thigh and shank from the lengths in Winter's table, with which the network was fitted [m].
+_ANGLE_MAX = 2.0 * np.pi  # rad, largest accepted absolute value of a control point
+#: Largest accepted difference between thigh or shank and Winter's table [m]. The network was fitted with Winter's lengths.
 _LEG_TOLERANCE = 1e-3
 
 
@@ -128,7 +128,7 @@ class GaitNetwork:
 
 
 def periodicity() -> Vector:
-    """Return the matrix A of the equation A c = 0 for gaits that are continuous at the step change, shape (24, 96).
+    """Return the matrix A for which A c = 0 means that a gait is continuous at the step change, shape (24, 96).
 
     c contains the control points of all joints, shape (96,). The first 12 rows are for the angles, the last 12 for the slopes.
     """

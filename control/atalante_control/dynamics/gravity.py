@@ -39,7 +39,7 @@ class LinkRecord:
     rotation: Annotated[Vector, (3, 3)]  # rotation matrix from link to parent
     down: Annotated[Vector, 3]  # m/s2, gravitational acceleration
     force: Annotated[Vector, 3]  # N, force that holds the link and its descendants
-    moment: Annotated[Vector, 3]  # Nm, moment about the joint that holds the link and its descendants
+    moment: Annotated[Vector, 3]  # Nm, moment that holds the link and its descendants, about the joint
 
 
 class Gravity:
@@ -75,7 +75,7 @@ class Gravity:
 
 
 def _links(articulated: ArticulatedModel) -> Records[LinkRecord]:
-    """Return the data of the links of a model, parents first. Row 0 is the pelvis."""
+    """Return the data of the links of a model, parents first. Record 0 is the pelvis."""
     model, into, _ = articulated
     data, neutral = model.createData(), pinocchio.neutral(model)
     joint_of = {int(q): joint for joint, q in enumerate(into)}

@@ -53,7 +53,7 @@ def check_hung(gait: Gait, robot: Robot, articulated: ArticulatedModel, gravity:
     """
     where = f"gait {gait.name!r}"
     check_gait(gait, robot, where)
-    # A constant added to all control points of a Bezier polynomial is added to the polynomial.
+    # If a constant is added to all control points, the Bezier polynomial changes by the same constant.
     coefficients = gait.coefficients + ankle_offset * _SAGITTAL_ANKLES[:, None]
     feedforward = _feedforward(gait, articulated) if gait.feedforward is None else gait.feedforward
     walked = replace(gait, coefficients=coefficients, feedforward=feedforward)

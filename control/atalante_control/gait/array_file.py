@@ -104,7 +104,7 @@ def _checked_directory(archive: zipfile.ZipFile, allowed: Collection[str], size_
 
 
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
-    """Return the bytes of a member. Their number must be the declared size; zipfile checks their CRC-32."""
+    """Return the bytes of a member after a check of their number against the declared size. zipfile checks the CRC-32."""
     with archive.open(member) as stream:
         # `read()` without a limit would decompress the whole member, even if it is larger than declared.
         content = stream.read(member.file_size + 1)
@@ -114,7 +114,7 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
 
 
 def _array(name: str, content: bytes) -> Array:
-    """Return the read-only array of .npy bytes. The number of bytes must match the shape."""
+    """Convert .npy bytes to a read-only array, and check that the number of bytes matches the shape."""
     stream = io.BytesIO(content)
     if (version := np.lib.format.read_magic(stream)) != (1, 0):
         raise ArrayFileError(f"{name} must have .npy version 1.0, got {version[0]}.{version[1]}")
@@ -131,14 +131,14 @@ def _array(name: str, content: bytes) -> Array:
     if len(data) != size:
         raise ArrayFileError(f"{name} must have the {size} bytes of its shape {shape}, got {len(data)}")
     if dtype.kind == "U":
-        data.decode("utf-32")  # raises for invalid text, which numpy detects only on use
+        data.decode("utf-32")  # raises an exception for invalid text, which numpy would raise only on use
     array = np.frombuffer(data, dtype).reshape(shape).copy()
     array.setflags(write=False)
     return array
 
 
 def _checksum(arrays: Mapping[str, Array | None]) -> str:
-    """Return the SHA-256 of names, types, shapes and bytes of the arrays, in hexadecimal digits; skip entries of None."""
+    """Return the SHA-256 of names, types, shapes and bytes of the arrays as hexadecimal digits. Entries of None are skipped."""
     digest = hashlib.sha256()
     for name, array in sorted(arrays.items()):
         if array is not None:

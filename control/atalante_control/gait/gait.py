@@ -74,7 +74,7 @@ class Gait:
 
     @property
     def hash32(self) -> int:
-        """Return the CRC-32 of duration, trajectories and feedforward, which identifies the gait."""
+        """Return the identifier of the gait: CRC-32 of duration, trajectories and feedforward."""
         content = np.float64(self.duration).tobytes() + np.ascontiguousarray(self.coefficients).tobytes()
         if self.feedforward is not None:
             content += np.ascontiguousarray(self.feedforward).tobytes()
@@ -253,7 +253,7 @@ def check_gait(
     Args:
         gait: gait to check; its left-stance step is checked too.
         robot: limits of the joints.
-        where: first words of the message, for example the name of the file.
+        where: start of the error message, for example the name of the file.
         gravity: function from a pose (12,) [rad] to the torque (12,) [Nm] that the controller adds to the feedforward. The torque
             limits apply to the sum. None: they apply to the feedforward.
 
@@ -281,7 +281,7 @@ def check_gait(
 
 
 def _check_form(gait: Gait, where: str) -> None:
-    """Raise `GaitError` if the shape or type of an array, a number or the duration is not valid."""
+    """Raise `GaitError` if an array has a wrong shape or type, a number is not finite, or the duration is not valid."""
     shape = len(JOINTS), DEGREE + 1
     for key, array in (("joints", gait.coefficients), ("feedforward", gait.feedforward)):
         if array is None and key == "feedforward":
@@ -295,7 +295,7 @@ def _check_form(gait: Gait, where: str) -> None:
             raise GaitError(
                 f"{where}: {key}.{JOINTS[joint]} must be finite, got {array[joint, point]} as control point {point}"
             )
-    # `_check_duration` accepts only built-in numbers, so a NumPy float is converted.
+    # `np.float64` is a subclass of float, but `_check_duration` accepts only built-in numbers.
     _check_duration(float(gait.duration) if isinstance(gait.duration, float) else gait.duration, where)
 
 
@@ -397,7 +397,7 @@ def _read_only(array: Vector) -> Vector:
 
 
 def step_over(cycle: int, cycles: int) -> bool:
-    """Return whether the nominal duration of a step has passed.
+    """Return whether a step is over because its nominal duration has passed.
 
     Args:
         cycle: cycles since the step change.

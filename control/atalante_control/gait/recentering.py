@@ -1,9 +1,8 @@
 """Re-centring ("deadbeat" in the paper): a cubic that leads from the pose at a step change to the nominal trajectory.
 
 `step change -> (q - q_nom, q' - q_nom') -> s(t) -> q_des(t) = q_nom(t) + s(t)`. The tracking error is exactly zero at the step
-change. After the time alpha T the desired trajectory has the angle and the velocity of the nominal trajectory. s is linear in the
-two deviations: s(t) = s(0) c0(t) + s'(0) c1(t). The guide filter therefore prepares its responses in advance, for the basis
-cubics c0 and c1.
+change. After the time alpha T the desired trajectory is the nominal trajectory. s is linear in the two deviations:
+s(t) = s(0) c0(t) + s'(0) c1(t). The guide filter therefore computes its responses to the basis cubics c0 and c1 in advance.
 
 The paper calls this polynomial a deadbeat. It is a reference trajectory, not a finite-time (deadbeat) control law.
 """
@@ -20,7 +19,7 @@ from atalante_hal.types import Vector
 
 @dataclass(frozen=True)
 class Deadbeat:
-    """Re-centring ("deadbeat" in the paper) of one gait: an offset of the reference trajectory after a step change.
+    """Re-centring ("deadbeat" in the paper) of one gait: an offset s(t) added to q_nom after a step change.
 
     Raises:
         ValueError: If alpha is outside (0, 1], or the duration is not positive.
@@ -48,7 +47,7 @@ class Deadbeat:
         return np.array([[1.0, 0.0, -3.0, 2.0], [0.0, self.end, -2.0 * self.end, self.end]])
 
     def basis(self, time: Vector) -> tuple[Vector, Vector, Vector]:
-        """Return c0 and c1 with their first and second time derivatives; all are zero from alpha T on.
+        """Return c0 and c1 with their first and second time derivatives. All of them are zero after the time alpha T.
 
         Args:
             time: time since the step change, shape (n,) [s], at least 0.

@@ -32,20 +32,20 @@ from atalante_hal.types import Vector
 HIDDEN = (64, 64)
 ITERATIONS = 3000  # largest number of L-BFGS iterations in one run of the optimiser
 ROUNDS = 2  # number of runs of the optimiser; the second run starts from the result of the first run
-RESOLUTION = math.radians(0.003)  # rad, accepted rms error that remains with the learned directions
-JUMP_KEPT = 0.45  # fraction of the speed jump at the step change that the fit keeps
+RESOLUTION = math.radians(0.003)  # rad, largest rms error caused by the principal directions that are left out
+JUMP_KEPT = 0.45  # the speed jump of each gait at the step change is multiplied by this factor before the fit
 END_WEIGHT = 20.0  # weight of the samples at start and end of a step; the other samples have weight 1
 ACCELERATION_WEIGHT = 5e-2  # s2, weight of an acceleration error [rad/s2] relative to an angle error [rad]
 ALPHA = 1e-7  # penalty on the squared weights of the network; it smooths the gaits between the grid points
 SEED = 1  # seed of the initial weights
-_SAMPLES = 41  # number of samples of a step for the distance of two gaits
+_SAMPLES = 41  # number of samples of a step for the distance between two gaits
 
 
 class Fit(NamedTuple):
     """Fitted network with its errors on the gaits of the library."""
 
     network: GaitNetwork
-    directions: int  # number of learned directions
+    directions: int  # number of principal directions, the outputs of the perceptron
     rms: float  # rad, rms error of the joint angles along the steps
     worst: float  # rad, largest error of the joint angles
 
@@ -70,7 +70,7 @@ def fit(gaits: Sequence[Gait], grid: Grid, *, hidden: Sequence[int] = HIDDEN, it
     root = np.linalg.cholesky(measure)
     deviations = (points - mean) @ root
     _, spread, directions = np.linalg.svd(deviations, full_matrices=False)
-    # Element k is the rms error that remains with the first k directions.
+    # Element k is the rms error if only the first k directions are used.
     outside = np.sqrt(np.cumsum(spread[::-1] ** 2)[::-1] / len(gaits))
     directions = directions[: int((outside > RESOLUTION).sum())]
     scores = deviations @ directions.T
@@ -105,7 +105,7 @@ def inputs(gait: Gait) -> Vector:
 
 
 def _metric(duration: float) -> Vector:
-    """Return the matrix M of the squared distance d' M d of two gaits, shape (96, 96).
+    """Return the matrix M of the squared distance d' M d between two gaits, shape (96, 96).
 
     d is the difference of their control points. The squared distance is the weighted mean of squared errors along the step.
 

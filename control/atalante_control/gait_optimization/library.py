@@ -25,7 +25,7 @@ from atalante_control.model import Patient
 from atalante_hal.robot import Robot, load_robot
 
 FORMAT = "atalante-library/1"
-LEVELS_MIN = 3  # smallest number of levels of a parameter; with 2 levels the network error between them is 10 degrees
+LEVELS_MIN = 3  # smallest number of levels of a parameter; between only 2 levels the network error is 10 degrees
 
 Index = tuple[int, ...]
 #: Function that solves one gait. It must be defined at module level, because other processes import it.
@@ -33,7 +33,7 @@ Solve = Callable[[Subject], SolvedGait]
 
 
 class LibraryError(ValueError):
-    """Folder without the requested library. The message states the remedy."""
+    """Missing or invalid library, or a library with another grid. The message states the path or the folder."""
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,7 @@ def solve_compiled(subject: Subject) -> SolvedGait:
 
 
 def verified(subject: Subject, solved: SolvedGait) -> SolvedGait:
-    """Verify a solved gait with Pinocchio. If a check fails, return the gait with the failed check as status.
+    """Verify a solved gait with Pinocchio. If a check fails, the status of the result names this check.
 
     Args:
         subject: patient and step parameters.

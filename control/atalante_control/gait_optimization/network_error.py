@@ -25,14 +25,12 @@ class Deviation(NamedTuple):
     """Deviation of the gait of the network from the solved gait, for one subject."""
 
     angles: Vector  # (n, 12) rad, absolute deviation of the joint angles along the step
-    landing_position: float  # m, deviation of the position of the swing foot relative to the stance foot at the landing
-    landing_attitude: (
-        float  # rad, deviation of the attitude of the swing foot relative to the stance foot at the landing
-    )
+    landing_position: float  # m, deviation of the position of the swing foot in the stance foot frame, at the landing
+    landing_attitude: float  # rad, deviation of the attitude of the swing foot in the stance foot frame, at the landing
     position_defect: float  # rad, largest jump of a joint angle at the step change
     speed_defect: float  # rad/s, largest jump of a joint speed at the step change
     feedforward: float  # rms of the feedforward difference, relative to the rms of the solved feedforward
-    within_limits: bool  # True: positions, speeds and feedforward of both steps are within the limits of the robot
+    within_limits: bool  # True: the gait of the network is valid and within the limits of the robot, see `check_gait`
 
 
 class Finding(NamedTuple):
@@ -94,7 +92,7 @@ def deviation(subject: Subject, gait: Gait, solved: Gait, robot: Robot) -> Devia
 
 
 def findings(deviations: Sequence[Deviation]) -> list[Finding]:
-    """Return the report over all subjects: 95th percentile and largest value of the joint error, largest other errors.
+    """Return the report over all subjects: 95th percentile of the joint error, and largest value of each error.
 
     Args:
         deviations: deviation of each subject.

@@ -1,8 +1,8 @@
 """Sparse nonlinear program built from small functions. Each function is repeated for several groups of unknowns.
 
 `Rows (SX expressions of a few unknowns) -> NonlinearProgram.add -> f, g and their exact sparse derivatives as five functions`.
-The module contains no model of walking; that is in `step_problem`. Every repeated function is differentiated only once. The
-program stores the matrix indices of the results of each repetition.
+The model of walking is in `step_problem`. Every repeated function is differentiated only once. For each repetition, the program
+stores where the derivatives belong in the sparse matrices.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Rows(NamedTuple):
 
 
 class Group(NamedTuple):
-    """Rows of g that belong to one named group of constraints."""
+    """Indices of the rows of g that belong to one named group of constraints."""
 
     name: str  # as in `Rows`
     unit: str  # as in `Rows`
@@ -195,7 +195,7 @@ def _derivatives(block: _Block, p: Symbol) -> tuple[Any, _Entries, _Entries]:
         ("hessian", curvature, [block.x, p, lam]),
     ):
         rows, columns = matrix.sparsity().get_triplet()
-        # Eliminating common subexpressions would save only 3 % of the operations and take most of the build time.
+        # Common subexpressions are not eliminated: this would save only 3 % of the operations but take most of the build time.
         function = casadi.Function(name, arguments, [casadi.vertcat(*matrix.nonzeros())])
         entries.append(_Entries(function, np.array(rows, np.intp), np.array(columns, np.intp)))
     return casadi.Function("values", [block.x, p], [block.expression]), entries[0], entries[1]

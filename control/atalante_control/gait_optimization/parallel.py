@@ -21,7 +21,7 @@ _LOKY_THREAD: Final = "ExecutorManagerThread"
 
 
 class FanOutError(RuntimeError):
-    """Parallel calls cannot be started. The message states the remedy."""
+    """Failure to start parallel calls. The message states the remedy."""
 
 
 def fan_out(
@@ -68,7 +68,7 @@ def fan_out(
         try:
             for result in results:  # noqa: UP028 - `yield from` would close `results` without suppressing its warnings
                 yield result
-        except multiprocessing.TimeoutError as error:  # no subclass of the built-in TimeoutError
+        except multiprocessing.TimeoutError as error:  # this class is not a subclass of the built-in TimeoutError
             raise TimeoutError(f"no parallel call finished within {patience:g} s") from error
         finally:
             with warnings.catch_warnings(), _without_loky_errors():
@@ -93,8 +93,8 @@ def _without_ctrl_c() -> Iterator[None]:
 def _without_loky_errors() -> Iterator[None]:
     """Suppress the report of a KeyError in the executor thread of loky.
 
-    To stop its processes, loky first clears the table of pending calls. If the thread queues a call at that moment, the call is
-    missing in the table (`add_call_item_to_queue` in loky 3.6). The error has no effect, because all calls are cancelled.
+    Before loky ends its processes, it clears the table of pending calls. If the thread queues a call at that moment, it does not
+    find the call in the table (`add_call_item_to_queue` in loky 3.6). The error has no effect, because all calls are cancelled.
     """
     before = threading.excepthook
 

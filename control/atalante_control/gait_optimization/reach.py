@@ -1,4 +1,4 @@
-"""Check before the optimisation that a landing pose exists: `problem, subject -> None, or why there is no pose`.
+"""Check before the optimisation that a landing pose exists: `problem, subject -> None, or reason why there is none`.
 
 The search finds a pose with both feet flat on the ground, one step length apart, with soft joint limits. If a joint must leave
 its range, the joint with the largest violation is reported as the reason why there is no gait.
@@ -16,7 +16,7 @@ from atalante_control.gait_optimization.step_problem import StepProblem
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
 
-_TOLERANCE = math.radians(0.5)  # rad, accepted violation of a joint range; the optimiser can find a better pose
+_TOLERANCE = math.radians(0.5)  # rad, accepted violation of a joint range, because the optimiser can find a better pose
 _CENTRE_WEIGHT = 1e-6  # weight of the distance from the middle of the joint ranges; a violation has weight 1
 _OPTIONS: dict[str, Any] = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "error_on_fail": False}
 

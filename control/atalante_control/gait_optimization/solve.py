@@ -30,7 +30,7 @@ from atalante_control.gait_optimization.result import SOLVED, Residual, SolvedGa
 from atalante_control.gait_optimization.step_problem import TRANSITION, Kind, StepProblem
 from atalante_hal.robot import ROBOT_FILE, load_robot
 
-RESIDUAL = 1e-6  # largest accepted violation of a constraint in a solved gait, in the SI unit of the constraint
+RESIDUAL = 1e-6  # largest accepted violation of each constraint in a solved gait, in the SI unit of this constraint
 _OPTIONS: dict[str, Any] = {
     "ipopt.nlp_scaling_method": "none",  # the program itself scales constraints and unknowns
     "ipopt.max_iter": 150,
@@ -42,10 +42,10 @@ _OPTIONS: dict[str, Any] = {
     "print_time": False,
     "error_on_fail": False,
     "calc_lam_p": False,
-    "no_nlp_grad": True,  # the gradient serves only sensitivities, which compiled functions do not provide
+    "no_nlp_grad": True,  # the gradient is used only for sensitivities, which compiled functions do not provide
 }
 #: IPOPT options of a warm start: a small initial barrier parameter mu, and bound multipliers computed from mu.
-#: With these options a solution takes 17 to 21 iterations instead of 34 to 36.
+#: With these options a warm start takes 17 to 21 iterations. With the default options it takes 34 to 36.
 _WARM: dict[str, Any] = {"ipopt.mu_init": 1e-3, "ipopt.bound_mult_init_method": "mu-based"}
 #: Patterns of the source files that determine a gait; `code_version` hashes these files.
 _SOURCES = (
@@ -67,7 +67,7 @@ def solve(
     """Optimise the gait of one step.
 
     A start step leads from rest on both feet to the end of the periodic step of the subject. A stop step leads from the start of
-    the periodic step to rest. Both take `step_problem.TRANSITION` seconds for every step duration.
+    the periodic step to rest. Both last `step_problem.TRANSITION` seconds, whatever the step duration is.
 
     Args:
         subject: patient and step parameters.
@@ -127,7 +127,7 @@ def solve(
 
 @cache
 def code_version() -> str:
-    """Return the version of the package and a hash of the files that determine a gait, including the robot file."""
+    """Return the version of the package and a hash of all files that determine a gait: `_SOURCES` and the robot file."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256(ROBOT_FILE.read_bytes())
     for pattern in _SOURCES:

@@ -76,11 +76,11 @@ class StepProblem:
         self._yaw = casadi.DM(_about_z(self.chain.stance_yaw))  # rotation from stance foot to walking frame
         self.program = NonlinearProgram(_POINTS + requirements.nodes * _NODE, self.symbols)
         self._build()
-        #: Unit and scale of each group of constraints, by name.
+        #: Unit and scale of each group of constraints, by the name of the group.
         self.units = {group.name: (group.unit, group.size) for group in self.program.groups} | _BOUND_UNITS
 
     def parameters(self, patient: Patient, duration: float, step_length: float) -> Vector:
-        """Return the values of the parameters of the program.
+        """Return the values of `symbols` for a patient and a step.
 
         Args:
             patient: patient in the exoskeleton.
@@ -241,7 +241,7 @@ class StepProblem:
         return rows.reshape(-1, self.program.unknowns)
 
     def _control_point(self, index: int) -> Vector:
-        """Return the matrix that selects one control point of every joint, shape (12, unknowns)."""
+        """Return the matrix that selects the control point `index` of every joint from x, shape (12, unknowns)."""
         rows = np.zeros((_N, self.program.unknowns))
         rows[np.arange(_N), np.arange(_N) * (DEGREE + 1) + index % (DEGREE + 1)] = 1.0
         return rows
@@ -269,7 +269,7 @@ class StepProblem:
         if around is not None:
             end, next_one = (-1, -2) if self.kind == "start" else (0, 1)
             pose, other = around.coefficients[:, end], around.coefficients[:, next_one]
-            # The joint speed is the same, but the derivative with respect to the phase scales with the duration.
+            # Both steps have the same joint speeds at their common pose, so their phase derivatives scale with the durations.
             points = {"gait pose": pose, "gait speed": pose + (other - pose) * TRANSITION / around.duration}
             for group in self.program.groups:
                 if group.name in points:

@@ -30,9 +30,9 @@ _NUMBERS = 13  # parameters per body: mass, first moment (3), inertia about the 
 
 @dataclass(frozen=True)
 class Body:
-    """Moving link with all links that are fixed to it. Its inertia is about the origin of the link."""
+    """Moving link, fused with all links that are fixed to it."""
 
-    name: str  # of the link
+    name: str  # name of the moving link
     parent: str  # name of the parent link
     joint: int  # index of the joint in JOINTS; -1 for the pelvis, which has no joint
     origin: Vector3  # m, position of the joint in the frame of the parent link
@@ -105,16 +105,16 @@ def bodies(links: Sequence[Link]) -> tuple[Body, ...]:
 
 
 class Chain:
-    """Chain of bodies from stance foot to swing foot. Its masses and lengths are symbols, valid for every subject.
+    """Chain of bodies from stance foot to swing foot. Its masses and lengths are symbols, so it is valid for every subject.
 
-    Axes and toe-out are constants. Numbers that are zero in the reference remain zero, which keeps the expressions small.
+    Axes and toe-out are constants. Numbers that are zero in the reference robot remain zero, which keeps the expressions small.
     """
 
     def __init__(self, reference: Sequence[Link]) -> None:
         """Build the chain from a reference robot.
 
         Args:
-            reference: links of the reference robot, which define topology, axes and the numbers that are zero.
+            reference: links of the reference robot. They define topology, axes, and which numbers are zero.
         """
         self.bodies = bodies(reference)
         numbers = _numbers(self.bodies)

@@ -23,7 +23,7 @@ _LEFT, _RIGHT = (f"{side}_{LEG_LINKS['HA']}" for side in SIDES)
 _SAMPLES = 201  # number of samples of a step
 _LOCAL = pinocchio.ReferenceFrame.LOCAL
 _EXACT = 1e-6  # tolerance of the equality constraints of the optimiser, in SI units
-_SLIDING = 1.0  # Ns, accepted impact impulse beyond the friction limit; it changes the robot's speed by some mm/s
+_SLIDING = 1.0  # Ns, accepted impact impulse above the friction limit; it changes the speed of the robot by some mm/s
 _SINKING = 1e-3  # m, accepted depth of the swing sole below the ground at the start of the swing
 
 
@@ -71,7 +71,8 @@ class Verifier:
 
         Args:
             gait: gait to verify.
-            kind: kind of step, `periodic`, `start` or `stop`. Start and stop steps are at rest at one end and have no impact.
+            kind: kind of step, `periodic`, `start` or `stop`. A start step begins at rest, a stop step ends at rest. Neither has
+                an impact.
         """
         motion = _sampled(gait, np.linspace(0.0, 1.0, _SAMPLES))
         checks = [*self._joints(motion), *self._loads(motion), *self._swing(motion)]
@@ -183,7 +184,7 @@ class Verifier:
         """Return the checks of a periodic step: landing pose, periodicity, impact map."""
         after, impulse, leaving = self.impact(motion.q[-1], motion.qd[-1])
         mirrored_q, mirrored_qd = SIGN * motion.q[0][SWAP], SIGN * motion.qd[0][SWAP]
-        # The impulse of a soft landing is small, so a small impulse beyond the friction limit is accepted.
+        # The impulse of a soft landing is small, so a small impulse above the friction limit is accepted.
         sliding = math.hypot(impulse[0], impulse[1]) - 0.5 * impulse[2]
         sinking = -min(leaving[2] + np.cross(leaving[3:], corner)[2] for corner in self._corners())
         return [
@@ -245,7 +246,7 @@ class Verifier:
         return np.array([(x + i * length / 2, j * width / 2, z) for i in (1, -1) for j in (1, -1)])
 
     def _foot_width(self) -> float:
-        """Return the lateral distance of the ankles at which the feet touch [m]. The toe-out moves the heels inwards."""
+        """Return the lateral ankle distance below which the feet touch each other [m]. The toe-out moves the heels inwards."""
         inner = self._forward().T @ (self._corners() * [1.0, -1.0, 1.0]).T
         return float(2.0 * inner[1].max())
 

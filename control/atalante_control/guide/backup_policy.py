@@ -33,7 +33,7 @@ class BackupPolicy:
     """PD law of one joint, with the inertia of the joint and the torque limit.
 
     Raises:
-        ValueError: If a value is not positive, or if one other than the torque limit is not finite.
+        ValueError: If a value is not positive, or if `kp`, `kd` or `inertia` is not finite.
     """
 
     kp: float  # Nm/rad
@@ -53,7 +53,7 @@ class BackupPolicy:
     def monotone(self) -> bool:
         """Return whether the loop is critically damped or overdamped, Kd^2 >= 4 Kp J.
 
-        The impulse response of a monotone loop never changes sign, so a constant extreme is the worst disturbance.
+        The impulse response of a monotone loop never changes sign. A constant disturbance at its bound is then the worst one.
         """
         return self.kd**2 >= 4.0 * self.kp * self.inertia * (1.0 - 1e-12)
 
@@ -89,7 +89,7 @@ class BackupPolicy:
     def peak_response(self, tau: Vector) -> Vector:
         """Return the largest |e(tau)| that a disturbance within +-1 Nm can cause from rest.
 
-        It is the L1 norm of the impulse response. For a monotone loop it equals the error of S. For an underdamped loop the
+        It is the L1 norm of the impulse response. For a monotone loop it equals the error in S. For an underdamped loop the
         worst disturbance changes sign with the impulse response, at tau_n = n pi / omega_d. S is monotone between these
         times, so the absolute increments of S are summed.
 
@@ -152,7 +152,7 @@ class BackupPolicy:
         return sigma, spread
 
     def _impulse(self, tau: Vector) -> tuple[Vector, Vector]:
-        """Return e and e' from e(0) = 0, e'(0) = 1; accurate near critical damping too."""
+        """Return e and e' of the free motion from e(0) = 0, e'(0) = 1. They are accurate even near critical damping."""
         sigma, spread = self._poles()
         if spread.imag:
             omega = spread.imag
@@ -166,7 +166,7 @@ class BackupPolicy:
 
 
 class ForcedResponse(NamedTuple):
-    """Solution P of the undisturbed loop and its sensitivity to the re-centring; (e, e'), each of shape (n, 2)."""
+    """Solution P of the undisturbed loop and its sensitivity to the re-centring: rows (e, e'), each of shape (n, 2)."""
 
     nominal: Vector  # P without re-centring [rad, rad/s]
     deviation: Vector  # response added to P per rad of s(0)
@@ -215,8 +215,8 @@ def forced_response(policy: BackupPolicy, curve: Curve) -> ForcedResponse:
 def free_drift(policy: BackupPolicy, curve: Curve) -> ForcedResponse:
     """Return the error of the joint without backup torque, the double integral of u_f / J - q_des''.
 
-    Where the drive saturates, the kernel adds the motion under a constant torque to this drift. Only differences along the
-    drift have a meaning.
+    Where the drive saturates, the kernel adds the motion under a constant torque to this drift. Only the difference between two
+    times has a meaning.
 
     Args:
         policy: backup policy of the joint.
@@ -240,7 +240,7 @@ def free_drift(policy: BackupPolicy, curve: Curve) -> ForcedResponse:
 def _successive(
     now: Vector, then: Vector, time: Vector, duration: float
 ) -> tuple[Vector, npt.NDArray[np.bool_], Vector]:
-    """Evaluate a polynomial in t / T up to T, and another one in (t - T) / T after T.
+    """Evaluate a polynomial in t / T up to T, and a second polynomial in (t - T) / T after T.
 
     Returns:
         Values and rates, shape (n, 2); True for each time after T, shape (n,); the jump of value and rate at T, shape (2,).

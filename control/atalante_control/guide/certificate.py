@@ -2,30 +2,32 @@ r"""Guide certificate: a check before walking that the filter can keep the joint
 
 The filter keeps a joint in its guide as long as the joint is in the safe backward image. These are the states from which the
 backup policy stays in the guide under every disturbance within its bounds (Proposition 1 of the paper). Three conditions must
-hold for a whole walk. Each is computed here exactly from the linear flow.
+hold for a whole walk. Each condition is checked here exactly, with the linear flow.
 
 1. *The re-centred state is in the image at the start of a step.* Re-centring sets s(0) = q - q_nom, s'(0) = q' - q_nom'.
-   Every step therefore starts at e = 0, e' = 0 from any end of the last step. From there the error is
+   Every step therefore starts at e = 0, e' = 0, whatever the state at the end of the last step was. From there the error is
    :math:`R(t) + s(0) R_0(t) + s'(0) R_1(t)` plus the effect of the disturbance, at most D(t) up or down. R is the response to
    the nominal acceleration; R_0 and R_1 are the responses to the acceleration of the re-centring. The condition holds if, at
    every t of the horizon, the largest error over all admissible s(0), s'(0) is below the upper bound and the smallest is above
    the lower bound. The remaining distance, as a fraction of the bound, is the margin.
-2. *The image is not empty at any time of the step.* This follows from 1. The backup policy without disturbance leads from a
-   state in the image at 0 to a state at t, from which the worst disturbance adds D(tau) <= D(t + tau). That state is in the
-   image at t. (For a monotone loop, a constant extreme from t on is one of the disturbances covered by the image at 0. For an
+2. *The image is not empty at any time of the step.* This follows from condition 1. The backup policy without disturbance leads
+   from a state in the image at 0 to a state at t. From there the worst disturbance adds D(tau) <= D(t + tau), so that state is
+   in the image at t. (For a monotone loop, the image at 0 also covers a constant extreme disturbance that starts at t. For an
    underdamped loop D is the L1 norm, which covers every signal.)
 3. *The end of a step does not violate the next one.* Near T the horizon is short. With this horizon alone the filter would
-   admit states near T from which the next step cannot be kept, and h would fall at the step change. Two measures prevent this.
+   admit states near T from which the joint leaves the guide in the next step, and h would fall at the step change. Two measures
+   prevent this.
    Re-centring resets the error, so the end state enters the next step only through s(0) and s'(0), and condition 1 holds for
    every pair of them in the hand-over box. In addition the horizon extends `overlap` past T, so the image at T already
    excludes states that leave the guide fast. A joint that swings every other step is handed over by the baseline controller. A
-   joint that is assisted in consecutive steps is handed over by its own guide, with |s(0)| up to the last width. The box is an
-   assumption, which the controller checks at every step change. The largest admissible box is part of the certificate.
+   joint that is assisted in consecutive steps is handed over by its own guide, with |s(0)| up to the width at the end of the
+   step. The box is an assumption, which the controller checks at every step change. The largest admissible box is part of the
+   certificate.
 
 By induction over the steps the joint never leaves its guide on the model of separate inertias J, each with its own ideal
-torque limit. Conditions 1 and 2 hold for the linear loop. Where the ideal torque saturates away from the re-centred path, the
-filter simulates the two extremes cycle by cycle and keeps a torque reserve. This case is tested under adversarial pushes, but
-not proved.
+torque limit. Conditions 1 and 2 hold for the linear loop. In states off the re-centred path the ideal torque can saturate. The
+filter then simulates both extreme disturbances cycle by cycle and keeps a torque reserve. This case is tested under adversarial
+pushes, but not proved.
 
 The bounds of the filter are torques on the separate inertias. A torque d on the coupled hip and knee is equivalent to A d on
 the separate inertias, with A = J M(q_SK)^-1. On the light empty leg this is several times d: at a straight knee, 1 Nm at the hip
@@ -65,7 +67,7 @@ _KNEE_SPACING = math.radians(0.05)  # rad, largest spacing of the knee angles at
 
 @dataclass(frozen=True)
 class HandOver:
-    """Largest deviations from the nominal start of a step at which a joint is handed over to the guide.
+    """Hand-over box: largest deviations from the nominal start of a step that the certificate assumes.
 
     Raises:
         ValueError: If a value is negative or not finite.
@@ -82,7 +84,7 @@ class HandOver:
 
 @dataclass(frozen=True)
 class JointTorque:
-    """Largest real torques at hip and knee that the disturbance bounds cover, at the same time and in any direction."""
+    """Largest real torques at hip and knee that the disturbance bounds cover, acting together and in any direction."""
 
     hip: float  # Nm, at SH
     knee: float  # Nm, at SK
@@ -94,23 +96,23 @@ class JointCertificate:
     """Certificate of one joint."""
 
     joint: str  # SH or SK
-    margin: float  # 1 - largest e / q_bound from the re-centred state; negative: the joint may leave the guide
+    margin: float  # 1 - largest |e| / q_bound after a start in the re-centred state; negative: the joint may leave the guide
     tightest_phase: float  # phase of the smallest margin, t / T
     side: str  # side of the smallest margin, upper or lower
     u_ext: tuple[float, float]  # Nm on the separate inertia, disturbance bounds of the filter
-    #: Largest admissible disturbance bounds, at a margin of zero, Nm on the separate inertia; (0, 0) if none are.
+    #: Largest admissible disturbance bounds, Nm on the separate inertia; (0, 0): no disturbance is admissible.
     #: They hold only for a filter that is configured with them.
     u_ext_max: tuple[float, float]
     #: Largest backup torque |u_b| over the step, with disturbance, Nm on the separate inertia (see module docstring).
     torque: float
-    torque_limit: float  # Nm on the separate inertia, torque limit less the reserve of the filter
+    torque_limit: float  # Nm on the separate inertia, torque limit minus the reserve of the filter
     image_empty_at: float  # first phase without a safe state; infinity if every phase has one
     hand_over_max: float  # factor by which the hand-over box can grow until the margin is zero
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """Result of the certification of a guide on the model, with the reason.
+    """Result of the certification of a guide on the model.
 
     `joint_torque` is the real torque at the joints that corresponds to the bounds of the filter. It is None if the guide is not
     certified or if `certify` was called without the mass matrix.
@@ -119,7 +121,7 @@ class Certificate:
     shape: str
     xi: float
     certified: bool
-    reason: str  # one sentence
+    reason: str  # sentence that states why the guide is certified or why it is not
     joints: tuple[JointCertificate, JointCertificate]
     joint_torque: JointTorque | None = None
 
@@ -161,7 +163,7 @@ def certify(
 def joint_torque(guide: GuideFilter, xi: float, hand_over: HandOver, inertia: AssistedInertia) -> JointTorque:
     """Return the largest real torques of hip and knee, in the ratio 5 to 3, within the disturbance bounds of the filter.
 
-    With A = J M(q_SK)^-1 it is the largest pair for which |A| (hip, knee) is at most the bounds, row by row. This holds at every
+    With A = J M(q_SK)^-1 it is the largest pair for which no element of |A| (hip, knee) exceeds its bound. This holds at every
     knee angle that the guide and the re-centring allow along the step. The pair is rounded down to 0.01 Nm.
 
     Args:

@@ -115,7 +115,7 @@ class GuideFilter:
             curve = Curve(deadbeat, nominal[joint], following[joint], self.time, uf)
             self.forced.append(forced_response(policy, curve))
             tables.append(np.concatenate([self.forced[joint], free_drift(policy, curve)], axis=2))
-        #: Columns P and DRIFT of `step`: nominal, per rad of s(0), per rad/s of s'(0). Shape (3, 2, horizon + 1, 4).
+        #: Terms of P and DRIFT in `step`, shape (3, 2, horizon + 1, 4): nominal, per rad of s(0), per rad/s of s'(0).
         self._parts = np.stack(tables, axis=1)
         first = int(self.grid[0])
         flow = np.array([_flow(config, joint, self.time) for joint in (0, 1)])
@@ -125,12 +125,12 @@ class GuideFilter:
         self._tick = specialised(tick, discarded, 0, 0.0, 0.0, 0.0, 0.0)
 
     def start_step(self, xi: float, deviation: Pair, rate: Pair) -> None:
-        """Start a step: compute the width from Xi and P from the deviations at the step change.
+        """Start a step: compute the bounds of the guide from Xi, and the forced responses from the deviations.
 
         Args:
             xi: assistance factor of the whole step.
-            deviation: s(0) of SH and SK [rad].
-            rate: s'(0) of SH and SK [rad/s].
+            deviation: deviations s(0) of SH and SK at the step change [rad].
+            rate: deviations s'(0) of SH and SK at the step change [rad/s].
         """
         (joints, _, step), (nominal, per_deviation, per_rate) = self.tables, self._parts
         if xi != joints[0].xi:
@@ -165,7 +165,7 @@ class GuideFilter:
 
     @property
     def bounds(self) -> list[float]:
-        """Return the upper and the lower distance to the guide at the last tick [rad]."""
+        """Return the distances from q_des to the upper and to the lower bound of the guide at the last tick [rad]."""
         hip = self.tables.joints[0]
         return [float(hip.upper), float(hip.lower)]
 

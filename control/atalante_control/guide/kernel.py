@@ -22,11 +22,11 @@ Pair = tuple[float, float]
 class Joint:
     """Data of one assisted joint: constants, values of the step, and results of the last tick."""
 
-    kp: float  # Nm/rad, of the backup policy
-    kd: float  # Nm s/rad, of the backup policy
+    kp: float  # Nm/rad, Kp of the backup policy
+    kd: float  # Nm s/rad, Kd of the backup policy
     inertia: float  # kg m2
     limit: float  # Nm, torque limit of the backup policy
-    counted: float  # Nm, torque limit minus reserve; the limit in the rollouts
+    counted: float  # Nm, torque limit minus reserve, which the rollouts assume as limit
     up: float  # Nm, u_ext_max
     down: float  # Nm, u_ext_min
     phi11: float  # error after one cycle per unit of e
@@ -45,8 +45,8 @@ class Joint:
     h: float  # safe backward image function
     rate: float  # 1/s, dh/dt
     gate: float  # lambda + (1 - lambda) lambda_d
-    upper: float  # rad, distance from q_des up to the guide
-    lower: float  # rad, distance from q_des down to the guide
+    upper: float  # rad, distance from q_des to the upper bound of the guide
+    lower: float  # rad, distance from q_des to the lower bound of the guide
     stepped: int  # number of rollouts computed cycle by cycle
 
 
@@ -54,8 +54,8 @@ class GuideTables(NamedTuple):
     """Tables of the guide filter for SH and SK of the swing leg, index 0 and 1 of the first axis."""
 
     joints: Records[Joint]  # (2,) data of SH and SK; `tick` writes its results to them
-    flow: Vector  # (2, horizon + 1, 9) flow of the backup policy, one row for each cycle ahead; columns as listed at `ERROR`
-    step: Vector  # (2, horizon + 1, 6) one row for each cycle since the step change; columns as listed at `P`
+    flow: Vector  # (2, horizon + 1, 9) flow of the backup policy, a row for each cycle ahead; columns: ERROR to STEADY below
+    step: Vector  # (2, horizon + 1, 6) a row for each cycle since the step change; columns: P, DRIFT and BOUND below
 
 
 ERROR = 0  # columns 0 and 1 of `flow`: predicted error per unit of e and per unit of e'
@@ -67,7 +67,7 @@ P = 0  # columns 0 and 1 of `step`: solution P of the undisturbed loop and its r
 DRIFT = 2  # columns 2 and 3 of `step`: error without backup torque and its rate [rad, rad/s]
 BOUND = 4  # columns 4 and 5 of `step`: distance from q_des to the guide, upper and lower [rad]
 
-_HOPELESS = 2.0  # |e| / q_bound at which a prediction ends early, because lambda is 1 for every value above 1
+_HOPELESS = 2.0  # a prediction ends early at this |e| / q_bound, because lambda is 1 for every value above 1
 
 
 def tick(guide: GuideTables, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Pair:
@@ -132,8 +132,9 @@ def damped_gate(gate: float, rate: float, zeta: float) -> float:
 def _largest_ratio(joint: Joint, flow: Vector, step: Vector, cycle: int, e: float, ed: float) -> float:
     """Return the largest |e| / q_bound of this cycle and of the predictions under both extreme disturbances.
 
-    A rollout is computed cycle by cycle only if the drive saturates while it pushes away from the side of the rollout. A
-    rollout of a monotone loop that saturates in the other direction stays below the linear rollout, which then is its bound.
+    There is a rollout for each bound of the guide. It is computed cycle by cycle only if the drive saturates while it pushes the
+    joint away from this bound. If a monotone loop saturates in the other direction, its error stays below that of the linear
+    rollout, which is then used.
     """
     worst = float(e / step[cycle, BOUND] if e > 0.0 else -e / step[cycle, BOUND + 1])
     asked = (joint.kp * e + joint.kd * ed) / joint.counted
@@ -149,9 +150,9 @@ def _largest_ratio(joint: Joint, flow: Vector, step: Vector, cycle: int, e: floa
 
 
 def _linear(joint: Joint, flow: Vector, step: Vector, cycle: int, e: float, ed: float) -> tuple[Pair, Pair]:
-    """Return the largest |e| / q_bound and the largest torque over `counted` of the linear rollouts.
+    """Return the largest |e| / q_bound and the largest torque / `counted` of the linear rollouts.
 
-    Each is a pair: rollout under the upper extreme disturbance, then under the lower one.
+    Each result is a pair: the value under the upper extreme disturbance, then the value under the lower one.
     """
     kp, kd, monotone = joint.kp, joint.kd, joint.monotone
     y, yd = e - step[cycle, P], ed - step[cycle, P + 1]
@@ -175,15 +176,15 @@ def errors_ahead(flow: Vector, step: Vector, y: float, yd: float) -> Pair:
     Args:
         flow: row of `flow` for the number of cycles to the point.
         step: row of `step` of the point.
-        y: e less P at the start of the rollout [rad].
-        yd: e' less P' at the start of the rollout [rad/s].
+        y: e - P at the start of the rollout [rad].
+        yd: e' - P' at the start of the rollout [rad/s].
     """
     error = flow[ERROR] * y + flow[ERROR + 1] * yd + step[P]
     return error + flow[ERROR_ADDED], flow[ERROR_ADDED + 1] - error
 
 
 def limited(joint: Joint, flow: Vector, step: Vector, side: int, cycle: int, e: float, ed: float) -> float:
-    """Return the largest |e| / q_bound ahead of a rollout along which the drive saturates.
+    """Return the largest |e| / q_bound of a rollout in which the drive saturates.
 
     Args:
         joint: record of the joint.
@@ -214,7 +215,7 @@ def limited(joint: Joint, flow: Vector, step: Vector, side: int, cycle: int, e: 
             e = then[DRIFT] + y + (yd + 0.5 * gained) * PERIOD
             ed = then[DRIFT + 1] + yd + gained
         cycle += 1
-        # Error of the worst disturbance minus that of the constant extreme; zero in a monotone loop.
+        # Error under the worst disturbance minus error under the constant extreme disturbance; zero in a monotone loop.
         ahead = flow[cycle - start]
         allowance = ahead[ERROR_ADDED + side] - sign * external * ahead[STEADY]
         worst = max(worst, (sign * e + allowance) / then[BOUND + side])

@@ -16,7 +16,7 @@ from atalante_hal.types import Vector
 
 PINCH_WIDTH = math.radians(1.0)  # rad, smallest half-width of the shape `pinched`
 SNAP_WIDTH = math.radians(0.1)  # rad, smallest half-width of the shape `snap`
-#: Smallest bound of a shape [rad], about two encoder counts at the joint. A much smaller bound overflows h in the filter.
+#: Smallest bound of a shape [rad], about two encoder counts at the joint. With a much smaller bound, h overflows in the filter.
 NARROWEST = 1e-6
 #: Phases and assistance factors at which a shape is checked on construction.
 _CHECKED_PHASES = np.linspace(0.0, 1.0, 2001)

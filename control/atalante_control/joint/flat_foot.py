@@ -1,6 +1,7 @@
-r"""Flat foot: swing ankle angles that hold the sole level, from the tibia IMU, or from the joints if that IMU is lost.
+r"""Flat foot: angles of the swing ankle that hold the sole level. `tibia attitude -> SA, HA targets`.
 
-`tibia attitude -> SA, HA targets`. The targets replace the nominal ones of the PID. The attitude of the foot in the world is
+The attitude comes from the tibia IMU. If this IMU is lost, the attitude is computed from the joints and the pelvis IMU. The
+targets replace the nominal angles in the reference of the PID. The attitude of the foot in the world is
 :math:`R_{tibia} R_z(\text{toe}) R_y(q_{SA}) R_a(q_{HA})`. The sole is level when this rotation maps the normal of the sole to the
 vertical. Let :math:`g` be the vertical in the ankle frame and :math:`a = (a_x, 0, a_z)` the henke axis. The y component of
 :math:`R_a e_z` is :math:`-a_x \sin q_{HA}` and does not depend on SA, which gives HA. SA then rotates in the x-z plane.
@@ -29,11 +30,11 @@ Quaternion = tuple[float, float, float, float]
 Vector3 = tuple[float, float, float]
 
 _SA, _HA = LEG_JOINTS.index("SA"), LEG_JOINTS.index("HA")
-_STOP_MARGIN = math.radians(1.0)  # rad, smallest distance of a target to the joint limit
-_STOP_FADE = math.radians(3.0)  # rad, distance to the end of the target range at which the rate starts to fade
+_STOP_MARGIN = math.radians(1.0)  # rad, smallest distance between a target and the joint limit
+_STOP_FADE = math.radians(3.0)  # rad, below this distance to the end of the target range, the target rate is reduced
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
-_IMU_AGE = 10  # cycles, largest age of a valid IMU message; its timeout in the DBC
+_IMU_AGE = 10  # cycles, largest age of a valid IMU message, equal to its timeout in the DBC
 
 
 class Ankle:
@@ -72,7 +73,7 @@ class FlatFoot:
 
 
 class Tibiae:
-    """Attitude and angular velocity of the tibiae from the joints and the pelvis IMU, for a tibia whose IMU is lost."""
+    """Substitute for a lost tibia IMU: attitude and angular velocity from the joints and the pelvis IMU."""
 
     def __init__(self, articulated: ArticulatedModel) -> None:
         """Prepare the forward kinematics.
@@ -89,7 +90,7 @@ class Tibiae:
     def attitude(
         self, side: int, position: Vector, velocity: Vector, pelvis: Sequence[float], gyro: Sequence[float]
     ) -> tuple[Quaternion, Vector3]:
-        """Compute the measurement that the IMU of a tibia would make.
+        """Compute attitude and angular velocity of a tibia, as its IMU would measure them.
 
         Args:
             side: 0 left, 1 right.
@@ -126,7 +127,7 @@ class LevelFeet:
 
     Attributes:
         ankles: records of the left and the right ankle.
-        cubics: c0 and c1 of the re-centring, then their derivatives, one row for each cycle until it ends, shape (n, 4).
+        cubics: c0 and c1 of the re-centring, then their derivatives, a row for each cycle of the re-centring, shape (n, 4).
     """
 
     def __init__(
@@ -145,7 +146,7 @@ class LevelFeet:
             exoskeleton: geometry of the feet.
             articulated: model with the pelvis fixed.
             deadbeat: re-centring of the gait.
-            nominal: rows (q_nom, q_nom') of the step in which the left (0) and the right leg (1) swings, each of shape (n, 24).
+            nominal: rows (q_nom, q_nom') of both steps, each of shape (n, 24): first the left leg swings, then the right leg.
             offset: angle added to SA [rad].
         """
         self._nominal, self._tibiae = nominal, Tibiae(articulated)
@@ -180,10 +181,10 @@ class LevelFeet:
         return not state.imu_rows or bool(state.age[state.imu_rows[_TIBIAE[side]]] <= _IMU_AGE)
 
     def without_imu(self, state: State, side: int, cycle: int, row: Vector) -> Vector:
-        """Return the desired row with the targets of the swing ankle, computed without the tibia IMU.
+        """Return a copy of q_des and q_des' with the targets of the swing ankle, computed without the tibia IMU.
 
         The attitude of the tibia is computed from the joints and the pelvis IMU. If the pelvis IMU is lost too, the targets are
-        the nominal ones.
+        the nominal angles.
 
         Args:
             state: measured state of the robot.
@@ -242,13 +243,13 @@ def _target(ankle: Ankle, tibia: Sequence[float] | Vector, gyro: Sequence[float]
 
 
 def _within(angle: float, rate: float, low: float, high: float) -> Pair:
-    """Return the angle limited to [low, high], and the rate, which fades to zero before the limits."""
+    """Return the angle limited to [low, high], and the rate, which is reduced near these limits and zero at them."""
     room = max(0.0, min(angle - low, high - angle) / _STOP_FADE)
     return min(high, max(low, angle)), rate * min(1.0, room)
 
 
 def level(geometry: Vector, tibia: Sequence[float] | Vector, gyro: Sequence[float] | Vector) -> tuple[Pair, Pair]:
-    """Return SA and HA that level the sole, or the nearest HA if the tibia leans too far sideways.
+    """Return the angles of SA and HA that level the sole. If the tibia leans too far sideways, HA is the nearest angle.
 
     Args:
         geometry: `FlatFoot.geometry`.

@@ -75,10 +75,10 @@ class AssistedInertia:
     """Mass matrix of SH and SK of one leg in closed form; it depends only on the knee angle.
 
     The block is M(q_SK) = A + B cos q_SK + C sin q_SK. A, B and C follow from three evaluations of the CRBA of Pinocchio, with
-    the other joints at their mean angles of the swing.
+    the other joints at their mean angles during the swing.
 
     Attributes:
-        inertias: J of SH and SK [kg m2], the largest diagonal of M along the swing.
+        inertias: J of SH and SK [kg m2], the largest diagonal elements of M during the swing.
         fit: A, B, C (columns) of M11, M12 and M22 (rows), shape (3, 3) [kg m2].
     """
 
@@ -145,7 +145,7 @@ class AssistedInertia:
         return on_hip, on_knee
 
     def ideal_of(self, knee: float) -> Vector:
-        """Return A = J M^-1, which converts real torques, less velocity torques, to the separate inertias. Shape (2, 2).
+        """Return A = J M^-1, shape (2, 2). It converts real torques minus velocity torques to the separate inertias.
 
         Args:
             knee: angle of SK [rad].
@@ -209,7 +209,7 @@ def friction(velocity: float, coulomb: float, viscous: float, smoothing: float) 
 
 
 def coupled(fit: Vector, inertias: Vector | Pair, knee: float, hip_rate: float, knee_rate: float, u: Pair) -> Pair:
-    """Convert torques on the separate inertias to real torques, as `AssistedInertia.torques`, for the compiled kernel.
+    """Convert torques on the separate inertias to real torques, see `AssistedInertia.torques`. Kernels can call it.
 
     Args:
         fit: `AssistedInertia.fit`.

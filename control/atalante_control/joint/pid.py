@@ -1,8 +1,8 @@
 """Joint PID of the baseline controller: `q_des, q_des' and measured q, q' -> tracking torque u_t` of twelve joints.
 
 Each leg has the gains of its role, stance or swing. The integral is a torque with a separate, small limit. Anti-windup: if the
-limiter reduced the torque of a joint, its integral does not grow further in that direction. The integral of a joint assisted by
-the virtual guide is scaled by the share of the baseline.
+limiter reduced the torque of a joint, its integral does not grow further in that direction. If the virtual guide assists a joint,
+its integral gain is scaled by the share of the baseline.
 """
 
 from __future__ import annotations

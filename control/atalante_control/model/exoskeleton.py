@@ -1,7 +1,7 @@
-"""Links of the exoskeleton, empty or with a patient: `ExoskeletonParameters (, Patient) -> links`.
+"""Links of the exoskeleton, with or without a patient: `ExoskeletonParameters (, Patient) -> links`.
 
 The right leg is the mirror image of the left leg. Each segment of a patient is fused into the link that carries it. The joint
-idealization of the controller compensates the empty exoskeleton. Gaits are computed for the exoskeleton with the patient.
+idealization of the controller uses the model of the empty exoskeleton. Gaits are computed with the patient.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class ExoskeletonParameters:
     shank_length: float = 0.408  # m, from SK to SA
 
     pelvis_mass: float = 16.5  # kg, pelvis and back
-    frontal_hip_mass: float = 3.7  # kg, of one leg; the masses below are also of one leg
+    frontal_hip_mass: float = 3.7  # kg, mass per leg, as all masses below
     transverse_hip_mass: float = 4.4
     thigh_mass: float = 9.0
     shank_mass: float = 11.0
@@ -41,8 +41,8 @@ class ExoskeletonParameters:
     fh_offset: Vector3 = (0.0, 0.089, 0.0)  # m, position of joint FH in the pelvis frame
     th_offset: Vector3 = (-0.135, 0.169, 0.0)  # m, position of joint TH in the frontal hip frame
     sh_offset: Vector3 = (0.135, 0.0, 0.0)  # m, position of joint SH in the transverse hip frame
-    knee_lateral: float = 0.005  # m, lateral distance of joint SK from SH, outwards positive
-    ankle_lateral: float = -0.169  # m, lateral distance of joint SA from SK, outwards positive
+    knee_lateral: float = 0.005  # m, lateral offset of joint SK relative to SH, positive outwards
+    ankle_lateral: float = -0.169  # m, lateral offset of joint SA relative to SK, positive outwards
     toe_out: float = math.radians(8.0)  # rad, outward rotation of the foot about the vertical
     ha_axis: Vector3 = (0.788, 0.0, 0.616)  # axis of joint HA in the foot frame; the URDF contains its unit vector
 
@@ -55,7 +55,7 @@ class ExoskeletonParameters:
 
     torso_imu: Vector3 = (-0.14, 0.0, 0.50)  # m, position of the torso IMU in the pelvis frame
     pelvis_imu: Vector3 = (-0.164, -0.015, 0.191)  # m, position of the pelvis IMU in the pelvis frame
-    tibia_imu: Vector3 = (-0.13, -0.074, 0.018)  # m, position of the left tibia IMU: x and y from SK, z from SA
+    tibia_imu: Vector3 = (-0.13, -0.074, 0.018)  # m, left tibia IMU: x and y relative to SK, z relative to SA
 
     def __post_init__(self) -> None:
         for name in ("thigh_length", "shank_length"):
@@ -117,7 +117,7 @@ def pad_link(foot: str, cell: str) -> str:
 
 
 def _patient_segments(p: ExoskeletonParameters, patient: Patient) -> dict[str, tuple[Box, Inertia]]:
-    """Return the segments of the patient's body by link, for pelvis and left leg, each in the frame of its link.
+    """Return box and mass properties of the patient's segments, by the name of the link that carries each segment.
 
     The hip of the patient is the intersection of the axes of FH and SH, the knee is on the axis of SK, and the ankle is at SA.
     The lateral offsets of the exoskeleton shift thigh and shank by half a centimetre. The foot is centred along the sole.

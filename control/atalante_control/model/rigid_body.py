@@ -68,7 +68,7 @@ class Inertia:
 
 @dataclass(frozen=True)
 class Link:
-    """Link of the tree, with the joint that connects it to its parent link."""
+    """Link of a tree of links, with the joint that connects it to its parent link."""
 
     name: str
     parent: str  # name of the parent link; "": the link is the root
@@ -81,7 +81,7 @@ class Link:
     pad: float = 0.0  # m, radius of a contact sphere at the origin of the link; 0: no contact
 
     def fused(self, box: Box, inertia: Inertia) -> Link:
-        """Return the link with a second body fixed to it.
+        """Return a copy of the link that is fused with a second body.
 
         Args:
             box: shape of the second body, added for viewers.

@@ -47,11 +47,11 @@ class ImpactDetector:
         self._released, self._count = False, 0
 
     def update(self, vertical_force: float, phase: float) -> bool:
-        """Return True in the cycle in which the step ends. A force of NaN counts as no force.
+        """Return whether the step ends in this cycle. A force of NaN counts as neither contact nor release.
 
         Args:
             vertical_force: force on the swing foot, sum of its cells, upwards positive [N].
-            phase: time in the step over its duration, t / T.
+            phase: time since the step change divided by the step duration, t / T.
         """
         config = self._config
         if vertical_force < config.release_force:
