@@ -8,7 +8,7 @@ from typing import Self
 
 
 class Closing(ABC):
-    """Context manager that calls `close()` at the end of the block, also after an exception."""
+    """Context manager that calls `close()` at the end of the block, even after an exception."""
 
     @abstractmethod
     def close(self) -> object:

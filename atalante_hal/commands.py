@@ -48,7 +48,7 @@ class Commands:
         self._sent_torque, self._sent_level = record.torque_command, record.level_command
         self._no_level = np.zeros_like(self._level)
         self.hold()
-        #: HOLD frames (quick stop, zero torque, motors off), encoded in advance so that no later fault can prevent them.
+        #: HOLD frames (quick stop, zero torque, motors off), encoded in advance, so that a later fault cannot prevent HOLD.
         self._prepared_hold = self._image.prepare()
         self._sealed = False  # True: the SYNC of the next cycle is already encoded
 

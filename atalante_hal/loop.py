@@ -19,9 +19,9 @@ from atalante_hal.types import PERIOD, Controller, State
 
 #: Number of consecutive late cycles after which the robot goes to HOLD.
 OVERRUNS_TO_HOLD = 3
-#: Longest gap between two cycles before the robot goes to HOLD [s]. The watchdog of the drives has the same timeout.
+#: Gap between two cycles above which the robot goes to HOLD [s]. The watchdog of the drives has the same timeout.
 GAP_TO_HOLD = 5e-3
-#: Largest delay against the monotonic clock within `DRIFT_CYCLES` cycles before the robot goes to HOLD [s].
+#: Delay against the monotonic clock within `DRIFT_CYCLES` cycles above which the robot goes to HOLD [s].
 DRIFT_TO_HOLD = 5e-3
 #: Length of the window in which the delay is measured [cycles].
 DRIFT_CYCLES = 50
@@ -118,7 +118,7 @@ class Statistics:
     cycles: int = 0
     overruns: int = 0  # cycles that began more than a period late
     lateness_max: float = 0.0  # s
-    wall: float = 0.0  # s, first to last cycle
+    wall: float = 0.0  # s, elapsed time from the first to the last cycle
     #: Histogram: number of cycles for each cost of 0, 1, 2, ... us. The last entry counts all longer cycles.
     costs: list[int] = field(default_factory=lambda: [0] * (COST_BINS + 1))
 
@@ -134,7 +134,7 @@ class Statistics:
             percentile: Share of the cycles that did not exceed the returned cost, 0 to 100 [%].
 
         Returns:
-            Cost [s] with a resolution of 1 us. 10 ms means 10 ms or more.
+            Cost [s] with a resolution of 1 us. A result of 10 ms means 10 ms or more.
         """
         total = np.cumsum(self.costs)
         return float(np.searchsorted(total, max(1.0, total[-1] * percentile / 100.0))) * 1e-6 if total[-1] else 0.0

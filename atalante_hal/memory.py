@@ -9,7 +9,7 @@ import tempfile
 def anonymous_file(label: str, size: int) -> int:
     """Create a zeroed file without a name and return its descriptor.
 
-    The file is in memory if the system supports it. It disappears with its last user, also after a crash.
+    The file is in memory if the system supports it. It is removed when the last process has closed it, even after a crash.
 
     Args:
         label: Name shown in /proc.

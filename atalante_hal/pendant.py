@@ -2,9 +2,9 @@
 
 `process image -> pendant -> state machine` is the only path for commands to the robot.
 
-START is edge-triggered: a press is a change of `RequestCounter` between two accepted frames. The first frame is never a press. A
-press that arrives while the pendant is not qualified yet is stored until it is. It is dropped if the dead-man switch or START is
-released before, or if the state changes.
+START is edge-triggered: a press is a change of `RequestCounter` between two accepted frames. The first frame is never a press. If
+START is pressed while the pendant is not qualified yet, the press is stored until the pendant is qualified. The press is dropped
+if the dead-man switch or START is released before that, or if the state changes.
 """
 
 from __future__ import annotations

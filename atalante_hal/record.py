@@ -1,6 +1,6 @@
 """Record of one cycle: a contiguous vector of all its values. The controller's `State` consists of views of it.
 
-The process image of the 1 ms messages decodes directly into the record. One copy moves the record into a telemetry ring.
+The process image of the 1 ms messages decodes directly into the record. The whole record is copied to a telemetry ring at once.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Record:
 
 
 def _fields(codec: Codec, controller_fields: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
-    """Return (name, length) of each record field: header, joint side, received signals, commands, controller fields."""
+    """Return (name, length) of each record field: header, joint-side values, received signals, commands, controller fields."""
     signals: dict[str, int] = {}
     for message, signal in codec.signals:
         name = _field_name(message, group_of(signal.name))

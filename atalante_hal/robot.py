@@ -46,8 +46,8 @@ class Envelope:
     """Reduction of the torque near the limits of position and velocity, see `limiter`."""
 
     look_ahead: float  # s, time ahead for which a joint at constant velocity must stay inside its position limits
-    position_margin: float  # rad, distance beyond a position limit at which the outward torque becomes 0
-    velocity_margin: float  # rad/s, excess over a velocity limit at which the accelerating torque becomes 0
+    position_margin: float  # rad, distance outside a position limit from which the outward torque is 0
+    velocity_margin: float  # rad/s, excess over a velocity limit from which the accelerating torque is 0
 
 
 @dataclass(frozen=True)
@@ -78,10 +78,10 @@ class Thresholds:
 
     supply_low: float  # V at a drive; below this voltage the battery is nearly empty
     supply_under: float  # V at a drive; below this voltage the drives may soon fail to hold
-    #: Smallest torque limit of a hot drive at which the robot may walk, as a share of the other leg's torque limit.
+    #: Smallest torque limit of a hot drive at which the robot may walk, as a share of the same limit of the other leg.
     derated_imbalance: float
     full_assist_ramp: float  # s, time for the ramp of the assistance factor from 0 to 1 in FULL_ASSIST
-    position_tolerance: float  # rad, distance beyond a position limit at which a joint counts as out of range
+    position_tolerance: float  # rad, distance outside a position limit from which a joint counts as out of range
     idle_torque: (
         float  # Nm, largest torque that a drive may report while off, and largest excess over its limit while on
     )
@@ -187,7 +187,7 @@ def load_robot(path: Path | None = None) -> Robot:
         path: Robot file (TOML); None: the `robot.toml` of this package.
 
     Returns:
-        The robot it describes.
+        Limits, gear ratios and sensor tolerances of the robot.
 
     Raises:
         RobotError: If the file cannot be read, or if a key is unknown, missing or outside its valid range.

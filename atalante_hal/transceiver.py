@@ -1,4 +1,4 @@
-"""Transceiver of the HAL: it sends only permitted frames, bounds the frames received in a cycle and reports bus faults.
+"""Transceiver of the HAL: it sends only permitted frames, limits how many are received in a cycle, and reports bus faults.
 
 `bus -> transceiver -> process image`, and back.
 
@@ -17,7 +17,7 @@ from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, Frames, as_words, header_word, new_frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Most frames that are received in one cycle; about 20 are cyclic.
+#: Largest number of frames received in one cycle. About 20 of them are cyclic.
 RECEIVE_BUDGET = 128
 #: Consecutive cycles after which a flood or a full transmit queue is confirmed.
 PERSISTENT = 5
@@ -52,7 +52,7 @@ class FrameTap(Protocol):
 
         Args:
             frames: Receive buffer, shape (m,).
-            count: Number of received frames at its start.
+            count: Number of received frames at the start of the buffer.
         """
 
 
@@ -81,7 +81,7 @@ class Transceiver:
             network: CAN network that defines the messages of the node.
             node: DBC name of the sending node, such as HAL.
             bus: Open bus. The caller owns it.
-            tap: Receiver of a copy of every frame; None: none.
+            tap: Receiver of a copy of every frame; None: no copy.
             cyclic: Number of frames received in a cycle without faults.
             surplus: Number of additional frames in a cycle above which a flood is reported, see `robot.Thresholds`.
         """
@@ -92,7 +92,7 @@ class Transceiver:
         self._most = cyclic + surplus
         #: Receive buffer, always the same array.
         self.scratch = new_frames(RECEIVE_BUDGET)
-        self._found: list[Finding] = []  # since the last call of `faults`
+        self._found: list[Finding] = []  # faults found since the last call of `faults`
         self._refused = 0  # consecutive cycles in which the transmit queue was full
         self._full_this_cycle = False
         self._asked = True  # the last batch was sent completely
@@ -145,12 +145,12 @@ class Transceiver:
                 self.tap.sent(batch.frames)
 
     def receive(self, count: int = 0, cycle: ReceiveImage | None = None, patience: float = 0.0) -> int:
-        """Receive frames into `scratch`, behind those already in it, up to `RECEIVE_BUDGET` frames.
+        """Receive frames into `scratch`, after the frames already in it, up to `RECEIVE_BUDGET` frames.
 
         Args:
             count: Number of frames already in `scratch`.
-            cycle: Process image whose messages are waited for; None: do not wait.
-            patience: Longest wait for them [s]. It is shortened if the last batch (their SYNC) was not sent.
+            cycle: Process image of the expected messages; None: do not wait for messages.
+            patience: Longest wait for the expected messages [s]. It is shortened if the last batch (their SYNC) was not sent.
 
         Returns:
             Number of frames now in `scratch`.
@@ -172,7 +172,7 @@ class Transceiver:
         return count
 
     def foreign(self, frames: Frames) -> None:
-        """Report received frames that are no messages to this node: error frames, its own messages and unknown messages.
+        """Report received frames that are not messages to this node: error frames, messages of this node and unknown frames.
 
         Args:
             frames: Received frames that are not in a process image, shape (n,).

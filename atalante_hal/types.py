@@ -34,7 +34,7 @@ class SupervisorState(IntEnum):
 
 @dataclass(slots=True)
 class State:
-    """Measured state of the robot in one cycle: joint side, SI units, joints in the order of `robot.JOINTS`.
+    """Measured state of the robot in one cycle: SI units, joint side of the gears, joints in the order of `robot.JOINTS`.
 
     The arrays are views of the HAL's memory and valid until the next `Hal.read()`. Copy values that are needed longer.
     Do not write into the arrays.
@@ -71,7 +71,7 @@ class Command:
     torque: Vector  # (12,) Nm at the joint
     vibration: Vector  # (8,) level, 0 to 1
     step: int | None = None  # number of the present step; None for a controller that does not walk
-    outside: bool = False  # True if a joint is outside its safe backward image; this only logs an event
+    outside: bool = False  # True if a joint is outside the virtual guide; this only logs an event
 
 
 class Controller(Protocol):

@@ -26,7 +26,7 @@ class Share(NamedTuple):
     """Frames of a batch that go to one channel."""
 
     link: Bus
-    indices: list[int]  # of the frames in the batch
+    indices: list[int]  # indices of these frames in the batch
     frames: Frames  # reused for each batch, because a bus caches memory views
 
 
@@ -59,10 +59,10 @@ class JoinedBus:
         self._shares: dict[bytes, list[Share]] = {}
         self._tails: dict[int, list[Frames]] = {}
         self._turn = (
-            0  # index of the channel that is read first; it rotates, because a busy channel could block the others
+            0  # index of the channel that is read first; rotates, because a busy channel could block the others
         )
         self._closed = False
-        self._failure: BusError | None = None  # of a channel in the present `receive`
+        self._failure: BusError | None = None  # error of a channel in the present `receive`
         files = [_file_of(link) for link in self._links]
         self._files = [file for file in files if file is not None]
         self._all_have_files = len(self._files) == len(files)

@@ -20,7 +20,7 @@ class PairBus:
 
     Args:
         name: Name of this end.
-        capacity: Number of frames that can be queued for this end. More raise `BusFull` at the peer.
+        capacity: Number of frames that can be queued for this end. Further frames raise `BusFull` at the peer.
 
     Attributes:
         step: Function that `receive()` calls when no frame is queued; None: no function is called.

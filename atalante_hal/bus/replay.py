@@ -1,7 +1,7 @@
 """Bus that replays a recorded log, for the HAL, the validator or the viewer.
 
-Frames have the order and the time stamps of the log. With `cycle_id`, the identifier of the first frame of a cycle (a SYNC),
-`receive()` also stops before each such frame, so that one call returns one cycle.
+Frames have the order and the time stamps of the log. With `cycle_id`, the identifier of the first frame of a cycle (SYNC),
+each call of `receive()` returns the frames of one cycle.
 """
 
 from __future__ import annotations

@@ -12,12 +12,12 @@ from atalante_hal.bus import Bus, BusDown
 from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.wire.frame import Frames
 
-#: Longest wait before a lost link is tried again [s], for callers that wait longer than this for a frame.
+#: Longest wait of one `receive` on a lost link [s]. The next call tries the link again.
 RETRY_PERIOD = 0.1
 
 
 class ResilientBus(WrappedBus):
-    """Bus that behaves as a disconnected cable while its link is lost: it drops sent frames and receives none.
+    """Bus that behaves like a disconnected cable while its link is lost: it drops sent frames and receives none.
 
     The first frame that is sent or received after a loss proves that the link is back.
 
@@ -54,7 +54,7 @@ class ResilientBus(WrappedBus):
 
         Args:
             frames: Receive buffer, shape (m,).
-            timeout: Longest wait for the first frame [s]; a lost link is tried again after `RETRY_PERIOD` at the latest.
+            timeout: Longest wait for the first frame [s]; at most `RETRY_PERIOD` while the link is lost.
 
         Returns:
             Number of received frames.

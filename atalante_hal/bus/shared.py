@@ -1,14 +1,14 @@
 """Embedded bus between two processes, in shared memory. The module `pair` is the variant within one process.
 
-Each end has a queue that only it writes and only the other end reads. After the frames it stores a frame counter, which makes
+Each end has a queue that only it writes and only the other end reads. It stores the frames and then a frame counter, which makes
 them visible to the reader. This requires that stores become visible in program order, as on x86-64. A waiting end polls the
-counter for a short time and then sleeps until the other end wakes it with a byte through a socket pair. The socket also detects
-the end of the other process, for any cause. Polling helps only if the two processes run on different cores.
+counter for a short time and then sleeps until the other end wakes it with a byte through a socket pair. The socket also reports
+that the other process has terminated, whatever the cause. Polling helps only if the two processes run on different cores.
 
 In lock-step one end is the client and the other the server. `receive()` of the client publishes its sent frames, requests one
 step of the server, and returns the frames that the server sends, or none when the step has ended. So both ends make the same
-sequence of calls as those of a `PairBus` and produce the same bytes. Only the work of a step after its answer runs in parallel
-with the client.
+sequence of calls as those of a `PairBus` and produce the same bytes. Only the work that the server does after its answer
+runs in parallel with the client.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ class SharedBus:
         """Serve the other end: call `step` for each of its requests, until the bus is down.
 
         Args:
-            step: Function that receives the queued frames and sends the answers. `receive` does not wait in it.
+            step: Function that receives the queued frames and sends the answers. While it runs, `receive` does not wait.
 
         Raises:
             BusDown: If the other end is closed or its process has ended.

@@ -88,7 +88,7 @@ class SocketCanBus:
 
     Args:
         channel: Name of the interface, such as `can0`.
-        capacity: Largest number of frames in one system call, and of those that one `receive()` returns.
+        capacity: Largest number of frames in one system call and in the result of one `receive()`.
         receive_buffer: Requested size of the kernel's receive buffer [bytes]; a frame takes about 1 kB. Without CAP_NET_ADMIN
             the kernel grants at most net.core.rmem_max.
 
@@ -310,7 +310,7 @@ class SocketCanBus:
         except (BusAbsent, OSError) as error:
             raise BusDown(f"{self.name} was removed and cannot be opened again: {error}") from error
         self._removed = False
-        self._lost_before = 0  # the kernel counts for each socket
+        self._lost_before = 0  # the kernel counts the lost frames of each socket from 0
 
 
 def require_channel(channel: str) -> None:

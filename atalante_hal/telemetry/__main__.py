@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _INSTALL = "install it with `pip install 'atalante-hal[telemetry]'`"
 
 
-#: Time limit for closing the Zenoh session [s]. SIGALRM then ends the process. The files are closed before.
+#: Time limit for closing the Zenoh session [s]. SIGALRM then ends the process. The files are already closed at that time.
 _SESSION_END = 1.0
 
 
@@ -44,7 +44,7 @@ class Outlets:
         records: Reader of the ring of cycle records.
         frames: Reader of the ring of CAN frames; None without a CAN log.
         restarts: Number of telemetry processes that this one replaces.
-        before: Endpoint of the last of them; None if there is none.
+        before: Endpoint of the last replaced process; None if there is none.
 
     Raises:
         SinkError: If a requested file or endpoint cannot be opened. A failure of the default endpoint (a free port of the

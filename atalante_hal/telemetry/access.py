@@ -1,7 +1,7 @@
 """Access control of the telemetry endpoint: TLS certificates and users, and the telemetry file with these settings.
 
-`telemetry file -> TelemetryConfig -> publisher`. Without these settings every client that reaches the endpoint may subscribe. On
-the default endpoint (loopback) these are the processes of this machine. A subscriber can only receive, see `publisher`.
+`telemetry file -> TelemetryConfig -> publisher`. Without these settings every client that reaches the endpoint may subscribe. The
+default endpoint (loopback) can be reached only from this machine. A subscriber can only receive, see `publisher`.
 """
 
 from __future__ import annotations

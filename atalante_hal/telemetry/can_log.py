@@ -1,8 +1,8 @@
 """CAN log with every frame that the HAL sent or received, in a file format of python-can.
 
-The suffix determines the format: `.log` (candump), `.asc`, `.blf`, `.log.gz` or `.asc.gz`. Each bus of the network is a channel:
-its name in `.log` (left_leg), its number in the order of the DBC, from 1, in the others. The same frames give identical files in
-`.log` and `.blf`, but not in `.asc` and `.gz`, which contain the date of writing.
+The suffix determines the format: `.log` (candump), `.asc`, `.blf`, `.log.gz` or `.asc.gz`. Each bus of the network is a channel.
+In `.log` the channel is the name of the bus (left_leg). In the other formats it is the number of the bus in the DBC, from 1. The
+same frames give identical `.log` and `.blf` files. Files in `.asc` and `.gz` differ, because they contain the date of writing.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Ring records with the CAN frames of the HAL, for a CAN log.
 
-The HAL passes its frame arrays to a `RingTap`. It copies them, one copy for each batch, into a record of up to 64 frames, and
-writes a full record to the ring every second or third cycle. The record does not contain the bus of a frame. The telemetry
+The HAL passes its frame arrays to a `RingTap`. It copies each array into a record of up to 64 frames, and writes the record to
+the ring when it is full, every second or third cycle. The record does not contain the bus of a frame. The telemetry
 process derives it from the identifier, which is unique in the network.
 """
 
@@ -53,7 +53,7 @@ class RingTap:
         self._used = 0
 
     def begin_run(self, base_ns: int) -> None:
-        """Set the reference time of the stamps of all following frames.
+        """Set the time to which the stamps of all following frames are relative.
 
         Args:
             base_ns: Time of stamp 0 [ns]: 0 on the wall clock, the start of the run in virtual time.
@@ -74,7 +74,7 @@ class RingTap:
 
         Args:
             frames: Receive buffer, shape (m,).
-            count: Number of received frames at its start.
+            count: Number of received frames at the start of the buffer.
         """
         self._add(frames, count, 0, self._stamps_of_batch() if self._stamps_of_batch is not None else None)
 

@@ -1,11 +1,11 @@
-"""Control loop's side of the telemetry: a context manager that owns the rings and the telemetry subprocess.
+"""Telemetry in the process of the control loop: a context manager that owns the rings and the telemetry subprocess.
 
 The subprocess is a new interpreter (`python -m atalante_hal.telemetry`, see `service`), not a fork. It has its own process group,
-so Ctrl-C in the terminal ends only the loop, which then closes the rings. The subprocess may be killed or stopped at any time.
-`write` never waits for it, except in lock-step with a recording or a CAN log, and then at most for the configured patience.
+so Ctrl-C in the terminal ends only the loop, which then closes the rings. The subprocess may be killed or suspended (SIGSTOP)
+at any time. `write` does not wait for it, except in lock-step with a recording or a CAN log, and then at most for `patience`.
 
 If the loop calls `tend` a few times a second, a subprocess that ended or hangs is replaced. The new one reads the same rings and
-listens on the same endpoint, or on another one if that is taken. It writes new files beside the first ones.
+listens on the same endpoint, or on another endpoint if the first is in use. It writes new files beside the first ones.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class TelemetryConfig:
 class Recording:
     """Files of the recording of a session, and whether they are complete.
 
-    Below 1000 Hz, the cycles between two messages count as recorded together with the second message.
+    At a recording rate below 1000 Hz, the cycles between two messages count as recorded as soon as the second message is.
     """
 
     files: tuple[str, ...]  # file names in order; each restart of the subprocess begins a new file
@@ -258,8 +258,8 @@ class TelemetryProcess(Closing):
     def tend(self) -> None:
         """Restart the subprocess in the background if it has ended or hangs. Call this a few times a second.
 
-        The replacement continues to read where the other one stopped, and writes numbered files. It listens on the same endpoint.
-        If that is taken, it uses another one or publishes nothing: `endpoint` then changes, or is None.
+        The new subprocess reads the records that the old one has not read, and writes numbered files. It listens on the same
+        endpoint. If this endpoint is in use, it listens on another (`endpoint` changes) or does not publish (`endpoint` is None).
         """
         if self._closed or self._child is None or (self._restarting is not None and self._restarting.is_alive()):
             return
@@ -327,7 +327,8 @@ class TelemetryProcess(Closing):
     def begin_run(self, name: str, about: Mapping[str, object] | None = None) -> None:
         """Begin a run, e.g. one guide shape; all following records belong to it.
 
-        The cycle time of a run begins at 0. Its log time begins now on the wall clock, or 1 s after the last record in lock-step.
+        The time in the records of a run begins at 0. Its log time begins at the present time, or in lock-step 1 s after the last
+        record.
 
         Args:
             name: Name of the run.
@@ -360,7 +361,7 @@ class TelemetryProcess(Closing):
 
     @property
     def alive(self) -> bool:
-        """Return whether the subprocess exists, running or stopped. The system call is too slow for every cycle."""
+        """Return whether the subprocess exists, even if it is suspended. Do not call this in every cycle: it is slow."""
         return self._child is not None and self._child.poll() is None
 
     @property

@@ -45,8 +45,8 @@ class Publisher(Closing):
         streams: (key, message type) of each stream; the stream of events is always added.
         listen: Zenoh endpoint such as tcp/127.0.0.1:7447; None: the first free port of the loopback from 7447 on.
         access: TLS and users.
-        before: Endpoint of the publisher that this one replaces, to which its subscribers reconnect. It is tried first if
-            `listen` is None.
+        before: Endpoint of the publisher that this one replaces. Its subscribers reconnect there, so this endpoint is tried first
+            if `listen` is None.
 
     Raises:
         SinkError: If the endpoint cannot be opened.
@@ -112,7 +112,7 @@ class Publisher(Closing):
         """
 
     def close(self) -> None:
-        """End the session. This fails after 10 s if a subscriber's process is stopped.
+        """End the session. This fails after 10 s if the process of a subscriber is suspended (SIGSTOP).
 
         Raises:
             SinkError: If Zenoh could not end the session.
@@ -136,7 +136,7 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
     own = [
         f"atalante/{robot}/**",
         f"atalante/{robot}/**/@adv/**",
-    ]  # "**" does not match a part of a key that begins with @
+    ]  # "**" does not match key parts such as @adv
     return {
         "mode": "peer",
         "listen": {"endpoints": [listen]},

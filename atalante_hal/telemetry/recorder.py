@@ -98,7 +98,7 @@ class Recorder(Closing):
         """Write the index and the statistics, and close the file.
 
         Raises:
-            SinkError: If the disk is full. Readers then scan the file, because it has no index.
+            SinkError: If the end of the file cannot be written. Readers then scan the file, because it has no index.
         """
         if self._file.closed:
             return

@@ -5,8 +5,9 @@ of written records. The slot after the newest record may be written at any time.
 again and discards the records that were overwritten meanwhile (a seqlock for the whole batch). This requires that stores become
 visible in program order, as on x86-64. On other processors a record could be read before its last bytes arrive.
 
-When the ring is full, the oldest record is overwritten and the reader counts the loss. A lossless ring waits for the reader
-instead, in short sleeps. If the reader's process has ended, or after its patience, it overwrites like any other ring.
+When the ring is full, the oldest record is overwritten and the reader counts the loss. The writer of a lossless
+ring waits for the reader instead, in short sleeps. It overwrites the oldest record only if the reader's process has ended or the
+longest wait (`patience`) is over.
 
 The memory is an anonymous file (memfd). It has no name, so nothing is left in /dev/shm after a crash. Its descriptor is passed
 to the reader's process (`pass_fds`). Writer and reader each hold a POSIX lock on one byte of the file. The kernel releases the
@@ -33,7 +34,7 @@ from atalante_hal.memory import anonymous_file
 MAGIC = int.from_bytes(b"ATLRING\0", "little")
 VERSION = 1
 
-# Indices of the 64-bit header words. Writer and reader have separate cache lines.
+# Indices of the 64-bit header words. The words of the writer and of the reader are in separate cache lines.
 _MAGIC, _VERSION, _RECORD_SIZE, _STRIDE, _SLOTS, _META_LENGTH, _NOTES_SIZE, _DATA = range(8)
 _WRITTEN, _CLOSED, _WRITER_PID, _NOTES_LENGTH, _LOSSLESS = range(8, 13)
 _READ, _LOST, _READER_PID, _KEPT = range(16, 20)
@@ -96,7 +97,7 @@ class _Ring:
 
     @property
     def meta(self) -> dict[str, Any]:
-        """Return the description of the records, as JSON types."""
+        """Return the metadata that the writer stored for the reader, such as the layout of the records, as JSON types."""
         length = self._header[_META_LENGTH]
         found: dict[str, Any] = json.loads(bytes(self._bytes[_HEADER_BYTES : _HEADER_BYTES + length]))
         return found
@@ -106,7 +107,7 @@ class _Ring:
         return _HEADER_BYTES + self._header[_META_LENGTH]
 
     def _lock(self, byte: int) -> bool:
-        """Lock one byte of the file, and return False if another process holds the lock."""
+        """Lock one byte of the file. Return False if another process keeps it locked."""
         for _ in range(_LOCK_TRIES):
             try:
                 fcntl.lockf(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, byte)
@@ -126,7 +127,7 @@ class _Ring:
             pid: Number of the process that locked it.
 
         Returns:
-            True if that process exists, running or stopped.
+            True if that process exists, even if it is suspended (SIGSTOP).
         """
         if pid == os.getpid():
             return True
@@ -151,8 +152,8 @@ class RingWriter(_Ring, Closing):
         record_size: Size of a record [bytes].
         slots: Number of slots, at least 2. `slots` - 1 records can wait for the reader.
         lossless: True: wait for the reader when the ring is full.
-        patience: Longest wait for the reader [s]. After it the ring is no longer lossless.
-        meta: Description of the records for the reader, as JSON types.
+        patience: Longest wait for the reader [s]. After a longer wait the ring is no longer lossless.
+        meta: Metadata for the reader, such as the layout of the records, as JSON types.
 
     Raises:
         RingError: If a size is too small.
@@ -209,7 +210,7 @@ class RingWriter(_Ring, Closing):
         self._offset = offset if offset < self._end else self._begin
 
     def _wait_for_reader(self) -> None:
-        """Wait until there is room for one record. After the longest wait, the ring overwrites its oldest records."""
+        """Wait until there is room for one record. If the wait is too long, make the ring overwrite its oldest records."""
         header, oldest = self._header, self._count - self._slots + 1
         give_up = time.monotonic() + self._patience
         while header[_READ] <= oldest:
@@ -251,7 +252,7 @@ class RingWriter(_Ring, Closing):
 
     @property
     def reader_alive(self) -> bool:
-        """Return whether a reader has attached and its process exists, running or stopped."""
+        """Return whether a reader has attached and its process exists, even if it is suspended (SIGSTOP)."""
         pid = self._header[_READER_PID]
         return pid != 0 and self._held(_READER_BYTE, pid)
 
@@ -260,7 +261,7 @@ class RingWriter(_Ring, Closing):
         self._header[_CLOSED] = 1
 
     def close(self) -> None:
-        """Mark the ring as closed and release the memory. The kernel frees it after the reader has closed, too."""
+        """Mark the ring as closed and release the memory. The kernel frees it when the reader has also released it."""
         if not self._map.closed:
             self.finish()
             self._release()
@@ -337,7 +338,7 @@ class RingReader(_Ring, Closing):
 
     @property
     def writer_alive(self) -> bool:
-        """Return whether the writer's process exists, running or stopped."""
+        """Return whether the writer's process exists, even if it is suspended (SIGSTOP)."""
         return self._held(_WRITER_BYTE, self._header[_WRITER_PID])
 
     def close(self) -> None:

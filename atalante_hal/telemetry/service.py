@@ -53,7 +53,7 @@ class Service:
         encoder: Encoder for the layout of the records; None without a sink for messages.
         sinks: Each sink with the number of cycles between two messages of a stream.
         loop_every: Number of cycles between two messages of loop statistics.
-        can_log: Writer of the CAN log; None: none.
+        can_log: Writer of the CAN log; None without a CAN log.
         recorder: The element of `sinks` that writes the recording; its saved records are counted in the ring.
     """
 
@@ -105,7 +105,7 @@ class Service:
 
     def step(self) -> bool:
         """Process the contents of the rings and return whether there were any."""
-        # Read the events before the notes: the note of a run is written before the events of the run.
+        # Read the events before the notes. They are written in the opposite order, so the run of each event is known here.
         events = [unpack(bytes(event)) for event in self._events.read()]
         records = self._records.read()
         first = self._records.position - len(records)

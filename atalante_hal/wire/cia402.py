@@ -55,7 +55,7 @@ TRANSITIONS: dict[tuple[DriveState, Controlword], DriveState] = {
     (_S.FAULT, _C.FAULT_RESET): _S.SWITCH_ON_DISABLED,
 }
 
-#: Transitions without a controlword (CiA 402): 1 after the start of the drive, 14 after its fault reaction.
+#: Transitions without a controlword: transition 1 of CiA 402 after the start of a drive, and 14 after its fault reaction.
 AUTOMATIC: dict[DriveState, DriveState] = {
     _S.NOT_READY_TO_SWITCH_ON: _S.SWITCH_ON_DISABLED,
     _S.FAULT_REACTION_ACTIVE: _S.FAULT,

@@ -26,7 +26,7 @@ CRC_START = 0xFFFF
 CRC_BYTES = 2
 #: Offset of the alive counter in the payload [bytes].
 COUNTER_BYTE = 2
-#: Largest counter step that is accepted as new data: up to four frames in a row may be lost.
+#: Largest increase of the counter that is accepted as new data: up to four frames in a row may be lost.
 MAX_DELTA = 5
 
 
@@ -71,7 +71,7 @@ _TABLE = np.array([crc_hqx(bytes([octet]), 0) for octet in range(256)], np.int64
 
 
 def protected_spans(messages: Sequence[Message]) -> Words:
-    """Return the begin and end of each row's payload [bytes], and its Data ID.
+    """Return for each row the begin and end of its payload [bytes], and its Data ID.
 
     Args:
         messages: message of each row of frames.
@@ -178,9 +178,9 @@ BAD_CYCLE = 4
 GOOD_CYCLE = 1
 #: Level of the leaky bucket at which the message loses its trust.
 FULL = 64
-#: Number of consecutive good cycles after which a message is trusted. Inputs of a pendant are ignored before.
+#: Number of consecutive good cycles after which a message is trusted. Until then the inputs of a pendant are ignored.
 REQUALIFY = 16
-#: Evidence of two senders that a cycle with frames of both adds. Four such cycles reach `FULL`.
+#: Increase of the evidence of two senders after a cycle with frames of both. Four such cycles reach `FULL`.
 RIVAL_CYCLE = 16
 
 
@@ -223,6 +223,6 @@ def suspect(evidence: int, *, rival: bool) -> int:
         rival: True if this cycle has a frame that cannot be from the sender of the accepted frame.
 
     Returns:
-        Evidence, 0 to `FULL`, at which two senders are confirmed. A cycle without a rival removes `GOOD_CYCLE`.
+        Evidence, 0 to `FULL`. `FULL` confirms two senders. A cycle without a rival removes `GOOD_CYCLE`.
     """
     return min(evidence + RIVAL_CYCLE, FULL) if rival else max(evidence - GOOD_CYCLE, 0)
