@@ -17,7 +17,6 @@ class Senders:
 
     def __init__(self, message: Message) -> None:
         self._message = message
-        self._data_id = data_id_bytes(message.data_id)
         self._last: bytes | None = None  # payload received last
         self._last_cycle = -1
 
@@ -32,16 +31,22 @@ class Senders:
             self._last = None
         self._last_cycle = cycle
         two, first = False, True
-        for payload in self._intact(frames):
+        for payload in intact_payloads(self._message, frames):
             if self._last is not None and payload != self._last:
                 step = (payload[COUNTER_BYTE] - self._last[COUNTER_BYTE]) & 0xFF
                 two |= step == 0 or (step != 1 and not first)
             self._last, first = payload, False
         return two
 
-    def _intact(self, frames: Frames) -> list[bytes]:
-        """Return the payloads of all frames of the message with correct length and CRC."""
-        message = self._message
-        candidates = frames[(frames["can_id"] == message.frame_id) & (frames["len"] == message.length)]
-        payloads = [frame["data"][: message.length].tobytes() for frame in candidates]
-        return [p for p in payloads if crc(p[CRC_BYTES:], self._data_id) == int.from_bytes(p[:CRC_BYTES], "little")]
+
+def intact_payloads(message: Message, frames: Frames) -> list[bytes]:
+    """Return the payloads of all frames of a message with correct length and CRC.
+
+    Args:
+        message: message of the DBC.
+        frames: received frames, shape (n,). Other messages are ignored.
+    """
+    data_id = data_id_bytes(message.data_id)
+    candidates = frames[(frames["can_id"] == message.frame_id) & (frames["len"] == message.length)]
+    payloads = [frame["data"][: message.length].tobytes() for frame in candidates]
+    return [p for p in payloads if crc(p[CRC_BYTES:], data_id) == int.from_bytes(p[:CRC_BYTES], "little")]

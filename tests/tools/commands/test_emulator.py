@@ -16,6 +16,7 @@ from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.frame import Frames, new_frames
+from atalante_hal.wire.process_image import TransmitImage
 from atalante_tools.cli import cli
 from atalante_tools.commands import emulator as emulator_module
 from atalante_tools.console.stop_request import StopRequest
@@ -27,8 +28,8 @@ class OtherProcess:
     """HAL at the other end of the bus: one cycle per poll of the emulator, and SIGINT after `cycles` cycles."""
 
     def __init__(self, network: Network, robot: Robot, cycles: int, monkeypatch: pytest.MonkeyPatch) -> None:
-        ours, self.bus = lockstep_pair()
-        self.hal = Hal(network, robot, ours)
+        self.hal_bus, self.bus = lockstep_pair()
+        self.hal = Hal(network, robot, self.hal_bus)
         self.stop = StopRequest()
         self.tap: list[Frames] = []
         self.pendant_bus: PairBus | None = None
@@ -42,6 +43,7 @@ class OtherProcess:
             yield self.stop
 
         monkeypatch.setattr(emulator_module, "stop_requested", stop_requested)
+        monkeypatch.setattr(emulator_module, "LISTEN", 0.0)
 
     def cycle(self) -> None:
         if self.stop.wanted:
@@ -121,6 +123,42 @@ def test_the_status_line_counts_cycles_frames_and_drives(
     cycles, came, went = (int(word) for word in lines[-1].split() if word.isdigit() and word != "12")
     assert came == 7 * cycles
     assert 19 * cycles < went < 21 * cycles
+
+
+def test_it_does_not_start_while_another_robot_answers(
+    network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = OtherProcess(network, robot, 400, monkeypatch)
+    monkeypatch.setattr(emulator_module, "LISTEN", 5.0)
+    other.bus.step = lambda: None
+    other.hal_bus.send(TransmitImage([network.message("LEFT_SH_STATE")]).seal(7))
+    result = other.run()
+    assert result.exit_code == 1
+    assert result.stderr == "atalante: another robot answers on pcan test (received LEFT_SH_STATE): stop it first\n"
+    assert other.hal_bus.receive(new_frames(1)) == 0
+
+
+def test_a_robot_that_comes_later_is_reported_once(
+    network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(emulator_module, "STATUS_PERIOD", 1e-9)
+    other = OtherProcess(network, robot, 40, monkeypatch)
+    image, cycle = TransmitImage([network.message("IMU_TORSO_STATE")]), other.bus.step
+
+    def with_another_robot() -> None:
+        cycle()
+        if other.hal.state.cycle > 20:
+            other.hal_bus.send(image.seal(other.hal.state.cycle & 0xFF))
+
+    other.bus.step = with_another_robot
+    result = other.run()
+    assert result.exit_code == 130, result.stderr
+    said = result.stderr.splitlines()
+    notice = "another robot answers, too (received IMU_TORSO_STATE): stop one of them; the HAL refuses START"
+    assert said.count(notice) == 1
+    after = [line for line in said[said.index(notice) :] if "cycles" in line]
+    assert after[-1].endswith("drives: 12 SWITCH_ON_DISABLED; another robot answers, too")
+    assert not any("another robot" in line for line in said[: said.index(notice)])
 
 
 @pytest.mark.parametrize(

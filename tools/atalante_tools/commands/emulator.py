@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from atalante_tools.console.options import SEED, Between, Target, patient_options, target_options
+from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import StopRequest, stop_requested
 from atalante_tools.console.terminal import Progress, say
 
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 STATUS_PERIOD: Final = 1.0
 #: Longest wait for a SYNC in lock-step [s]. After it, the stop request is checked.
 POLL_TIMEOUT: Final = 0.1
+#: Time to listen for another robot before the first frame [s]. Without a HAL, each node sends its status every 0.1 s.
+LISTEN: Final = 0.25
 
 
 @click.command()
@@ -47,7 +50,7 @@ def command(target: Target, seed: int, operator: bool, xi: float | None, patient
     """Emulate the robot on a bus: drives, IMUs, feet, vibration motors and the operator's pendant.
 
     With --wall the emulator runs in real time. With --lockstep it advances by one cycle at each SYNC of the HAL. If the
-    interface goes down, the emulator waits until it is up again.
+    interface goes down, the emulator waits until it is up again. It does not start if another robot answers on the bus.
 
     --mass and --height adjust the leg lengths to a patient. `atalante airwalk` requires the same values. The emulated
     exoskeleton is empty and suspended in the air.
@@ -76,8 +79,10 @@ def command(target: Target, seed: int, operator: bool, xi: float | None, patient
         from atalante_emulator.pendant import Operator
         from atalante_tools.commands.emulator_line import Line
 
-        bus = Line(join(network, open_buses(network, target)), network.message("PENDANT_STATE").frame_id)
+        bus = Line(join(network, open_buses(network, target)), network)
         try:
+            if message := bus.listen(LISTEN):
+                raise Failed(f"another robot answers on {target} (received {message}): stop it first")
             pendant = Operator(xi) if operator else None
             emulator = Emulator(network, robot, body, bus, seed=seed, operator=pendant)
             say(f"the emulated robot is on {target}; now type in another terminal: {other_side}")
@@ -114,9 +119,14 @@ def end_condition(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[
     """
     progress = Progress(period=STATUS_PERIOD)
     has_pendant = emulator.operator is not None
+    alone = True
 
     def is_over() -> bool:
-        nonlocal has_pendant
+        nonlocal has_pendant, alone
+        if alone and bus.other_robot:
+            alone = False
+            progress.clear()
+            say(f"another robot answers, too (received {bus.other_robot}): stop one of them; the HAL refuses START")
         if has_pendant and bus.pendant_displaced:
             has_pendant = False
             progress.clear()
@@ -131,7 +141,7 @@ def end_condition(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[
 
 
 def status_line(emulator: Emulator, bus: Line) -> str:
-    """Return the status line with cycles, frames and drive states. If the interface is down, the line contains its error.
+    """Return the status line with cycles, frames and drive states. It also names another robot, and the error of the interface.
 
     Args:
         emulator: Emulator whose status is printed.
@@ -141,4 +151,5 @@ def status_line(emulator: Emulator, bus: Line) -> str:
     drives = ", ".join(f"{count} {name}" for name, count in states.items())
     lost = f", {emulator.frames_lost} lost" if emulator.frames_lost else ""
     down = f"; {bus.down}" if bus.down else ""
-    return f"{emulator.cycle} cycles, {bus.received} frames in, {bus.sent} out{lost}; drives: {drives}{down}"
+    other = "; another robot answers, too" if bus.other_robot else ""
+    return f"{emulator.cycle} cycles, {bus.received} frames in, {bus.sent} out{lost}; drives: {drives}{other}{down}"

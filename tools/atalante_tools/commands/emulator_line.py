@@ -5,41 +5,90 @@ HAL <-> bus <-> Line <-> emulated nodes
 
 from __future__ import annotations
 
+import time
+from typing import Final
+
+import numpy as np
+
+from atalante_dbc import Network
+from atalante_emulator.collision import intact_payloads
 from atalante_hal.bus import Bus
 from atalante_hal.bus.resilient import ResilientBus
-from atalante_hal.wire.frame import Frames
+from atalante_hal.wire.e2e import COUNTER_BYTE, check_counter
+from atalante_hal.wire.frame import Frames, new_frames
+from atalante_tools.session.takeover import PendantReader, Takeover
+
+#: Time without a frame of another pendant after which the emulated pendant sends again [cycles]. It is longer than the time of a
+#: pendant process, so that the process sends first.
+PENDANT_QUIET: Final = 12
+#: Number of consecutive frames of one message after which another robot is recognised.
+ROBOT_FRAMES: Final = 3
 
 
 class Line(ResilientBus):
-    """Bus of the emulated robot. It counts frames, and drops the emulated pendant's frames if another pendant sends.
+    """Bus of the emulated robot. It counts frames, and recognises other senders of the emulated nodes' messages.
+
+    The frames of the emulated pendant are dropped during and after a takeover by another pendant, see `takeover`.
 
     Attributes:
         sent: Number of frames sent so far.
         received: Number of frames received so far.
-        pendant_displaced: Whether another pendant has sent a frame.
+        other_robot: Message of the emulated nodes that another robot sends. Empty: no other robot was recognised.
     """
 
-    def __init__(self, bus: Bus, pendant_id: int) -> None:
+    def __init__(self, bus: Bus, network: Network) -> None:
+        """Wrap a bus.
+
+        Args:
+            bus: Open bus that carries the frames of all buses. `close` closes it, too.
+            network: Nodes and messages of the DBC.
+        """
         super().__init__(bus)
-        self._pendant_id = pendant_id
+        self._takeover = Takeover(established=True, quiet=PENDANT_QUIET)
+        self._pendant = PendantReader(network, self._takeover)
+        self._pendant_ids = [m.frame_id for m in network.sent_by("PENDANT")]
+        nodes = [node.name for node in network.nodes if node.kind not in ("master", "pendant")]
+        self._own = {m.frame_id: m for name in nodes for m in network.sent_by(name)}
+        self._in_row: dict[int, tuple[int, int]] = {}  # identifier -> last counter, number of consecutive frames
         self.sent = 0
         self.received = 0
-        self.pendant_displaced = False
+        self.other_robot = ""
+
+    @property
+    def pendant_displaced(self) -> bool:
+        """Return whether another pendant has taken over from the emulated pendant."""
+        return self._takeover.lost
+
+    def listen(self, seconds: float) -> str:
+        """Check that no other robot sends, before the first frame is sent. Drop all received frames.
+
+        Args:
+            seconds: Longest time to listen [s].
+
+        Returns:
+            Name of the first message received from another robot. Empty if there is none.
+        """
+        block, deadline = new_frames(256), time.monotonic() + seconds
+        while (left := deadline - time.monotonic()) > 0.0:
+            count = super().receive(block, left)
+            if found := self._from_another_robot(block[:count]):
+                return self._own[found[0][0]].name
+        return ""
 
     def send(self, frames: Frames) -> None:
-        """Send frames as `ResilientBus.send`, without those of the emulated pendant after a takeover.
+        """Send frames as `ResilientBus.send`, without those of the emulated pendant if another pendant sends.
 
         Args:
             frames: Frames to send.
         """
-        if self.pendant_displaced:
+        if not self._takeover.sends:
             frames = self._without_pendant(frames)
         super().send(frames)
         if not self.down:
             self.sent += len(frames)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Receive frames as `ResilientBus.receive`, and recognise another pendant.
+        """Receive frames as `ResilientBus.receive`, and recognise another pendant and another robot.
 
         Args:
             frames: Buffer for the received frames.
@@ -47,11 +96,30 @@ class Line(ResilientBus):
         """
         count = super().receive(frames, timeout)
         self.received += count
-        if not self.pendant_displaced and (frames["can_id"][:count] == self._pendant_id).any():
-            self.pendant_displaced = True
+        if not self._takeover.lost:
+            self._pendant.read(frames, count)
+        if not self.other_robot:
+            for can_id, counter in self._from_another_robot(frames[:count]):
+                last, in_row = self._in_row.get(can_id, (None, 0))
+                in_row = in_row + 1 if check_counter(last, counter).fresh else 1
+                self._in_row[can_id] = counter, in_row
+                if in_row >= ROBOT_FRAMES:
+                    self.other_robot = self._own[can_id].name
         return count
+
+    def _from_another_robot(self, frames: Frames) -> list[tuple[int, int]]:
+        """Return identifier and counter of the intact frames that only the emulated nodes may send. The pendant is left out."""
+        ids = frames["can_id"].tolist()
+        if self._own.keys().isdisjoint(ids):
+            return []
+        return [
+            (can_id, payload[COUNTER_BYTE])
+            for index, can_id in enumerate(ids)
+            if can_id in self._own
+            for payload in intact_payloads(self._own[can_id], frames[index : index + 1])
+        ]
 
     def _without_pendant(self, frames: Frames) -> Frames:
         """Return all frames except the frames of the pendant."""
-        kept = frames["can_id"] != self._pendant_id
+        kept = np.isin(frames["can_id"], self._pendant_ids, invert=True)
         return frames if kept.all() else frames[kept]

@@ -1,11 +1,11 @@
 """PENDANT node of the network: answers each SYNC with `PENDANT_STATE`, and sends `PENDANT_STATUS` at its period.
 
-Only one pendant sends at a time. A new pendant listens first and copies the signals of the older pendant: request counter,
-dead-man switch and assistance factor. The older pendant stops sending when it receives a frame with its own identifier.
+Only one pendant sends at a time, see `takeover`. A new pendant listens first and copies the signals of the older pendant: request
+counter, dead-man switch and assistance factor. The older pendant stops sending when it receives frames of the new pendant.
 
-During the takeover both pendants answer the same SYNC in one or two cycles. Both frames have the same counter, the low byte of
-the signal Cycle in SYNC. The HAL accepts the first frame. It reports the second frame as a repetition, or as a second sender if
-the contents differ. After four such cycles the HAL holds the robot.
+During the takeover both pendants answer the same SYNC in two cycles. Both frames have the same counter, the low byte of the
+signal Cycle in SYNC. The HAL accepts the first frame. It reports the second frame as a repetition, or as a second sender if the
+contents differ. After four such cycles the HAL holds the robot.
 """
 
 from __future__ import annotations
@@ -17,20 +17,14 @@ from typing import Final
 from atalante_dbc import Network
 from atalante_hal.bus import Bus, BusFull
 from atalante_hal.types import PERIOD, SupervisorState
-from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.frame import Frames, new_frames
-from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
+from atalante_hal.wire.process_image import TransmitImage
+from atalante_tools.session.takeover import PendantReader, Takeover
 
-#: Duration of a takeover [cycles]. In this time the older pendant must stop sending.
-TAKEOVER_CYCLES: Final = 50
-#: Last part of a takeover, in which the older pendant must not send any frame [cycles].
-QUIET_CYCLES: Final = 10
 #: NMT state of an operational node (CiA 301).
 OPERATIONAL: Final = 5
 #: Firmware version reported in PENDANT_STATUS.
 FIRMWARE_VERSION: Final = 0x0100
-#: Values of `Check` for a frame with a valid CRC. Such a frame with the identifier of the pendant comes from another pendant.
-_FROM_ANOTHER: Final = (Check.OK, Check.SOME_LOST, Check.REPEATED, Check.CONFLICT, Check.WRONG_SEQUENCE)
 
 
 class Request(IntEnum):
@@ -49,30 +43,24 @@ class PendantNode:
         hal: State of the HAL in the last SYNC. None: no SYNC received.
         cycles: Number of received SYNCs.
         answered: Number of answered SYNCs.
-        found_another: Whether a frame of another pendant was received before `start_sending()`.
-        displaced: Whether another pendant took over from this node.
-        takeover_failed: Whether this node stopped because the older pendant did not stop sending.
+        found_another: Whether another pendant sent before `start_sending()`.
     """
 
-    def __init__(self, network: Network, bus: Bus) -> None:
+    def __init__(self, network: Network, bus: Bus, *, seed: int | None = None) -> None:
         """Set up the process images of the node.
 
         Args:
             network: Nodes and messages of the DBC.
             bus: Bus that carries `PENDANT_STATE`.
+            seed: Seed of the random cycles of a takeover. None: random seed of the operating system.
         """
         state, status = network.message("PENDANT_STATE"), network.message("PENDANT_STATUS")
-        sync = next(m for m in network.sent_by("HAL") if m.bus == state.bus and m.name.startswith("SYNC_"))
         self._bus = bus
-        self._received = ReceiveImage([sync, state])
-        self._sync_row, self._state_row = (self._received.codec.rows[m.name] for m in (sync, state))
-        self._ids = {sync.frame_id, state.frame_id}
+        self._takeover = Takeover(seed=seed)
+        self._reader = PendantReader(network, self._takeover)
         self._scratch = new_frames(128)
         self._tx, self._status = TransmitImage([state]), TransmitImage([status])
         self._at = {s.name: self._tx.codec.index(state.name, s.name) for s in state.signals}
-        self._received_index = {s.name: self._received.codec.index(state.name, s.name) for s in state.signals}
-        self._hal_at = self._received.codec.index(sync.name, "HalState")
-        self._cycle_at = self._received.codec.index(sync.name, "Cycle")
         for name, value in (
             ("NodeState", OPERATIONAL),
             ("DbcHash", network.hash32),
@@ -82,17 +70,25 @@ class PendantNode:
         self._uptime_at = self._status.codec.index(status.name, "Uptime")
         self._status_cycles = status.cycle_ms
         self._sending = False
-        self._other_at = -TAKEOVER_CYCLES  # value of `answered` when the last frame of another pendant arrived
         self.hal: SupervisorState | None = None
         self.cycles = 0
         self.answered = 0
         self.found_another = False
-        self.displaced = False
-        self.takeover_failed = False
+
+    @property
+    def displaced(self) -> bool:
+        """Return whether another pendant took over from this node."""
+        return self._takeover.lost and self._takeover.established
+
+    @property
+    def takeover_failed(self) -> bool:
+        """Return whether this node gave up its takeover because another pendant did not stop sending."""
+        return self._takeover.lost and not self._takeover.established
 
     def start_sending(self) -> None:
         """Answer every SYNC from now on."""
         self._sending = True
+        self._takeover.start()
 
     @property
     def dead_man(self) -> bool:
@@ -131,45 +127,33 @@ class PendantNode:
         Returns:
             Whether a SYNC was received.
         """
-        count = self._bus.receive(self._scratch, timeout)
-        if self._ids.isdisjoint(self._scratch["can_id"][:count].tolist()):
+        was_silent = self._takeover.silent
+        synced = self._reader.read(self._scratch, self._bus.receive(self._scratch, timeout))
+        if not self._sending and self._takeover.present:
+            self.found_another = True
+            self._copy_signals()
+        if self._takeover.silent and not was_silent:
+            self._release_start()
+        if not synced:
             return False
-        image = self._received
-        image.new_cycle()
-        image.accept_each(self._scratch, count)
-        state = Check(image.check[self._state_row])
-        if state in _FROM_ANOTHER:
-            self._other_received(state)
-        if not Check(image.check[self._sync_row]).fresh:
-            return False
-        self.hal = SupervisorState(int(image.values[self._hal_at]))
+        self.hal = SupervisorState(self._reader.hal_state)
         self.cycles += 1
-        if self._sending:
+        if self._takeover.sends:
             self._answer()
         return True
 
-    def _other_received(self, check: Check) -> None:
-        if not self._sending:
-            if check.fresh:
-                self.found_another = True
-                self._copy_signals()
-            return
-        if self.answered > TAKEOVER_CYCLES:
-            self._sending = False
-            self.displaced = True
-        self._other_at = self.answered
-
     def _copy_signals(self) -> None:
         """Copy the signals of the other pendant. The HAL then receives the same values from both pendants."""
-        for name, index in self._at.items():
-            self._tx.values[index] = self._received.values[self._received_index[name]]
+        for name, value in self._reader.other.items():
+            self._tx.values[self._at[name]] = value
+
+    def _release_start(self) -> None:
+        """Release START: after the silence, a request counter other than the other pendant's would count as a new press."""
+        if self._tx.values[self._at["Request"]] == Request.START:
+            self._tx.values[self._at["Request"]] = Request.NONE
 
     def _answer(self) -> None:
-        if self.answered == TAKEOVER_CYCLES and self._other_at > TAKEOVER_CYCLES - QUIET_CYCLES:
-            self._sending = False
-            self.takeover_failed = True
-            return
-        self._send(self._tx.seal(int(self._received.values[self._cycle_at]) & 0xFF))
+        self._send(self._tx.seal(self._reader.tag))
         if self.answered % self._status_cycles == 0:
             self._status.values[self._uptime_at] = self.answered * PERIOD
             self._send(self._status.seal())

@@ -1,0 +1,187 @@
+"""Takeover rule of the pendants: after any takeover exactly one pendant sends.
+
+    SYNC and frames of other pendants -> PendantReader -> Takeover -> answer or silence
+
+A pendant answers each SYNC with a frame whose counter is the low byte of the signal Cycle. Only an intact frame with the counter
+of the present SYNC comes from another pendant. A damaged, old or replayed frame changes nothing.
+
+A pendant that receives such frames stops sending and listens. If the other pendant continues, the listening pendant gives up. If
+no frame comes, it sends again. An established pendant stops at once, and a new pendant at a random cycle of its takeover. Two
+pendants that stop together therefore draw again, until one of them hears the other.
+"""
+
+from __future__ import annotations
+
+from random import Random
+from typing import Final
+
+from atalante_dbc import Message, Network
+from atalante_hal.wire.e2e import COUNTER_BYTE, MAX_DELTA, Check
+from atalante_hal.wire.frame import Frames
+from atalante_hal.wire.process_image import ReceiveImage
+
+#: Shortest time in which a new pendant sends before it may stop [cycles]. In this time the older pendant stops sending.
+TAKEOVER_CYCLES: Final = 50
+#: Shortest time in which a pendant sends again after a silence before it may stop again [cycles].
+RETRY_CYCLES: Final = 8
+#: Range of the random time that is added to `TAKEOVER_CYCLES` and `RETRY_CYCLES` [cycles].
+DRAW_CYCLES: Final = 50
+#: Number of consecutive frames of another pendant after which a pendant stops sending. The HAL tolerates three such cycles.
+PRESENT_FRAMES: Final = 2
+#: Number of consecutive frames of another pendant after which a silent pendant gives up.
+LOST_FRAMES: Final = 3
+#: Time without a frame of another pendant after which a silent pendant sends again [cycles]. The HAL times out after 5.
+QUIET_CYCLES: Final = 3
+#: Values of `Check` for a frame with a valid CRC.
+_INTACT: Final = (Check.OK, Check.SOME_LOST, Check.REPEATED, Check.CONFLICT, Check.WRONG_SEQUENCE)
+
+
+class Takeover:
+    """Takeover rule of one pendant. It decides whether the pendant answers the present SYNC.
+
+    Attributes:
+        established: Whether this pendant was the only one at the end of its takeover.
+        silent: Whether this pendant stopped sending to listen for another pendant.
+        lost: Whether this pendant gave up. It never sends again.
+    """
+
+    def __init__(self, *, established: bool = False, quiet: int = QUIET_CYCLES, seed: int | None = None) -> None:
+        """Start as a listener, or as an established pendant that sends.
+
+        Args:
+            established: Whether this pendant sends from the beginning, and stops for each new pendant.
+            quiet: Time without a frame of another pendant after which this pendant sends again [cycles].
+            seed: Seed of the random cycles. None: random seed of the operating system.
+        """
+        self._quiet, self._random = quiet, Random(seed)
+        self._sending = self.established = established
+        self.silent = self.lost = False
+        self._tag = -1  # counter of the answers to the present SYNC; -1 before the first SYNC
+        self._cycle = 0  # number of SYNCs
+        self._free_from = 0  # cycle from which this pendant may stop sending
+        self._quiet_from = 0  # first cycle without a frame of another pendant
+        self._heard_at = -MAX_DELTA - 1  # cycle of the last frame of another pendant
+        self._heard = 0  # consecutive frames of another pendant
+
+    @property
+    def present(self) -> bool:
+        """Return whether another pendant sends."""
+        return self._heard >= PRESENT_FRAMES and self._cycle - self._heard_at <= MAX_DELTA
+
+    @property
+    def sends(self) -> bool:
+        """Return whether this pendant answers the present SYNC."""
+        return self._sending and not self.silent and not self.lost
+
+    def start(self) -> None:
+        """Begin the takeover as a new pendant: answer each SYNC from now on."""
+        self._sending = True
+        self._free_from = self._cycle + 1 + TAKEOVER_CYCLES + self._random.randrange(DRAW_CYCLES)
+
+    def sync(self, tag: int) -> None:
+        """Begin a cycle with a SYNC.
+
+        Args:
+            tag: Counter of the answers to this SYNC, 0 to 255.
+        """
+        self._cycle += 1
+        self._tag = tag
+        if self.silent and self._cycle - self._quiet_from >= self._quiet:
+            self.silent = False
+            self._free_from = self._cycle + RETRY_CYCLES + self._random.randrange(DRAW_CYCLES)
+        elif self.sends and self._cycle >= self._free_from:
+            if self.present:
+                self.silent = True
+                self._quiet_from, self._heard = self._cycle, 0
+            else:
+                self.established = True
+
+    def answer(self, counter: int) -> bool:
+        """Count an intact frame of another pendant if it answers the present SYNC.
+
+        Args:
+            counter: Alive counter of the frame, 0 to 255.
+
+        Returns:
+            Whether the frame answers the present SYNC, and is the first such frame.
+        """
+        if counter != self._tag or self._heard_at == self._cycle:
+            return False
+        in_row = self._cycle - self._heard_at <= MAX_DELTA
+        self._heard = self._heard + 1 if in_row else 1
+        self._heard_at, self._quiet_from = self._cycle, self._cycle + 1
+        if self.silent and self._heard >= LOST_FRAMES:
+            self.lost, self.silent = True, False
+        return True
+
+
+class PendantReader:
+    """Reader of the frames on the bus of the pendant: passes each SYNC and each frame of another pendant to the takeover rule.
+
+    Attributes:
+        tag: Counter of the answers to the last SYNC, 0 to 255.
+        hal_state: Signal HalState of the last SYNC.
+        other: Signals of the last frame of another pendant that answered its SYNC, by name. Empty before.
+    """
+
+    def __init__(self, network: Network, takeover: Takeover) -> None:
+        """Set up the process image of the reader.
+
+        Args:
+            network: Nodes and messages of the DBC.
+            takeover: Rule that receives the events.
+        """
+        state, sync = pendant_messages(network)
+        self._takeover = takeover
+        self._image = ReceiveImage([sync, state])
+        rows, index = self._image.codec.rows, self._image.codec.index
+        self._sync_row, self._state_row = rows[sync.name], rows[state.name]
+        self._ids = {sync.frame_id, state.frame_id}
+        self._state_index = {s.name: index(state.name, s.name) for s in state.signals}
+        self._hal_index, self._cycle_index = index(sync.name, "HalState"), index(sync.name, "Cycle")
+        self.tag = 0
+        self.hal_state = 0
+        self.other: dict[str, float] = {}
+
+    def read(self, frames: Frames, count: int) -> bool:
+        """Read received frames in the order of the bus. Other messages are ignored.
+
+        Args:
+            frames: Receive buffer.
+            count: Number of received frames at the start of the buffer.
+
+        Returns:
+            Whether a SYNC is among them.
+        """
+        synced = False
+        for index, can_id in enumerate(frames["can_id"][:count].tolist()):
+            if can_id in self._ids:
+                synced |= self._read_one(frames[index : index + 1])
+        return synced
+
+    def _read_one(self, frame: Frames) -> bool:
+        """Read one frame, shape (1,). Return whether it is a SYNC."""
+        image = self._image
+        image.new_cycle()
+        image.accept_each(frame, 1)
+        if (check := Check(image.check[self._state_row])) in _INTACT:
+            counter = int(frame["data"][0, COUNTER_BYTE])
+            if self._takeover.answer(counter) and check.fresh:
+                self.other = {name: float(image.values[at]) for name, at in self._state_index.items()}
+        if not Check(image.check[self._sync_row]).fresh:
+            return False
+        self.tag = int(image.values[self._cycle_index]) & 0xFF
+        self.hal_state = int(image.values[self._hal_index])
+        self._takeover.sync(self.tag)
+        return True
+
+
+def pendant_messages(network: Network) -> tuple[Message, Message]:
+    """Return the cyclic message of the pendant, and the SYNC that it answers.
+
+    Args:
+        network: Nodes and messages of the DBC.
+    """
+    state = network.message("PENDANT_STATE")
+    sync = next(m for m in network.sent_by("HAL") if m.bus == state.bus and m.name.startswith("SYNC_"))
+    return state, sync
