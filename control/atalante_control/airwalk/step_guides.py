@@ -1,7 +1,7 @@
 """Virtual guides of the airwalk controller: one guide filter for each set of gains, and the selection for each step.
 
 `assistance factor -> guide filter, certificate`. A stiff backup policy is needed in a narrow guide, but exceeds the available
-torque in a wide one. Each step uses the filter of lowest gains that is certified, with a margin, at its assistance factor.
+torque in a wide one. Each step uses the softest filter that is certified with a margin at its assistance factor.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class StepGuides:
         ]
 
     def at(self, xi: float) -> GuideFilter:
-        """Return the filter with the lowest gains that is certified at Xi with `guide_margin`; if none is, the stiffest filter.
+        """Return the softest filter that is certified at Xi with `guide_margin`; if there is none, the stiffest filter.
 
         Args:
             xi: assistance factor in [0, 1].

@@ -21,7 +21,7 @@ class Telemetry:
     q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the bound of the guide on the side of the error
     guide: Annotated[Vector, 2]  # rad, distances from q_des to the upper and to the lower bound of the guide
     h: Annotated[Vector, 2]  # safe backward image function
-    gate: Annotated[Vector, 2]  # lambda + (1 - lambda) lambda_d, published as `lambda`
+    gate: Annotated[Vector, 2]  # weight of the backup torque, lambda + (1 - lambda) lambda_d; published as `lambda`
     filter_active: Annotated[Vector, 2]  # 1 where the filter is active
     step: float  # number of completed right-stance steps
     phase: float  # t / T

@@ -109,7 +109,7 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
         # `read()` without a limit would decompress the whole member, even if it is larger than declared.
         content = stream.read(member.file_size + 1)
     if len(content) != member.file_size:
-        raise ArrayFileError(f"{member.filename} must have the {member.file_size} bytes declared, got {len(content)}")
+        raise ArrayFileError(f"{member.filename} must have the declared {member.file_size} bytes, got {len(content)}")
     return content
 
 

@@ -27,7 +27,7 @@ class SolvedGait:
 
     gait: Gait  # solved gait, or the last iterate if the solver failed
     status: str  # SOLVED, or a sentence that names the violated constraint
-    max_residual: float  # largest violation of all constraints, each in its own SI unit
+    max_residual: float  # largest violation over all constraints, each in its own SI unit
     solve_s: float  # s, computing time
     iterations: int  # iterations of the optimiser
     residuals: Mapping[str, Residual] = field(default_factory=dict)  # largest violation of each group of constraints

@@ -3,8 +3,8 @@
 `Chain, Requirements -> constraints of one node, of both ends, of the impact -> NonlinearProgram`, built once per kind of step.
 Subject, step length and duration are parameters. Bezier control points determine the motion. The unknowns of a node are the
 joint angles, their first and second derivatives with respect to the phase, the torques and the ground wrench. Linear equations
-connect the unknowns of a node to the control points. The equations of motion connect them to each other. These redundant unknowns
-keep the equations short and the matrix sparse.
+connect the unknowns of a node to the control points. The equations of motion connect the unknowns of a node to each other. The
+unknowns are redundant, which keeps the equations short and the matrix sparse.
 
 Stance foot and swing foot are flat rigid bodies on flat ground. The stance foot does not move. Every step is fully actuated, so
 the partial hybrid zero dynamics has no zero dynamics. The impact map connects the end of a step with the start of the next step.
@@ -43,7 +43,7 @@ _BOUND_UNITS = {
     "vertical ground force": ("N", _FORCE),
 }
 _KNEES = [i for i, joint in enumerate(JOINTS) if joint.endswith("SK")]
-#: Reflection of a polar vector in the sagittal plane. An axial vector is multiplied by the negative.
+#: Factors that reflect a polar vector in the sagittal plane. For an axial vector the factors have the opposite sign.
 _MIRROR = casadi.DM([1.0, -1.0, 1.0])
 
 
@@ -290,7 +290,7 @@ class StepProblem:
         return wrench[3:] * _MOMENT - casadi.cross(casadi.DM([x, 0.0, z]), wrench[:3] * _FORCE)
 
     def _ground(self, wrench: Symbol) -> list[Rows]:
-        """Return the constraints of friction cone, centre of pressure and yaw moment, as margins of the vertical force."""
+        """Return the constraints of friction cone, centre of pressure and yaw moment, each as a force that must be positive."""
         requirements, exo = self.requirements, self.exoskeleton
         force, moment = wrench[:3] * _FORCE, self._pressure_moment(wrench)
         length, width = exo.sole_size

@@ -157,7 +157,7 @@ class Chain:
         unused = np.delete(numbers, self._used)
         if not same or unused.any():
             raise ValueError(
-                "the robot must have the bodies, joint axes and zero numbers of the reference robot, got different ones"
+                "the robot must have the same bodies, joint axes and zero parameters as the reference robot, got others"
             )
         return np.asarray(numbers[self._used])
 

@@ -292,7 +292,7 @@ def _from_rest(policy: BackupPolicy, forced: ForcedResponse, time: Vector) -> Fo
 
 
 def _smallest_ratio(room: Vector, taken: Vector) -> float:
-    """Return the smallest ratio `room / taken`, clipped below at 0. Entries without a positive `taken` count as infinity."""
+    """Return the smallest ratio `room / taken`, but at least 0. The ratio is infinite where `taken` is not positive."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return max(0.0, float(np.where(taken > 0.0, room / taken, np.inf).min()))
 

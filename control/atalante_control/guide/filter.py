@@ -6,7 +6,7 @@ the share of the backup policy in the torque. The flow is linear (see `backup_po
 over the horizon for each joint and both extremes, and no integration. Where the backup policy would saturate the drive, the
 prediction is piecewise (see `kernel`).
 
-The horizon is a grid of `points` intervals that ends at T, with the same points during the whole step, plus `overlap` after T.
+The horizon is a fixed grid with at most `points` intervals up to T. It continues with the same spacing for `overlap` after T.
 After T the joint follows the nominal trajectory of the next step, and the guide keeps its last width. Without the overlap the
 prediction in the last cycles would end at T, and any speed would be admitted there (see `certificate`).
 """
@@ -160,7 +160,7 @@ class GuideFilter:
 
     @property
     def gates(self) -> list[float]:
-        """Return lambda + (1 - lambda) lambda_d of SH and SK at the last tick."""
+        """Return the weight of the backup torque, lambda + (1 - lambda) lambda_d, of SH and SK at the last tick."""
         return [float(self.tables.joints[i].gate) for i in (0, 1)]
 
     @property

@@ -44,7 +44,7 @@ class Joint:
     fresh: bool  # true before the first tick of a step, when dh/dt is not defined
     h: float  # safe backward image function
     rate: float  # 1/s, dh/dt
-    gate: float  # lambda + (1 - lambda) lambda_d
+    gate: float  # weight of the backup torque, lambda + (1 - lambda) lambda_d
     upper: float  # rad, distance from q_des to the upper bound of the guide
     lower: float  # rad, distance from q_des to the lower bound of the guide
     stepped: int  # number of rollouts computed cycle by cycle

@@ -234,7 +234,7 @@ def _write_targets(ankle: Ankle, cubics: Vector, cycle: int, target: tuple[Pair,
 
 
 def _target(ankle: Ankle, tibia: Sequence[float] | Vector, gyro: Sequence[float] | Vector) -> tuple[Pair, Pair]:
-    """Return angles and rates of SA and HA that hold the sole level, with the offset and within the limits."""
+    """Return angles and rates of SA and HA that hold the sole level, plus the offset of SA, limited to the target range."""
     (sagittal, henke), rates = level(ankle.geometry, tibia, gyro)
     low, high = ankle.low, ankle.high
     sa, sa_rate = _within(sagittal + ankle.offset, rates[0], low[0], high[0])

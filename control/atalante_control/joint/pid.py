@@ -130,7 +130,7 @@ class Pid:
             desired: q_des [rad], then q_des' [rad/s], shape (24,).
             q: measured angles, shape (12,) [rad].
             qd: measured speeds, shape (12,) [rad/s].
-            sent: torque command of the last cycle after the limiter, shape (12,) [Nm]; None: not limited.
+            sent: torque command of the previous cycle after the limiter, shape (12,) [Nm]; None: it was not limited.
 
         Returns:
             u_t, shape (12,) [Nm], overwritten by the next call.
@@ -140,7 +140,7 @@ class Pid:
 
     @property
     def requested(self) -> Vector:
-        """Return the torque command that was stored last, shape (12,) [Nm]."""
+        """Return the torque command of the last `store_request`, shape (12,) [Nm]."""
         return self.records[0].requested
 
     def store_request(self, torque: Vector) -> None:
@@ -160,7 +160,7 @@ def control(pids: Records[PidRecord], desired: Vector, q: Vector, qd: Vector, se
         desired: q_des [rad], then q_des' [rad/s], shape (24,).
         q: measured angles, shape (12,) [rad].
         qd: measured speeds, shape (12,) [rad/s].
-        sent: torque command of the last cycle after the limiter, shape (12,) [Nm].
+        sent: torque command of the previous cycle after the limiter, shape (12,) [Nm].
         torque: u_t, shape (12,) [Nm], overwritten.
     """
     pid, n = pids[0], len(q)

@@ -77,7 +77,7 @@ class Patient:
         """Return the box (for viewers) and the mass properties of a segment, in the frame of the link that carries it.
 
         The moment of inertia about the transverse axes is m (gyration length)^2. The table has no moment about the axis of the
-        segment. It is computed for a square prism with the length and density of the segment, which is also the box.
+        segment. It is computed for a square prism with the length and density of the segment. The same prism is the box.
 
         Args:
             segment: one of `SEGMENTS`.

@@ -92,5 +92,5 @@ def test_fixed_links_are_merged_into_their_body() -> None:
 
 def test_robot_with_other_axes_is_rejected(chain: Chain) -> None:
     worn = links(ExoskeletonParameters(ha_axis=(1.0, 0.0, 0.0)), PATIENT)
-    with pytest.raises(ValueError, match="must have the bodies, joint axes and zero numbers"):
+    with pytest.raises(ValueError, match="must have the same bodies, joint axes and zero parameters"):
         chain.values(worn)
