@@ -25,7 +25,7 @@ class AirwalkConfig:
     friction: Friction = field(default_factory=Friction)
     alpha: float = 0.4  # end of the re-centring, as a fraction of the step duration
     guide_rate: Pair = (28.0, 44.0)  # rad/s, natural frequencies of the stiffest guide on SH and SK
-    gentler: tuple[float, ...] = (0.5, 0.7)  # natural frequencies of the softer guides / guide_rate, ascending
+    gentler: tuple[float, ...] = (0.5, 0.7)  # natural frequency of each softer guide / guide_rate, ascending
     guide_margin: float = 0.25  # smallest certificate margin with which a softer guide is used, fraction of the width
     guide_damping: float = 1.05  # damping ratio of the backup policy; with a ratio of at least 1 the loop is monotone
     # Nm, bounds of the disturbance u_ext of SH and SK, as torques on the separate inertias (see `certificate`).

@@ -76,7 +76,7 @@ class GaitNetwork:
         return np.asarray((x @ last.weights + last.bias).reshape(len(JOINTS), DEGREE + 1))
 
     def gait(self, subject: Subject, robot: Robot) -> Gait:
-        """Return the gait of a subject. Its feedforward torques are the inverse dynamics of its trajectories.
+        """Return the gait of a subject. Its feedforward is computed from its trajectories by inverse dynamics.
 
         The limits of the robot are not checked here, see `check_gait`.
 

@@ -69,7 +69,7 @@ class Gait:
 
     @property
     def cycles(self) -> int:
-        """Return the number of cycles in a step, N."""
+        """Return N, the number of cycles in a step."""
         return round(self.duration / PERIOD)
 
     @property
@@ -81,7 +81,7 @@ class Gait:
         return zlib.crc32(content)
 
     def mirrored(self) -> Gait:
-        """Return the step with the other stance leg."""
+        """Return the step of the mirrored robot, in which the other leg is the stance leg."""
         feedforward = None if self.feedforward is None else _mirror(self.feedforward)
         return Gait(self.name, self.duration, _mirror(self.coefficients), feedforward, self.parameters, self.solver)
 

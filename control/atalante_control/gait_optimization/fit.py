@@ -8,8 +8,8 @@ few directions in which the library varies. The linear map back to the control p
    of the solved gait.
 2. *Weighted errors.* The distance of two gaits is the deviation of their angles and accelerations along the step. The
    accelerations determine the feedforward. The ends of the step have a larger weight, because the foot lands there. The
-   perceptron learns the principal directions of the library in this metric. The last directions are
-   omitted if all of them together cause an rms error below `RESOLUTION`.
+   perceptron learns the principal directions of the library in this metric. The last directions are omitted if all of them
+   together cause an rms error below `RESOLUTION`.
 """
 
 from __future__ import annotations

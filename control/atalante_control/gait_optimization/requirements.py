@@ -20,7 +20,7 @@ class Requirements:
     friction: float = 0.5  # largest ratio of horizontal to vertical ground force
     force_min: float = 300.0  # N, smallest vertical ground force
     sole_share: float = 0.6  # fraction of the sole in which the centre of pressure must be
-    cell_share: float = 0.8  # fraction of the rectangle of force cells in which the centre of pressure must be
+    cell_share: float = 0.8  # fraction of the rectangle between the force cells in which the centre of pressure must be
     yaw_lever: float = 0.03  # m, largest ratio of yaw moment about the sole centre to vertical ground force
     #: Required height of the swing sole at mid-swing [m]. Over the step it is scaled by sin(pi t / T)^2; for a start or stop step
     #: the exponent is 4.

@@ -174,7 +174,7 @@ class ForcedResponse(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """Nominal motion and feedforward of one joint in a step and in the next one."""
+    """Nominal motion of one joint in a step and in the next step, with the feedforward of the first step."""
 
     deadbeat: Deadbeat  # re-centring of the gait
     nominal: Vector  # (8,) rad, Bezier control points of q_nom in this step

@@ -26,7 +26,7 @@ class Joint:
     kd: float  # Nm s/rad, Kd of the backup policy
     inertia: float  # kg m2
     limit: float  # Nm, torque limit of the backup policy
-    counted: float  # Nm, torque limit minus reserve, which the rollouts assume as limit
+    counted: float  # Nm, torque limit in the rollouts: `limit` minus the reserve
     up: float  # Nm, u_ext_max
     down: float  # Nm, u_ext_min
     phi11: float  # error after one cycle per unit of e

@@ -161,7 +161,7 @@ class LevelFeet:
         self.cubics: Vector = np.column_stack([c0, c1, c0d, c1d])
 
     def start_step(self, state: State, side: int) -> None:
-        """Store the deviation of the swing ankle from its target for the re-centring.
+        """Store the deviation of the swing ankle from its target. The re-centring of the step starts from it.
 
         Args:
             state: measured state of the robot at the step change.
