@@ -46,8 +46,8 @@ class Envelope:
     """Reduction of the torque near the limits of position and velocity, see `limiter`."""
 
     look_ahead: float  # s, time ahead for which a joint at constant velocity must stay inside its position limits
-    position_margin: float  # rad, distance outside a position limit from which the outward torque is 0
-    velocity_margin: float  # rad/s, excess over a velocity limit from which the accelerating torque is 0
+    position_margin: float  # rad, the outward torque falls to 0 over this distance outside a position limit
+    velocity_margin: float  # rad/s, the accelerating torque falls to 0 over this excess above a velocity limit
 
 
 @dataclass(frozen=True)
@@ -78,10 +78,10 @@ class Thresholds:
 
     supply_low: float  # V at a drive; below this voltage the battery is nearly empty
     supply_under: float  # V at a drive; below this voltage the drives may soon fail to hold
-    #: Smallest torque limit of a hot drive at which the robot may walk, as a share of the same limit of the other leg.
+    #: The robot may walk only if the torque limit of a hot drive is at least this share of the limit of the other leg.
     derated_imbalance: float
     full_assist_ramp: float  # s, time for the ramp of the assistance factor from 0 to 1 in FULL_ASSIST
-    position_tolerance: float  # rad, distance outside a position limit from which a joint counts as out of range
+    position_tolerance: float  # rad, a joint counts as out of range from this distance outside a position limit
     idle_torque: (
         float  # Nm, largest torque that a drive may report while off, and largest excess over its limit while on
     )
@@ -110,7 +110,7 @@ class Robot:
     derating: Derating
     sensors: Sensors
     thresholds: Thresholds
-    hash32: int  # CRC-32 of the file, as reported in HAL_STATUS
+    hash32: int  # CRC-32 of the robot file, as reported in HAL_STATUS
 
     def torque_limit(self, temperature: Vector) -> Vector:
         """Return the torque limit of each drive at its temperature.

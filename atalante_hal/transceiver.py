@@ -95,7 +95,7 @@ class Transceiver:
         self._found: list[Finding] = []  # faults found since the last call of `faults`
         self._refused = 0  # consecutive cycles in which the transmit queue was full
         self._full_this_cycle = False
-        self._asked = True  # the last batch was sent completely
+        self._asked = True  # True if the last batch was sent completely
         self._floods = 0  # consecutive cycles with a flood
         self._bus_off = 0  # error class of the last bus-off frame; 0 after the operator's acknowledgement
         #: True if the bus has no fault, so that `faults` need not be called.

@@ -26,7 +26,7 @@ class SupervisorState(IntEnum):
     READY = 1  # every node answers without a fault; the operator may press START
     ACTIVE = 2  # the controller drives the joints
     FULL_ASSIST = 3  # as in ACTIVE, but the assistance factor is ramped to 1
-    FINISH_STEP = 4  # the controller finishes the present step, then HOLD follows
+    FINISH_STEP = 4  # the controller finishes the walking step, then HOLD follows
     HOLD = 5  # every drive holds its position with its internal control loop
     LOWER = 6  # a joint that cannot hold its position is lowered slowly
     FAULT = 7  # latched until the operator presses START
@@ -55,7 +55,7 @@ class State:
     foot_force: Vector  # (2, 4, 3) N, on the foot, in the foot frame
     vibration: Vector  # (8,) measured level, 0 to 1
     valid: npt.NDArray[np.bool_]  # (messages,) True if the data is new and plausible and its sender is trusted
-    age: npt.NDArray[np.int64]  # (messages,) age of the data [cycles], since the SYNC that triggered it
+    age: npt.NDArray[np.int64]  # (messages,) age of the data [cycles], counted from the SYNC that the message answers
     joints_valid: bool  # True if all twelve joint states are valid
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown
     torque_sent: Vector | None = None  # (12,) Nm, last torques that were sent, after the limits; None if unknown
@@ -70,7 +70,7 @@ class Command:
 
     torque: Vector  # (12,) Nm at the joint
     vibration: Vector  # (8,) level, 0 to 1
-    step: int | None = None  # number of the present step; None for a controller that does not walk
+    step: int | None = None  # number of the walking step; None for a controller that does not walk
     outside: bool = False  # True if a joint is outside the virtual guide; this only logs an event
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 #: Entries of python-can's configuration file for 1 Mbit/s and 5 Mbit/s with a CAN clock of 80 MHz. The sample points are at 75 %.
-#: The Linux kernel chooses the same above 800 kbit/s (drivers/net/can/dev/calc_bittiming.c).
+#: The Linux kernel also chooses 75 % above 800 kbit/s (drivers/net/can/dev/calc_bittiming.c).
 SEGMENTS: Final = (
     ("f_clock", "80000000"),
     ("nom_brp", "1"),

@@ -1,4 +1,4 @@
-"""Bus of a program that outlasts a lost link.
+"""Bus for a program that continues to run while its CAN link is lost.
 
 A link is lost when an interface goes down or an adapter is unplugged. It is back when the interface is up again.
 """

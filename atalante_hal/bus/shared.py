@@ -29,18 +29,18 @@ from atalante_hal.bus.batch import Batches
 from atalante_hal.memory import anonymous_file
 from atalante_hal.wire.frame import FRAME_BYTES, Frames
 
-#: Header words of each end that count: frames sent, frames received, steps requested, steps completed.
+#: Counters in the header of each end: frames sent, frames received, steps requested, steps completed.
 _SENT, _RECEIVED, _REQUESTED, _COMPLETED = range(4)
-#: Header words of each end that are flags: the end serves steps, sleeps, or is closed.
+#: Flags in the header of each end: it serves steps, it sleeps, it is closed.
 _SERVING, _SLEEPING, _CLOSED = range(4, 7)
 #: Number of 64-bit header words of each end: one cache line.
 _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
 #: Time for which a waiting end polls before it sleeps [s]. It is longer than the computing time of a cycle.
 _POLL_TIME = 500e-6
-#: Number of waits without polling that follow a wait in which polling received nothing. This saves computing time.
+#: After a wait in which polling received nothing, this number of waits do not poll. This saves computing time.
 _WAITS_WITHOUT_POLLING = 32
-#: Longest sleep before the shared memory is read again [ms]. A new value can become visible after its wake-up.
+#: Longest sleep before the shared memory is read again [ms]. A new value may become visible only after its wake-up byte.
 _SLEEP = 20
 _WAKE_UP = b"\0"
 _REASON_BYTES = 4096

@@ -18,7 +18,7 @@ class Reaction(IntEnum):
     INFO = 0  # record only
     NOT_READY = 1  # no reaction of a moving robot, but START is refused while the diagnostic is active
     FULL_ASSIST = 2  # ramp the assistance factor to 1
-    FINISH_STEP = 3  # finish the current step, then HOLD
+    FINISH_STEP = 3  # finish the walking step, then HOLD
     HOLD = 4  # all drives hold their positions
     LOWER = 5  # lower the affected joint; all other drives hold their positions
     FAULT = 6  # latched until the operator acknowledges the fault

@@ -32,7 +32,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 #: Check result of a rejected message -> diagnostic that becomes pending in the same cycle.
 PENDING = {
     Check.REPEATED: Dtc.E2E_REPEATED,
-    Check.CONFLICT: Dtc.E2E_REPEATED,  # for a single frame; two frames in a cycle are evidence of two senders, see `rivals_of`
+    Check.CONFLICT: Dtc.E2E_REPEATED,  # only for one frame in a cycle; two frames are evidence of two senders, see `rivals_of`
     Check.WRONG_SEQUENCE: Dtc.E2E_SEQUENCE,
     Check.CRC: Dtc.E2E_CRC,
     Check.LENGTH: Dtc.FRAME_LENGTH,

@@ -324,7 +324,7 @@ class SafetyMonitor:
             memory.raise_dtc(state.cycle, Dtc.OPERATOR_STOP, "PENDANT", text=text)
         if reasons:
             self.reason = memory.text_of(reasons) or self.reason
-        elif before is not _S.FINISH_STEP:  # the robot holds for the reason for which it finished the step
+        elif before is not _S.FINISH_STEP:  # HOLD keeps the reason of FINISH_STEP
             self.reason = entry_text(after, self.missing())
         if after is _S.ACTIVE and before not in MOVING and not self.enabling:
             self._limiter.restart(state.torque)

@@ -103,7 +103,7 @@ def _reason(request: StartRequest) -> str:
 
 
 def missing_text(missing: Collection[str]) -> str:
-    """Return which nodes prevent READY, one sentence.
+    """Return which nodes prevent READY, as one sentence.
 
     Args:
         missing: DBC names of the nodes that are not well.
@@ -112,7 +112,7 @@ def missing_text(missing: Collection[str]) -> str:
 
 
 def entry_text(state: SupervisorState, missing: Collection[str]) -> str:
-    """Return why the robot entered a state without a diagnostic that demands it, one sentence.
+    """Return the reason for a state that no diagnostic demanded, as one sentence.
 
     Args:
         state: state that was entered.
@@ -130,7 +130,7 @@ def entry_text(state: SupervisorState, missing: Collection[str]) -> str:
 
 
 def stop_text(stop_requested: bool) -> str:
-    """Return the reason of an operator stop, one sentence.
+    """Return the reason of an operator stop, as one sentence.
 
     Args:
         stop_requested: True if STOP or HOLD was requested, False if the dead-man is not pressed.

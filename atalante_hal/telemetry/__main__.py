@@ -107,7 +107,7 @@ class Outlets:
         return [(sink, CYCLES_PER_SECOND // rate) for sink, rate in pairs if sink is not None]
 
     def close_files(self) -> None:
-        """Close recording and CAN log; a failure becomes a notice."""
+        """Close recording and CAN log. Failures are added to `notices`."""
         for file in (self.recorder, self.can_log):
             if file is not None:
                 try:

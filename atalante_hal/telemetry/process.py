@@ -125,7 +125,7 @@ class Recording:
 
     files: tuple[str, ...]  # file names in order; each restart of the subprocess begins a new file
     complete: bool  # True if there is one file, with an index and with all cycles
-    missing_cycles: int  # number of cycles that are in no file
+    missing_cycles: int  # number of cycles missing in the files
 
 
 @dataclass(frozen=True)

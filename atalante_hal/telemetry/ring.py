@@ -41,7 +41,7 @@ _READ, _LOST, _READER_PID, _KEPT = range(16, 20)
 _HEADER_BYTES = 256
 
 _WRITER_BYTE, _READER_BYTE = 0, 1  # offsets of the bytes that writer and reader lock
-_LOCK_TRIES = 50  # number of attempts, because `_held` of the other end locks the byte for some microseconds
+_LOCK_TRIES = 50  # attempts to lock a byte, because the other end may lock it for some microseconds in `_held`
 
 _WAIT = 0.0002  # s, polling period
 NOTES_BYTES = 1 << 16
@@ -327,7 +327,7 @@ class RingReader(_Ring, Closing):
         return self._next
 
     def notes(self) -> list[dict[str, Any]]:
-        """Return the notes written since the last call. "from" is the number of the record that follows the note.
+        """Return the notes written since the last call. The key "from" is the number of the record that follows the note.
 
         Call it after `read` to get every note that belongs to the records read.
         """

@@ -76,7 +76,7 @@ class Service:
         self._lost, self._lost_reported = 0, -math.inf
         self._recorder, self._saved = recorder, 0  # recorder, and its number of saved messages at the last check
         self._handled = 0  # number of records whose messages have been passed to all sinks
-        self._kept = 0  # number of records that are marked as saved in the ring
+        self._kept = 0  # number of records that the ring counts as saved
         self.notices: list[str] = []  # faults, one sentence each
 
     def run(self, stop: Sequence[object]) -> None:
@@ -192,7 +192,7 @@ class Service:
             self._mark_saved()
 
     def _mark_saved(self) -> None:
-        """Mark the records that were processed so far as saved in the ring."""
+        """Count the records processed so far as saved, in the header of the ring."""
         self._records.keep(self._handled - self._kept)
         self._kept = self._handled
 

@@ -31,7 +31,7 @@ class Imus:
         self._now = now
         self._gyro_end, self._accel_end = (_end_of_range(codec, signal) for signal in ("GyroX", "AccelX"))
         self._norm_error = robot.sensors.quaternion_error
-        #: IMU index -> norm of its quaternion, for each IMU with a quaternion without unit norm.
+        #: IMU index -> norm of its quaternion, for each IMU whose quaternion does not have unit norm.
         self.no_attitude: dict[int, float] = {}
         #: IMU index -> largest reading [rad/s or m/s2], for each saturated IMU.
         self.saturated: dict[int, float] = {}
