@@ -273,6 +273,7 @@ def test_the_table_is_printed(monkeypatch: pytest.MonkeyPatch, traffic: list[Fra
     assert "dead-man pressed" in result.stdout
     assert "2 lost" in result.stdout
     assert "left_SK" in result.stdout
+    assert "measured load %  computed worst case %" in result.stdout
     assert result.stderr == ""
 
 

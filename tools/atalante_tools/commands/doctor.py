@@ -2,23 +2,28 @@
 
 Machine (commands/machine.py) -> examine -> CheckResult -> one line each, exit code
 interface -> Adapter (atalante_hal/bus/adapters.py) -> what is known of the interface
+bus -> BusTiming (commands/bus_timing.py) -> time from a SYNC to states and commands, with --bus
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import click
 
-from atalante_tools.console.options import EMBEDDED, json_option
+from atalante_tools.console.options import EMBEDDED, Between, Target, json_option
 from atalante_tools.console.outcome import Failed
-from atalante_tools.console.terminal import show_json
+from atalante_tools.console.stop_request import StopRequest, stop_requested
+from atalante_tools.console.terminal import show_json, table
 from atalante_tools.session.body import engine_hint
 
 if TYPE_CHECKING:
+    from atalante_hal.bus import Bus
     from atalante_hal.bus.adapters import Adapter
+    from atalante_tools.commands.bus_timing import BusTiming
     from atalante_tools.commands.machine import Interface, Machine
 
 #: Recommended length of a transmit queue [frames]. One cycle of all four buses sends 22 frames.
@@ -27,6 +32,8 @@ QUEUE: Final = 1000
 FD_MTU: Final = 72
 #: SCHED_FIFO priority that the 1 kHz loop requests.
 PRIORITY: Final = 50
+#: Longest wait for a frame [s]. After it, clock and stop request are checked.
+POLL_TIMEOUT: Final = 0.02
 #: Linux file with the real-time limits of each user.
 LIMITS: Final = "/etc/security/limits.conf"
 #: Python package -> what it is needed for, and the extra of `atalante-hal` that installs it.
@@ -71,19 +78,35 @@ class CheckResult:
     metavar="CHANNEL",
     help="CAN channel to check (vcan0), or a channel map (left_leg=can0,right_leg=can1,left_sense=can2,right_sense=can3).",
 )
+@click.option(
+    "--bus", "measure", is_flag=True, help="Measure the time from each SYNC to states and commands on a running bus."
+)
+@click.option(
+    "--for",
+    "seconds",
+    type=Between(0.05, 600.0),
+    default=2.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="Listening time of --bus [s].",
+)
 @json_option
-def command(interface: str, channel: str, as_json: bool) -> None:
+def command(interface: str, channel: str, measure: bool, seconds: float, as_json: bool) -> None:
     """Check whether this computer is ready, and print the commands that fix problems.
 
     With -i, the command prints what is known of the interface: CAN FD, driver, form of the channel, bit timing, what was tried.
     With -c, it opens the channels as every other command does, and closes them. It sends no frames and changes nothing.
-    The exit code is 1 if the chosen interface requires something that is missing.
+    With --bus, it listens to a running HAL and its nodes, and compares the receive timestamps with the cycle of 1 ms. The exit
+    code is 1 if the chosen interface requires something that is missing, or if the bus does not fit into the cycle.
 
     \b
     Example: atalante doctor
              atalante doctor -i socketcan -c vcan0
              atalante doctor -i pcan
+             atalante doctor -i socketcan -c can0 --bus
     """
+    if measure and (interface == EMBEDDED or not channel):
+        raise click.UsageError("--bus requires an interface and a channel: add for example -i socketcan -c vcan0")
     from atalante_tools.commands.machine import ThisMachine
 
     checks = list(examine(ThisMachine(), interface, channels_of(interface, channel)))
@@ -96,6 +119,8 @@ def command(interface: str, channel: str, as_json: bool) -> None:
         _show_facts(interface, as_json)
     if missing := [check.name for check in checks if check.needed and not check.ok]:
         raise Failed(f"{interface} {channel}".rstrip() + f" is not ready: {', '.join(missing)}")
+    if measure:
+        _measure(Target(interface, channel, lockstep=False), seconds, as_json)
 
 
 def channels_of(interface: str, channel: str) -> list[str]:
@@ -240,6 +265,70 @@ def facts(adapter: Adapter) -> str:
             *(f"    {line}" for line in adapter.configuration.splitlines()),
         ]
     return "\n".join(lines)
+
+
+def _measure(target: Target, seconds: float, as_json: bool) -> None:
+    import atalante_dbc
+    from atalante_tools.commands.bus_timing import BusTiming, rows
+    from atalante_tools.session.rig import join, open_buses
+
+    network = atalante_dbc.load()
+    timing = BusTiming(network)
+    with stop_requested() as stop:
+        bus = join(network, open_buses(network, target))
+        try:
+            listen(bus, timing, seconds, stop)
+        finally:
+            bus.close()
+        if stop.wanted:
+            raise SystemExit(stop.exit_code)
+    clock = stamp_clock(target.interface)
+    latencies = timing.report()
+    if not latencies:
+        raise Failed(
+            f"no answer to a SYNC on {target} for {seconds:g} s: start a robot and a HAL, for example atalante airwalk"
+        )
+    if as_json:
+        for latency in latencies:
+            show_json(asdict(latency) | {"fits": latency.fits, "stamps": clock})
+    else:
+        click.echo(
+            f"\ntime from the end of a SYNC to the end of the frame, {clock} timestamps\n{table(rows(latencies))}"
+        )
+    if timing.skipped and not as_json:
+        click.echo(f"{timing.skipped} frames without an earlier SYNC on their bus")
+    if late := [f"{x.kind} on {x.bus}" for x in latencies if not x.fits]:
+        raise Failed(f"99 % of the frames must be within the budget, but these are later: {', '.join(late)}")
+
+
+def listen(bus: Bus, timing: BusTiming, seconds: float, stop: StopRequest) -> None:
+    """Receive frames for some seconds and measure their times.
+
+    Args:
+        bus: Bus to listen to.
+        timing: Measurement that collects the frames.
+        seconds: Listening time [s].
+        stop: Stop request, which ends the listening early.
+    """
+    from atalante_hal.wire.frame import new_frames
+
+    frames = new_frames(256)
+    end = time.monotonic() + seconds
+    while (now := time.monotonic()) < end and not stop.wanted:
+        count = bus.receive(frames, min(POLL_TIMEOUT, end - now))
+        timing.accept(frames, bus.stamps, count)
+
+
+def stamp_clock(interface: str) -> str:
+    """Return the clock of the receive timestamps of an interface: hardware, kernel, software or unknown.
+
+    Args:
+        interface: Name of the interface in python-can.
+    """
+    from atalante_hal.bus.adapters import ADAPTERS
+
+    adapter = ADAPTERS.get(interface)
+    return adapter.stamps if adapter else "unknown"
 
 
 def _show_facts(interface: str, as_json: bool) -> None:

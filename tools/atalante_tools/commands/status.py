@@ -40,7 +40,8 @@ _BLANK: Final = "-"
 def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
     """Listen to a bus and print its nodes, joints (degrees, Nm), supervisor state and bus load.
 
-    The command sends no frames. The exit code is 1 if no frame was received, and 4 if a fault is latched.
+    The measured load is the longest wire time of the received frames. The computed worst case counts every message of the DBC at
+    its shortest period. The command sends no frames. The exit code is 1 if no frame was received, and 4 if a fault is latched.
 
     \b
     Example: atalante status -i socketcan -c vcan0
@@ -144,7 +145,7 @@ def render(report: Report, target: Target) -> str:
         (j.joint, _number(j.position_deg, 2), _number(j.velocity_deg_s, 1), _number(j.torque_nm, 1))
         for j in report.joints
     ]
-    loads = [("bus", "load %", "worst case %")]
+    loads = [("bus", "measured load %", "computed worst case %")]
     loads += [(bus, f"{100 * used:.1f}", f"{100 * worst:.1f}") for bus, (used, worst) in report.load.items()]
     counts = f"{report.frames} frames in {report.seconds:.1f} s, {report.crc_errors} CRC errors, {report.dropped} lost"
     if report.foreign:
