@@ -47,11 +47,11 @@ def compiled(function: Function) -> Function:
 
 
 def specialised(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> Callable[P, R]:
-    """Return the machine code of a function for the types of given arguments, which it is called with once.
+    """Call a function once, and return its machine code for the types of these arguments.
 
-    A call of it skips the type dispatch of numba, which takes about 0.7 us for each `NamedTuple`. So the types are not checked:
-    every later call needs arrays of the same dtype, number of dimensions and memory layout. Pass only arrays that the caller
-    allocated itself.
+    A call of this machine code skips the type dispatch of numba, which takes about 0.7 us for each `NamedTuple`. So the types are
+    not checked: every later call needs arrays of the same dtype, number of dimensions and memory layout. Pass only arrays that
+    the caller allocated itself.
 
     Args:
         function: function for `compiled`.

@@ -44,7 +44,7 @@ class Hal:
         robot: Joint limits and transmission.
         bus: Open bus. The caller owns it and closes it.
         patience: Longest wait for the nodes' answers to a SYNC [s]. On the wall clock it must be well below the period of 1 ms.
-            In lock-step with another process it should be long, so that a slow machine gives the same run.
+            In lock-step with another process it should be long, so that a run has the same result on a slow machine.
         assistance_factor: Assistance factor Xi in [0, 1], used until the pendant sets another.
         controller_fields: (name, length) of each field the controller records, see `types.Controller`.
         gait_hash: CRC-32 of the gait the controller walks, sent in HAL_STATUS.
@@ -86,19 +86,19 @@ class Hal:
             self._plausibility,
             self._limiter,
         )
-        #: Diagnostics and state changes so far, one event for each, raised when it begins.
+        #: Events so far. Each diagnostic and each state change is logged once, when it begins.
         self.events = self._safety_monitor.memory.events
 
     # -- construction ------------------------------------------------------------------------------------------------
 
     def _build_images(self, controller_fields: Sequence[tuple[str, int]], assistance_factor: float) -> None:
         received = self.network.received_by("HAL")
-        # In the order in which the buses deliver the messages, see `ReceiveImage.accept`.
+        # The rows have the order in which the buses deliver the messages, see `ReceiveImage.accept`.
         fast = [m for bus in self.network.buses for m in received if m.bus == bus and m.cycle_ms == 1]
         #: Message of each entry of `State.valid` and `State.age`.
         self.messages = tuple(m.name for m in fast)
         parts = self._parts = Record(ReceiveImage(fast).codec, controller_fields)
-        #: All values of this cycle in one contiguous vector, whose fields `layout` names.
+        #: All values of this cycle in one contiguous vector. `layout` gives the name and the slice of each field.
         self.record, self.layout, self.controller_record = parts.values, parts.layout, parts.controller
         self._header = parts.header
         self._header[3] = assistance_factor
@@ -197,7 +197,7 @@ class Hal:
         return self._send_command()
 
     def hold(self) -> Vector:
-        """Send HOLD, or, during a start, the next CiA 402 controlword that enables each drive.
+        """Send HOLD or, during a start, the next CiA 402 controlword on the path to OPERATION ENABLED.
 
         Returns:
             Torques that were sent, shape (12,) [Nm], valid until the next call.
@@ -221,7 +221,8 @@ class Hal:
     def _follow_drives(self) -> None:
         """Set the commanded torques to the present torques of the drives.
 
-        From the second cycle on all limits apply. A drive that is off produces no torque, so its command is 0.
+        In the first cycle of a start only the torque limit applies, and then all limits. A drive that is off produces no torque,
+        so its command is 0.
         """
         torque = np.where(powered(self.state.drive_state), self.state.torque, 0.0)
         if self._safety_monitor.enabling:
@@ -263,7 +264,7 @@ class Hal:
         self._safety_monitor.end()
 
     def stop(self, cycles: int = 10) -> None:
-        """Send HOLD until every drive has had time to follow.
+        """Send HOLD for some cycles, so that every drive has time to react.
 
         Call it at the end of a run, before the bus is closed. It waits `STOP_PATIENCE` at most for the nodes' answers.
 

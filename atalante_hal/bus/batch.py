@@ -36,7 +36,7 @@ class Batch(NamedTuple):
 
 
 class Batches:
-    """Cache of the arrays that were passed to one bus, found by identity."""
+    """Cache of the arrays that were passed to one bus, with the `id()` of each array as its key."""
 
     def __init__(self) -> None:
         self._batches: dict[int, Batch] = {}

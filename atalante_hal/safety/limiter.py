@@ -2,20 +2,21 @@
 
     requested torque -> derated torque limit, envelope of position and velocity -> torque rate -> torque sent
 
-*Envelope.* Torque towards a position limit is faded out by the predicted position of the joint, `look_ahead` from now at the
-present velocity. The torque limit is full up to the position limit and falls to zero at `position_margin` beyond it. Torque in
-the direction of the velocity is faded out in the same way between `velocity_max` and `velocity_margin` beyond it. Torque in the
-opposite direction, which brakes, keeps the full limit: the envelope never reverses a torque and never weakens braking. The
-envelope is not a controller: without braking a joint reaches its end stop. The end stop is at the position limit or less than
-the margin beyond it, and must withstand the torque that presses the joint against it at rest. A gait may use the full range.
+*Envelope.* The limit of the torque towards a position limit depends on the predicted position of the joint: the position after
+the time `look_ahead` at the present velocity. The torque limit is full up to the position limit and falls to zero over
+`position_margin` outside it. In the same way the limit of the torque in the direction of the velocity falls to zero between
+`velocity_max` and `velocity_max + velocity_margin`. A torque in the opposite direction brakes, and keeps the full limit: the
+envelope never reverses a torque and never weakens braking. The envelope is not a controller: without braking a joint reaches its
+end stop. The end stop is at the position limit or less than `position_margin` outside it, and must withstand the torque that
+presses the joint against it at rest. A gait may use the full range.
 
-*Rate.* The torque changes by at most `torque_rate_max`, without exception. Where the derated or faded limit falls below the
-torque of the last cycle, the torque approaches the new limit at this rate.
+*Rate.* The torque changes by at most `torque_rate_max`, without exception. If the derating or the envelope reduces the limit
+below the torque of the last cycle, the torque approaches the new limit at this rate.
 
 *Guarantee.* The inequalities below hold for every pair (k-1, k) of command frames that both have ENABLE_OPERATION for a joint.
 u is the TargetTorque and M the MaxTorque of a frame. q and v are the position and velocity in the last good state frame of the
-joint before frame k, or in an earlier one no older than the node's timeout. r = torque_rate_max * 1 ms, and e is one step of
-TargetTorque on the wire.
+joint before frame k, or in an earlier good frame not older than the timeout of the node. r = torque_rate_max * 1 ms, and e is
+the resolution of TargetTorque.
 
 - |u_k| <= torque_max, M_k <= torque_max
 - |u_k - u_(k-1)| <= r + e
@@ -66,8 +67,8 @@ class JointLimits(NamedTuple):
     position_max: Vector  # (12,) highest position [rad]
     velocity_max: Vector  # (12,) highest velocity [rad/s]
     look_ahead: float  # prediction time of the position [s]
-    position_margin: float  # distance beyond a position limit at which the torque is zero [rad]
-    velocity_margin: float  # excess over the highest velocity at which the torque is zero [rad/s]
+    position_margin: float  # the torque falls to zero over this distance outside a position limit [rad]
+    velocity_margin: float  # the torque falls to zero over this excess above the highest velocity [rad/s]
 
 
 class Limiter:
@@ -76,10 +77,10 @@ class Limiter:
     A torque within the limits is passed on bit for bit.
 
     Attributes:
-        last: torque sent last, shape (12,) [Nm]; the rate limit refers to it.
+        last: torque sent last, shape (12,) [Nm]; the rate limit is relative to it.
         limit: present torque limit, shape (12,) [Nm].
-        cut: True for each joint whose torque was cut in the last `apply`, shape (12,); input of an anti-windup.
-        saturated: cycles in a row, up to the last `apply`, in which a torque was cut.
+        cut: True for each joint whose torque was cut in the last `apply`, shape (12,); used for the anti-windup of a controller.
+        saturated: number of consecutive cycles, up to the last `apply`, in which a torque was cut.
     """
 
     def __init__(self, robot: Robot, period: float) -> None:
@@ -188,10 +189,10 @@ def limit(
 
 
 def share(beyond: float) -> float:
-    """Return S(x), the fraction of the torque limit that remains at some distance beyond a position or velocity limit.
+    """Return S(x), the fraction of the torque limit that remains outside a position or velocity limit.
 
     Args:
-        beyond: distance beyond the limit as a fraction of the margin; negative within the limit.
+        beyond: distance outside the limit as a fraction of the margin; negative inside the limit.
     """
     return within(1.0 - beyond, 0.0, 1.0)
 

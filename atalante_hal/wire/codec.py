@@ -1,7 +1,7 @@
 """Signal codec that decodes or encodes all signals of a list of messages in one pass of compiled code.
 
-The decoding plan (word, shift, mask, range, factor of each signal) is built once from the DBC. No signal crosses a 64-bit word of
-the payload. So a signal is decoded with one word, one shift, one mask, one addition and one multiplication.
+The decoding plan (word, shift, mask, range, factor of each signal) is built once from the DBC. No signal crosses the boundary of
+a 64-bit payload word. So a signal is decoded with one word, one shift, one mask, one addition and one multiplication.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, WORDS, Frames, new_frame
 
 Words = npt.NDArray[np.int64]
 
-#: Rows of the decoding plan: word, shift, mask, largest code, low and high end of the range, invalid code.
+#: Rows of the decoding plan: word, shift, mask, largest code, lowest and highest code of the range, invalid code.
 WORD, SHIFT, MASK, LARGEST, LOW, HIGH, INVALID = range(7)
 #: Rows of the scales, as in the equation: value = (code + base) * factor + offset.
 BASE, FACTOR, OFFSET = range(3)
@@ -35,8 +35,8 @@ _LONGEST = 51  # largest signal length that `_ROUND` supports [bits]
 class SignalTable(NamedTuple):
     """Arrays that describe the coding of all signals of a codec, for the compiled functions of this module.
 
-    The columns are in the order of the decoded values. The codec owns the arrays. Only `codes` changes: every decoding and
-    encoding overwrites it.
+    Column i of `plan` and `scales` and entry i of `codes` belong to decoded value i. The codec owns the arrays.
+    Only `codes` changes: every decoding and encoding overwrites it.
     """
 
     plan: Words  # (7, size) decoding plan, with the rows WORD to INVALID
@@ -44,7 +44,7 @@ class SignalTable(NamedTuple):
     codes: Words  # (size,) raw codes of the last decoding or encoding
     words: Words  # (n,) indices of the 64-bit words that contain a signal
     by_row: Words  # (size,) signal indices, sorted by row
-    row_begins: Words  # (rows + 1,) index in `by_row` at which each row begins
+    row_begins: Words  # (rows + 1,) begin of each row in `by_row`
 
 
 def group_of(signal: str) -> str:
@@ -88,7 +88,7 @@ class Codec:
             mask, largest = (1 << s.length) - 1, (1 << s.length - s.signed) - 1
             invalid = NO_CODE if s.invalid_raw is None else s.invalid_raw
             plan.append((row * WORDS + 1 + s.start // 64, s.start % 64, mask, largest, low, high, invalid))
-            # An offset of a whole number of codes is added to the code, because integer addition is exact.
+            # If the offset is a whole number of codes, it is added to the code, because integer addition is exact.
             code = s.offset / s.factor
             exact = code == round(code) and round(code) * s.factor == s.offset
             scales.append((code, s.factor, 0.0) if exact else (0.0, s.factor, s.offset))
@@ -151,12 +151,12 @@ class Codec:
             out: output for the physical values, shape (size,), in DBC units.
 
         Returns:
-            Whether every signal is inside its DBC range; an invalid code is outside.
+            Whether every signal is inside its DBC range; an invalid code counts as outside.
         """
         return self._decode(frames.view(np.int64), self.table, out)
 
     def rows_outside(self) -> list[int]:
-        """Return the rows with a signal outside its range, as of the last `decode`."""
+        """Return the rows with a signal outside its range in the last `decode`."""
         codes, plan = self.table.codes, self.table.plan
         outside = (codes < plan[LOW]) | (codes > plan[HIGH])
         return sorted(set(self.row_of[outside].tolist()))
@@ -209,7 +209,7 @@ def decode(words: Words, table: SignalTable, values: Vector) -> bool:
 
 
 def read_codes(words: Words, table: SignalTable) -> bool:
-    """Read the raw codes of all signals, as the first step of `decode`.
+    """Read the raw codes of all signals. This is the first half of `decode`.
 
     Args:
         words: frames as a flat array of 64-bit words, shape (rows * 9,).
@@ -240,7 +240,7 @@ def signed(raw: int, mask: int, largest: int) -> int:
 
 
 def scale(table: SignalTable, values: Vector) -> None:
-    """Convert the raw codes of all signals to physical values, as the second step of `decode`.
+    """Convert the raw codes of all signals to physical values. This is the second half of `decode`.
 
     Args:
         table: signals of the codec, with their raw codes.
@@ -257,7 +257,7 @@ def read_row(words: Words, offset: int, row: int, table: SignalTable) -> int:
 
     Args:
         words: frames as a flat array of 64-bit words.
-        offset: offset of the frame from its row in the plan [words].
+        offset: position of the frame in `words` minus the position that the plan assumes for its row [words].
         row: row of the message of the frame.
         table: signals of the codec; the entries of the row in `codes` are overwritten.
 

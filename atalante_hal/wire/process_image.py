@@ -56,7 +56,7 @@ _FOREIGN = -1
 NEVER = 1 << 30
 #: Age from which an answer to a SYNC counts as replayed; a younger answer counts as late [cycles].
 LATEST = 16
-#: Half the counter period. A larger step forward counts as a step back, unless the row was silent for as many cycles.
+#: Half the counter period. A larger increase counts as a decrease, unless the message was missing for as many cycles.
 _HALF_TURN = 128
 
 
@@ -69,14 +69,14 @@ class E2EState(NamedTuple):
     headers: Words  # (rows,) header word of the message: identifier, length and flags
     spans: Words  # (rows, 3) begin and end of the payload [bytes] and Data ID, see `e2e.protected_spans`
     expected: Words  # (rows,) expected counter of the next frame; `NOTHING` before the first frame
-    silent: Words  # (rows,) cycles since the expected counter last changed
+    silent: Words  # (rows,) cycles since the last change of the expected counter
     kept: Octets  # (rows * 72,) last frame with correct format, CRC and sequence
 
 
 class RowStatus(NamedTuple):
     """Result of the check of each row of a process image in this cycle.
 
-    The arrays are those of the `ReceiveImage`.
+    The `ReceiveImage` owns the arrays.
     """
 
     age: Words  # (rows,) age of the values [cycles]
@@ -183,7 +183,7 @@ class ReceiveImage:
         """Reject a row that `accept` just committed, because its values are implausible: restore its previous values and age.
 
         Args:
-            row: row of the message; its age is one cycle more than before `accept`.
+            row: row of the message; its age becomes one cycle more than before `accept`.
         """
         mine = self.codec.row_of == row
         self.values[mine] = self.values_before[mine]
@@ -429,8 +429,8 @@ def judge_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int, re
         return _CRC
     counter = int(octets[begin + COUNTER_BYTE])
     in_time = tag == _NO_TAG or tag - counter & 0xFF < LATEST
-    # After a silence of half the counter period, the counter no longer gives the order of frames. Then a frame is new if it
-    # answers a SYNC of the last cycles.
+    # If a message was missing for half the counter period, its counter no longer gives the order of the frames. Then a frame
+    # is new if it answers one of the last `LATEST` SYNCs.
     back = tag != _NO_TAG and in_time and expected[row] != NOTHING and silent[row] >= _HALF_TURN
     result = judge_counter(expected[row], counter)
     if back and result == _REPEATED:
@@ -496,7 +496,7 @@ class TransmitImage:
 
     @property
     def counter(self) -> int:
-        """Return the alive counter of the first row, as of the last `seal`."""
+        """Return the alive counter of the first row in the last `seal`."""
         return int(self._counters[0])
 
     def prepare(self) -> bytes:
