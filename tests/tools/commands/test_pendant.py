@@ -692,12 +692,16 @@ def test_start_runs_for_a_time_and_ends_in_hold(world: World, monkeypatch: pytes
     assert world.hal.state.supervisor is HOLD
 
 
-def test_xi_takes_over_and_sets_the_factor(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_xi_takes_over_without_a_conflict_and_sets_the_factor(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     world.active()
+    begin = world.hal.state.cycle
     result = invoke(world, monkeypatch, "xi", "0.7", "--for", "0.1")
     assert result.exit_code == 0
     assert result.stderr.startswith("taking over from another pendant on pcan test\nassistance factor 0.7\n")
     assert world.hal.state.assistance_factor == pytest.approx(0.7, abs=1e-4)
+    codes = [event.code for event in world.hal.events if event.cycle > begin]
+    assert codes[-2:] == ["OPERATOR_STOP", "HOLD"]
+    assert set(codes[:-2]) <= {"E2E_REPEATED"}
 
 
 @pytest.mark.parametrize(

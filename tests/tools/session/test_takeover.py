@@ -158,6 +158,53 @@ def test_exactly_one_pendant_is_left_with_a_pendant_that_never_yields() -> None:
         assert not hardware.lost
 
 
+class Process:
+    """Pendant process that the operating system delays: it reads the frames of the bus later, and answers only the last SYNC."""
+
+    def __init__(self, rule: Takeover) -> None:
+        self.rule = rule
+        self.inbox: list[tuple[bool, int]] = []  # SYNC or not, and counter
+
+    def run(self) -> int | None:
+        """Read all frames. Return the counter of the answer."""
+        answer = None
+        for is_sync, counter in self.inbox:
+            if is_sync:
+                self.rule.sync(counter)
+                answer = counter
+            else:
+                self.rule.answer(counter)
+        self.inbox.clear()
+        return answer if self.rule.sends else None
+
+
+@pytest.mark.parametrize("stalls", [0.1, 0.3, 0.6])
+@pytest.mark.parametrize("lost", [0.0, 0.1])
+def test_exactly_one_pendant_is_left_on_a_loaded_computer(stalls: float, lost: float) -> None:
+    for seed in range(40):
+        random = Random(seed)
+        processes = [Process(Takeover(established=True, seed=seed))]
+        processes += [Process(Takeover(seed=random.randrange(1 << 30))) for _ in range(2 + seed % 2)]
+        starts = [0, *[random.randrange(121) for _ in processes[1:]]]
+        for cycle in range(3000):
+            for process in processes:
+                process.inbox.append((True, cycle & 0xFF))
+            for index in random.sample(range(len(processes)), len(processes)):
+                process = processes[index]
+                if cycle == starts[index] and index:
+                    process.rule.start()
+                if random.random() < stalls or (answer := process.run()) is None:
+                    continue
+                for other in processes:
+                    if other is not process and random.random() >= lost:
+                        other.inbox.append((False, answer))
+            left = [process for process in processes if not process.rule.lost]
+            assert left, "all pendants gave up"
+            if len(left) == 1 and cycle > max(starts):
+                break
+        assert len(left) == 1
+
+
 # -- frames ----------------------------------------------------------------------------------------------------------
 
 

@@ -27,6 +27,9 @@ LISTEN_CYCLES: Final = 3
 HAL_TIMEOUT: Final = 1.0
 #: Longest wait for a frame [s]. After it, stop request and keyboard are checked.
 POLL_TIMEOUT: Final = 0.02
+#: Number of SYNCs that a new pendant answers with the signals of the older pendant, until the older pendant stops sending. If the
+#: signals differ, the HAL holds the robot after four cycles.
+COPY_SYNCS: Final = 20
 #: Number of SYNCs that `pendant stop` and `pendant hold` answer.
 PRESS_SYNCS: Final = 500
 #: Number of SYNCs answered with STOP at the end of `pendant start` and `pendant xi`.
@@ -79,7 +82,7 @@ class Session:
                 return
 
     def take_over(self) -> None:
-        """Copy the signals of another pendant if one sends. Then press the dead-man switch and start sending."""
+        """Copy the signals of another pendant if one sends. Then press the dead-man switch and send until the other one stops."""
         self.listen()
         say(
             f"taking over from another pendant on {self._target}"
@@ -88,6 +91,8 @@ class Session:
         )
         self.node.dead_man = True
         self.node.start_sending()
+        if self.node.found_another:
+            self.answer_syncs(COPY_SYNCS)
 
     def answer_syncs(self, count: int) -> None:
         """Answer a number of SYNCs.
