@@ -39,7 +39,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.compiled import compiled
+from atalante_hal.compiled import specialised
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import Vector
 
@@ -101,8 +101,7 @@ class Limiter:
         self.saturated = 0
         # Copies of the inputs, because the compiled code accepts only the array type and layout that it was compiled for.
         self._asked, self._motion = np.zeros(_COUNT), np.zeros((2, _COUNT))
-        self._apply = compiled(limit)
-        self.apply(self.last, np.zeros((2, _COUNT)))  # nothing; from now on it is machine code
+        self._apply = specialised(limit, self._asked, self._motion, self._limits, self.limit, self.last, self.cut)
 
     def apply(self, torque: Vector, motion: Vector) -> Limited:
         """Limit a command and store the result in `last`.

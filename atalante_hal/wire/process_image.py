@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc import Message
-from atalante_hal.compiled import compiled
+from atalante_hal.compiled import specialised
 from atalante_hal.types import Vector
 from atalante_hal.wire.codec import (
     INSIDE,
@@ -131,10 +131,14 @@ class ReceiveImage:
         self._offered: tuple[Frames, Words] | None = None
         self._ordered = _Received(new_frames(count), count)
         self._received = self._ordered
-        self._accept_exact, self._accept_frames = compiled(accept_exact), compiled(accept_frames)
-        # Call the functions once without data, so that they are compiled here and not in the first cycle.
-        self._accept(self._ordered, None)
-        self.accept_each(self._ordered.frames, 0)
+        # These calls have no data and change nothing.
+        words, table = self._ordered.words, self.codec.table
+        self._accept_exact = specialised(
+            accept_exact, words, self._e2e, _NO_TAG, table, self.values, self.values_before
+        )
+        self._accept_frames = specialised(
+            accept_frames, words, _no_rows(0), self._e2e, _NO_TAG, restarts, table, self.values, self._status
+        )
 
     def new_cycle(self, elapsed: int = 1) -> None:
         """Begin a new cycle: increase the age of every row, and mark it as without data until a frame arrives.
@@ -246,9 +250,9 @@ class ReceiveImage:
             Indices in `frames` of the frames that are not messages of this process image.
         """
         self.values_before[:] = self.values
-        found: Words = np.full((count, 2), _FOREIGN)
+        found = _no_rows(count)
         self._accept_frames(
-            frames.view(np.int64),
+            _words_of(frames),
             found,
             self._e2e,
             _NO_TAG if tag is None else tag,
@@ -310,8 +314,18 @@ class _Received:
     def __init__(self, frames: Frames, rows: int) -> None:
         self.frames = frames
         head = frames[:rows]
-        self.words: Words = head.view(np.int64)
+        self.words = _words_of(head)
         self.headers = as_words(head)[:, 0]
+
+
+def _words_of(frames: Frames) -> Words:
+    """Return the frames as a flat array of 64-bit words, the only array type that the specialised functions accept."""
+    return as_words(frames).view(np.int64).ravel()
+
+
+def _no_rows(count: int) -> Words:
+    """Return an array for the row and `Check` of `count` frames, which are not messages of a process image so far."""
+    return np.full((count, 2), _FOREIGN)
 
 
 def accept_exact(
@@ -470,10 +484,9 @@ class TransmitImage:
         rows = len(self.codec.messages)
         self._counters: Words = np.zeros(rows, np.int64)
         self._singles = [self.frames[row : row + 1] for row in range(rows)]
-        self._seal, self._protect = compiled(seal), compiled(protect)
-        # Call the functions once here, so that they are compiled before the first cycle.
-        self._protect(self._octets, self._spans, self._counters)
-        self.seal(0xFF)
+        # These calls set every counter to 0xFF, so the first frame has counter 0.
+        self._protect = specialised(protect, self._octets, self._spans, self._counters)
+        self._seal = specialised(seal, self.values, self.codec.table, self._words, self._spans, self._counters, 0xFF)
 
     def seal(self, counter: int | None = None) -> Frames:
         """Encode the values and protect every row with counter and CRC.

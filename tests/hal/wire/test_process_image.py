@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from binascii import crc_hqx
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from atalante_dbc import Message, load
+from atalante_hal.wire import process_image
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.frame import new_frames
 from atalante_hal.wire.process_image import NEVER, ReceiveImage, TransmitImage
@@ -35,6 +38,39 @@ def deliver(tx: TransmitImage, rx: ReceiveImage, buffer: np.ndarray, order: list
     order = list(range(ROWS)) if order is None else order
     buffer[: len(order)] = frames[order]
     return list(rx.accept(buffer, len(order)))
+
+
+def array_types(arguments: tuple[Any, ...]) -> list[Any]:
+    return [
+        array_types(value)
+        if isinstance(value, tuple)
+        else (value.dtype, value.ndim, value.flags.c_contiguous)
+        if isinstance(value, np.ndarray)
+        else type(value)
+        for value in arguments
+    ]
+
+
+def test_each_call_has_the_argument_types_of_the_compilation(monkeypatch):
+    called = set()
+
+    def checked(function: Callable[..., Any], *first: Any) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
+            assert array_types(arguments) == array_types(first)
+            called.add(function.__name__)
+            return function(*arguments)
+
+        function(*first)
+        return call
+
+    monkeypatch.setattr(process_image, "specialised", checked)
+    tx, rx, buffer = pair()
+    deliver(tx, rx, buffer)
+    deliver(tx, rx, buffer, list(reversed(range(ROWS))))
+    buffer[:ROWS] = tx.seal_prepared(tx.prepare())
+    rx.accept(buffer[:ROWS], ROWS, 2)
+    rx.accept(buffer, 1, 3)
+    assert called == {"accept_exact", "accept_frames", "seal", "protect"}
 
 
 def test_cycle_without_frames_leaves_all_rows_without_data():
