@@ -116,12 +116,13 @@ class Outlets:
                     self.notices.append(str(error))
 
     def summary(self) -> dict[str, int]:
-        """Return the counts of messages and frames, and whether the recording is complete."""
+        """Return the counts of messages and frames, and whether recording and CAN log were closed without a fault."""
         return {
             "published": self.publisher.messages if self.publisher is not None else 0,
             "recorded": self.recorder.messages if self.recorder is not None else 0,
             "finished": self.recorder is not None and self.recorder.finished,
             "frames_logged": self.can_log.frames if self.can_log is not None else 0,
+            "can_log_finished": self.can_log is not None and self.can_log.finished,
         }
 
 

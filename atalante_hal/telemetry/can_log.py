@@ -63,6 +63,7 @@ class CanLog(Closing):
         suffix = check_format(path)
         self.path = path
         self.frames = 0
+        self.finished = False  # True if the file was closed and has every frame that was written
         names = (*buses, FOREIGN)
         by_name = suffix.startswith(".log")
         self._channels: dict[str, str | int] = {name: name if by_name else number for number, name in enumerate(names)}
@@ -125,6 +126,7 @@ class CanLog(Closing):
                 self._logger.stop()
             except OSError as error:
                 raise self._failed(error) from error
+            self.finished = True
 
     def _failed(self, error: OSError) -> SinkError:
         self._open = False

@@ -42,10 +42,14 @@ RUN_GAP_NS = 1_000_000_000
 HANGS_AFTER = 2.0
 #: Largest number of restarts in a session.
 RESTARTS = 3
+#: Period of the check whether the start of a killed subprocess has ended [s].
+_KILLED = 0.1
 #: Time limit for the subprocess to end its Zenoh session, after it has printed its summary [s].
 _SESSION_END = 2.0
 #: Time limit for a restarted subprocess to become ready [s].
 _RESTART = 30.0
+#: Time limit for a subprocess that becomes ready during a run [s]. After it the subprocess is replaced.
+_JOIN = 60.0
 
 
 #: Fields of the configuration that are paths.
@@ -136,6 +140,7 @@ class TelemetrySummary:
     published: int = 0  # messages
     recorded: int = 0  # messages
     frames_logged: int = 0
+    can_log_complete: bool = True  # False if the CAN log that was requested is not one closed file with every frame
     lost: int = 0  # cycles that telemetry lost
     frames_lost: int = 0  # lost records of the CAN frame ring; a cycle adds about one record
     restarts: int = 0  # restarts of the subprocess after it ended or hung
@@ -175,11 +180,12 @@ class TelemetryProcess(Closing):
         self._closed = False
         self._tap: RingTap | None = None
         self._child: subprocess.Popen[bytes] | None = None
+        self._unread = b""  # output of the subprocess that follows its last line read
         self._restarts = 0
         self._faults: list[str] = []  # faults of subprocesses, one sentence each
         self._recordings: list[str] = []  # names of the files begun so far
         self._last_endpoint: str | None = None  # last endpoint in use; None before the first endpoint was opened
-        self._restarting: threading.Thread | None = None
+        self._restarting: threading.Thread | None = None  # start or restart of the subprocess in the background
         self._progress = (0, 0.0)  # number of records read, and time [s], at the last progress
         meta = {
             "layout": layout.to_json(),
@@ -208,17 +214,57 @@ class TelemetryProcess(Closing):
     def start(self, timeout: float = 60.0) -> None:
         """Start the subprocess and wait until it has opened its files and its Zenoh session.
 
+        On the wall clock, a subprocess that is not ready in time joins later. The rings keep the newest records until then;
+        older ones are counted as lost. In lock-step the loop needs the subprocess from the first cycle on.
+
         Args:
             timeout: Longest wait [s].
 
         Raises:
-            TelemetryError: If a requested file or endpoint cannot be opened, or the subprocess is not ready in time.
+            TelemetryError: If a requested file or endpoint cannot be opened, or, in lock-step, if the subprocess is not ready in
+                time.
         """
         try:
-            self.notices = self._launch(self.config, timeout)
+            if self.config.lock_step:
+                self.notices = self._launch(self.config, timeout)
+            else:
+                self._start_in_background(timeout)
         except BaseException:  # includes KeyboardInterrupt during the wait
             self.close(0.0)
             raise
+
+    def _start_in_background(self, timeout: float) -> None:
+        """Start the subprocess in a thread and wait for it.
+
+        Args:
+            timeout: Longest wait [s]. After it the thread goes on.
+
+        Raises:
+            TelemetryError: If the start fails within the timeout.
+        """
+        result: list[tuple[str, ...] | TelemetryError] = []
+
+        def launch() -> None:
+            try:
+                notices = self._launch(self.config, _JOIN)
+            except TelemetryError as error:
+                result.append(error)
+                self._faults.append(str(error))
+                if self._child is not None:
+                    self._end(self._child, 0.0)
+            else:
+                result.append(notices)
+                self._faults.extend(notices)
+
+        self._restarting = threading.Thread(target=launch, daemon=True)
+        self._restarting.start()
+        self._restarting.join(timeout)
+        if not result:
+            self.notices = ("the telemetry process is not ready yet: the run starts without it and it joins later",)
+        elif isinstance(result[0], TelemetryError):
+            raise result[0]
+        else:
+            self.notices = result[0]
 
     def _launch(self, config: TelemetryConfig, timeout: float) -> tuple[str, ...]:
         """Start a subprocess and wait until it is ready.
@@ -237,6 +283,7 @@ class TelemetryProcess(Closing):
         fds = {name: ring.fd for name, ring in rings.items() if ring is not None}
         before = {"restarts": self._restarts, "endpoint": self._last_endpoint}
         arguments = json.dumps({"config": config.to_json(), "rings": fds, **before})
+        self._unread = b""
         self._child = subprocess.Popen(
             [sys.executable, "-P", "-m", "atalante_hal.telemetry", arguments],
             stdin=subprocess.DEVNULL,
@@ -246,7 +293,8 @@ class TelemetryProcess(Closing):
         )
         report = self._read_line(timeout)
         if report is None:
-            raise TelemetryError(f"the telemetry process was not ready within {timeout:.0f} s")
+            limit = "at the end of the run" if self._closed else f"within {timeout:.0f} s"
+            raise TelemetryError(f"the telemetry process was not ready {limit}")
         if "error" in report:
             raise TelemetryError(report["error"])
         self.endpoint = report["endpoint"]
@@ -383,14 +431,13 @@ class TelemetryProcess(Closing):
         if self._closed:
             return TelemetrySummary()
         self._closed = True
-        if self._restarting is not None:
-            self._restarting.join()
         rings = [ring for ring in (self.frames, self.events, self.records) if ring is not None]
         report: dict[str, Any] | None = None
         if self._tap is not None:
             self._tap.flush()
         for ring in rings:
             ring.finish()
+        self._await_start(timeout)
         if self._child is not None:
             report = self._read_line(timeout)
             self._end(self._child, _SESSION_END if report is not None else 0.0)
@@ -399,6 +446,20 @@ class TelemetryProcess(Closing):
         for ring in rings:
             ring.close()
         return summary
+
+    def _await_start(self, timeout: float) -> None:
+        """Wait for the end of a start in the background, and kill the subprocess if it is not ready in time.
+
+        Args:
+            timeout: Longest wait [s].
+        """
+        if self._restarting is None:
+            return
+        self._restarting.join(timeout)
+        while self._restarting.is_alive():
+            if self._child is not None:
+                self._child.kill()
+            self._restarting.join(_KILLED)
 
     def _summary(self, report: Mapping[str, Any] | None) -> TelemetrySummary:
         """Summarise the session after its last subprocess has ended.
@@ -411,12 +472,14 @@ class TelemetryProcess(Closing):
         """
         facts = {"lost": self.records.lost, "notices": (), "finished": False, **(report or {})}
         finished = facts.pop("finished") and not self._restarts
+        logged = facts.pop("can_log_finished", False) and not self._restarts and not facts.get("frames_lost")
         notices = tuple(dict.fromkeys((*self._faults, *facts.pop("notices"))))
         missing = self.records.written - self.records.kept
         recording = Recording(tuple(self._recordings), finished and not missing, missing)
         return TelemetrySummary(
             complete=report is not None and not self._restarts,
             restarts=self._restarts,
+            can_log_complete=logged or self.config.can_log is None,
             notices=notices,
             recording=recording if self.config.recording is not None else None,
             **facts,
@@ -438,17 +501,18 @@ class TelemetryProcess(Closing):
         assert self._child.stdout is not None
         if self._child.stdout.closed:
             return None
-        pipe, line = self._child.stdout.fileno(), b""
+        pipe = self._child.stdout.fileno()
         give_up = time.monotonic() + timeout
         with selectors.DefaultSelector() as selector:
             selector.register(pipe, selectors.EVENT_READ)
-            while not line.endswith(b"\n"):
+            while b"\n" not in self._unread:
                 if not selector.select(max(0.0, give_up - time.monotonic())):
                     return None
                 read = os.read(pipe, 1 << 16)
                 if not read:
                     return None
-                line += read
+                self._unread += read
+        line, _, self._unread = self._unread.partition(b"\n")
         report: dict[str, Any] = json.loads(line)
         return report
 

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -395,6 +396,63 @@ class TestRefusals:
         with pytest.raises(TelemetryError, match="set can_log"):
             telemetry.tap()
         telemetry.close()
+
+
+class TestLateStart:
+    """Start of a telemetry process that is slower than the patience of a run on the wall clock."""
+
+    @pytest.fixture
+    def late(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[float], TelemetryConfig]:
+        def config(delay: float) -> TelemetryConfig:
+            (tmp_path / "sitecustomize.py").write_text(f"import time\ntime.sleep({delay})\n")
+            monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+            return TelemetryConfig(recording=tmp_path / "r.mcap", record_rate=1000, publish=False, slots=64)
+
+        return config
+
+    def test_the_recording_begins_when_the_process_joins_and_the_gap_is_counted(
+        self, layout: Layout, late: Callable[[float], TelemetryConfig], tmp_path: Path
+    ) -> None:
+        telemetry = TelemetryProcess(late(1.0), layout)
+        telemetry.start(0.0)
+        assert telemetry.notices[0].startswith("the telemetry process is not ready yet")
+        telemetry.begin_run("constant")
+        write(telemetry, range(1, 501))
+        until(lambda: telemetry.records.taken == 500)
+        write(telemetry, range(501, 521))
+        summary = telemetry.close()
+        assert (summary.complete, summary.lost, summary.restarts) == (True, 437, 0)
+        assert summary.recording == Recording(("r.mcap",), False, 437)
+        assert [message.cycle for message in recorded(tmp_path / "r.mcap")] == list(range(438, 521))
+
+    def test_a_run_that_ends_before_the_process_joins_is_recorded(
+        self, layout: Layout, late: Callable[[float], TelemetryConfig], tmp_path: Path
+    ) -> None:
+        telemetry = TelemetryProcess(late(1.0), layout)
+        telemetry.start(0.0)
+        write(telemetry, range(1, 51))
+        telemetry.tend()
+        assert telemetry.close(60.0).recording == Recording(("r.mcap",), True, 0)
+        assert [message.cycle for message in recorded(tmp_path / "r.mcap")] == list(range(1, 51))
+
+    def test_a_process_that_never_joins_is_killed_at_the_end(
+        self, layout: Layout, late: Callable[[float], TelemetryConfig]
+    ) -> None:
+        telemetry = TelemetryProcess(late(3600.0), layout)
+        telemetry.start(0.0)
+        write(telemetry, range(1, 51))
+        summary = telemetry.close(0.1)
+        assert not telemetry.alive
+        assert not summary.complete
+        assert summary.notices == ("the telemetry process was not ready at the end of the run",)
+        assert summary.recording == Recording((), False, 50)
+
+    def test_in_lock_step_the_start_waits_for_the_process(
+        self, layout: Layout, late: Callable[[float], TelemetryConfig]
+    ) -> None:
+        telemetry = TelemetryProcess(replace(late(3600.0), lock_step=True), layout)
+        with pytest.raises(TelemetryError, match="was not ready within 1 s"):
+            telemetry.start(1.0)
 
 
 def test_without_zenoh_the_recording_goes_on(layout: Layout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

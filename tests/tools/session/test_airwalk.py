@@ -55,7 +55,9 @@ def atalante(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 def test_the_table_shows_no_tracking_error_for_a_single_step() -> None:
     walked = Result("pinched", True, 1.97, 1.18, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0)
-    head, two, one = results_table([walked, replace(walked, steps=1)]).splitlines()
+    head, two, one = results_table(
+        [walked, replace(walked, steps=1, max_ratio=None, inside=None, filter_active=None)]
+    ).splitlines()
     assert head.split("  ")[0].strip() == "shape"
     assert two.split() == ["pinched", "yes", "1.97", "1.18", "2", "0.93", "99.9", "50.0", "4697", "6.2", "90000", "0"]
     assert one.split() == ["pinched", "yes", "1.97", "1.18", "1", "-", "-", "-", "4697", "6.2", "90000", "0"]
@@ -324,6 +326,41 @@ def test_a_recording_with_a_gap_fails_the_run_and_is_counted(tmp_path: Path, mon
     assert done.stderr.index(f"telemetry on Zenoh at {old}") < done.stderr.index(f"telemetry on Zenoh at {new}")
     said = f"one file with every cycle, got recording.mcap, recording-1.mcap with {missing} cycles missing"
     assert done.stderr.splitlines()[-1] == f"atalante: the recording must be {said}"
+
+
+def test_a_run_of_one_step_reports_no_tracking_error(tmp_path: Path):
+    done = CliRunner().invoke(cli, ["airwalk", "--steps", "1", "--json", "--out", str(tmp_path)])
+    assert done.exit_code == 0, done.stderr
+    walked = json.loads(done.stdout.splitlines()[0])
+    assert (walked["steps"], walked["max_ratio"], walked["inside"], walked["filter_active"]) == (1, None, None, None)
+
+
+def test_a_can_log_on_a_full_disk_fails_the_run(tmp_path: Path):
+    log = tmp_path / "frames.log"
+    log.symlink_to("/dev/full")
+    done = CliRunner().invoke(cli, ["airwalk", "--steps", "1", "--out", str(tmp_path), "--can-log", str(log)])
+    assert done.exit_code == 1
+    assert f"the CAN log {log} stopped: No space left on device" in done.stderr
+    said = f"atalante: the CAN log {log} must contain every frame, but frames are missing"
+    assert done.stderr.splitlines()[-1] == said
+
+
+def test_a_run_starts_without_the_telemetry_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "sitecustomize.py").write_text("import time\ntime.sleep(1.0)\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    start = TelemetryProcess.start
+
+    def start_as_on_the_wall_clock(telemetry: TelemetryProcess, timeout: float = 60.0) -> None:
+        telemetry.config = replace(telemetry.config, lock_step=False)
+        start(telemetry, 0.0)
+
+    monkeypatch.setattr(TelemetryProcess, "start", start_as_on_the_wall_clock)
+    done = CliRunner().invoke(cli, ["airwalk", "--steps", "1", "--json", "--out", str(tmp_path / "run")])
+    assert done.exit_code == 0, done.stderr
+    late = "the telemetry process is not ready yet: the run starts without it and it joins later"
+    assert done.stderr.index(late) < done.stderr.index("ACTIVE on")
+    recording = json.loads(done.stdout.splitlines()[-1])
+    assert recording == {"recording": {"files": ["recording.mcap"], "complete": True, "missing_cycles": 0}}
 
 
 def test_every_event_is_recorded_when_the_event_log_holds_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 #: Names of the guide shapes, copied from `shapes.SHAPES` because the help must not import the slow controller.
 SHAPE_NAMES = "constant, widening, narrowing, pinched, asymmetric, snap"
+#: Longest wait for the telemetry process before a run on the wall clock [s]. A process that is ready later joins the run.
+_TELEMETRY_WAIT = 5.0
 #: Period of the check of the telemetry process [cycles].
 _TEND_CYCLES = 250
 
@@ -65,10 +67,11 @@ class Options:
 
 @dataclass
 class Walked:
-    """Results and recording of a trial. The recording is set when the telemetry is closed."""
+    """Results and recording of a trial. The recording and the state of the CAN log are set when the telemetry is closed."""
 
     results: list[Result] = field(default_factory=list)  # one result per finished guide shape
     recording: Recording | None = None  # None until the telemetry is closed
+    can_log_complete: bool = True  # False if frames are missing in the CAN log
 
 
 def _record_rate(text: str) -> int:
@@ -128,7 +131,7 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
         as_json: Whether to print JSON objects instead of a table.
 
     Raises:
-        Failed: If the robot left ACTIVE before the last step, or the recording is incomplete.
+        Failed: If the robot left ACTIVE before the last step, or the recording or the CAN log is incomplete.
         FaultLatched: If the robot is in FAULT.
         SystemExit: If a signal ended the run.
     """
@@ -152,6 +155,8 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
                     click.echo(results_table(walked.results))
                 write_summary(options.out, _summary_options(options), walked.results, walked.recording)
     _require_complete(walked.recording)
+    if not walked.can_log_complete:
+        raise Failed(f"the CAN log {options.can_log} must contain every frame, but frames are missing")
 
 
 def _require_complete(recording: Recording | None) -> None:
@@ -162,7 +167,7 @@ def _require_complete(recording: Recording | None) -> None:
     """
     if recording is not None and not recording.complete:
         raise Failed(
-            f"the recording must be one file with every cycle, got {', '.join(recording.files)} "
+            f"the recording must be one file with every cycle, got {', '.join(recording.files) or 'no file'} "
             f"with {recording.missing_cycles} cycles missing"
         )
 
@@ -214,7 +219,7 @@ def _walk_all(
                     certificates = {shape: walking.certificate(options.xi) for shape, walking in controllers.items()}
                     _announce(certificates.values())
                     telemetry = _telemetry(target, options, outlet, rig.hal, network, gait.hash32)
-                    stack.enter_context(telemetry)
+                    telemetry.start() if target.lockstep else telemetry.start(_TELEMETRY_WAIT)
                     stack.callback(_close, telemetry, walked)
                     report_endpoint = _EndpointReport(telemetry)
                 telemetry.begin_run(name, {"shape": name, "xi": options.xi, **_bounds(certificates[name])})
@@ -448,7 +453,7 @@ class _EndpointReport:
 def _close(telemetry: TelemetryProcess, walked: Walked) -> None:
     """Close the telemetry, print its messages about lost data, and add its recording to `walked`."""
     summary = telemetry.close()
-    walked.recording = summary.recording
+    walked.recording, walked.can_log_complete = summary.recording, summary.can_log_complete
     for notice in summary.notices:
         if notice not in telemetry.notices:  # messages from the start of the telemetry are already printed
             say(notice)
@@ -458,13 +463,15 @@ def _close(telemetry: TelemetryProcess, walked: Walked) -> None:
 
 def _result(certificate: Certificate, controller: AirwalkController, hal: Hal, statistics: Statistics) -> Result:
     walking = controller.statistics
+    # The first step is not counted, and the run ends in the first cycle after the last step.
+    counted = walking.steps >= 2
     return Result(
         shape=certificate.shape,
         **_bounds(certificate),
         steps=walking.steps,
-        max_ratio=round(walking.max_ratio, 4),
-        inside=round(walking.inside_fraction, 4),
-        filter_active=round(walking.active_fraction, 4),
+        max_ratio=round(walking.max_ratio, 4) if counted else None,
+        inside=round(walking.inside_fraction, 4) if counted else None,
+        filter_active=round(walking.active_fraction, 4) if counted else None,
         cycles=statistics.cycles,
         real_time_factor=round(statistics.real_time_factor, 2),
         frames=int(hal.record[hal.layout["frames"]][0]),

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 class Result:
     """Result of one guide shape. The field names are the JSON keys of `--json` and of summary.json.
 
-    `max_ratio`, `inside` and `filter_active` are measured after the first completed step.
+    `max_ratio`, `inside` and `filter_active` are measured after the first completed step. They are None if the run ended before
+    the second step.
     """
 
     shape: str
@@ -37,9 +38,9 @@ class Result:
         float | None
     )  # certified disturbance at the knee, simultaneous with the hip [Nm]. None: not certified.
     steps: int  # number of completed right-stance steps
-    max_ratio: float  # largest ratio of tracking error to guide width, |e| / q_bound
-    inside: float  # share of the time with both assisted joints inside the guide, 0 to 1
-    filter_active: float  # share of the time with an active guide filter, 0 to 1
+    max_ratio: float | None  # largest ratio of tracking error to guide width, |e| / q_bound
+    inside: float | None  # share of the time with both assisted joints inside the guide, 0 to 1
+    filter_active: float | None  # share of the time with an active guide filter, 0 to 1
     cycles: int
     real_time_factor: float
     frames: int
@@ -87,13 +88,16 @@ def write_summary(out: Path, options: Mapping[str, Any], results: Sequence[Resul
     """
     summary = {**options, "recording": asdict(recording), "shapes": [asdict(result) for result in results]}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-    figure = _figure(out)
+    figure = _figure(out, recording)
     say(f"in {out}: {', '.join([*recording.files, 'summary.json', *([figure] if figure else [])])}")
 
 
-def _figure(out: Path) -> str:
+def _figure(out: Path, recording: Recording) -> str:
     """Draw the figure and return its file name. If it cannot be drawn, print the reason and return an empty string."""
     name = "guide_shapes.png"
+    if "recording.mcap" not in recording.files:
+        say("no figure: recording.mcap was not written")
+        return ""
     try:
         from mcap.exceptions import McapError
 
@@ -135,7 +139,7 @@ def results_table(results: Sequence[Result]) -> str:
 
 
 def _tracking_cells(result: Result) -> tuple[str, str, str]:
-    """Return the three table cells of the tracking error. The cells are empty unless two steps are complete."""
-    if result.steps < 2:
+    """Return the three table cells of the tracking error, each "-" if it was not measured."""
+    if result.max_ratio is None or result.inside is None or result.filter_active is None:
         return "-", "-", "-"
     return f"{result.max_ratio:.2f}", f"{100 * result.inside:.1f}", f"{100 * result.filter_active:.1f}"
