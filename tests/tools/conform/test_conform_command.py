@@ -1,4 +1,4 @@
-"""Tests of `atalante conform`: protocol, exit codes, real-time clock, and the frames of the node tester."""
+"""Tests of `atalante conform`: report, exit codes, real-time clock, and the frames of the node tester."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def run(*arguments: str) -> Result:
 # -- command -----------------------------------------------------------------------------------------------------------
 
 
-def test_protocol_lists_requirement_test_measurement_and_source():
+def test_report_lists_requirement_test_measurement_and_source():
     result = run("left_sk", "--only", "drive-13", "--only", "NODE-01")
     assert result.exit_code == 0
-    protocol = result.stdout
-    assert protocol.startswith("ACCEPTANCE PROTOCOL  LEFT_SK (drive)\non embedded, ")
-    entries = [line.split()[:2] for line in protocol.splitlines() if line.startswith(("NODE-", "DRIVE-"))]
+    report = result.stdout
+    assert report.startswith("ACCEPTANCE REPORT  LEFT_SK (drive)\non embedded, ")
+    entries = [line.split()[:2] for line in report.splitlines() if line.startswith(("NODE-", "DRIVE-"))]
     assert entries == [["NODE-01", "pass"], ["DRIVE-13", "pass"]]  # in the order of the examination
     for part in (
         "Latches a local hold after 5 lost commands.",
@@ -50,7 +50,7 @@ def test_protocol_lists_requirement_test_measurement_and_source():
         "measured: OPERATION_ENABLED -> QUICK_STOP_ACTIVE",
         "source: fault matrix F25",
     ):
-        assert part in protocol
+        assert part in report
     assert "2 of 2 requirements passed" in result.stderr
 
 

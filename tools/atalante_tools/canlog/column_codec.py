@@ -88,7 +88,7 @@ class ColumnCodec:
         rows: dict[tuple[str, int], int] = {}
         self._little: list[int] = []  # Intel words
         self._big: list[int] = []  # Motorola words, byte-swapped
-        self._joined: list[tuple[bool, int, int]] = []  # (is Motorola, first word, shift) of each field in two words
+        self._joined: list[tuple[bool, int, int]] = []  # fields in two words: (is Motorola, first word, shift)
         sources: list[tuple[str, int]] = []
         left: list[int] = []
         for number, field in enumerate(self.fields):
@@ -152,7 +152,7 @@ class ColumnCodec:
         field, codes = self.fields[index], raw[index]
         if field.kind == "float":
             unsigned, floating = _FLOATS[field.length]
-            with np.errstate(invalid="ignore", over="ignore"):  # a payload may contain a signalling NaN
+            with np.errstate(invalid="ignore", over="ignore"):  # a signalling NaN in a payload is no error
                 real = codes.astype(unsigned).view(floating).astype(np.float64)
                 return np.asarray(real * field.factor + field.offset)
         integers = codes.view(np.int64) if field.kind == "signed" or field.length < _WORD else codes
@@ -256,9 +256,9 @@ def _pair_table(followed_by: int) -> npt.NDArray[np.uint16]:
 
 
 def crc_of_zeros(length: int, data_id: int) -> int:
-    """Return the CRC of a payload whose bytes are all zero.
+    """Return the CRC of a payload of zeros.
 
-    The contributions of the payload bytes are added to it (over GF(2)).
+    The CRC of any payload is this CRC, XORed with the contributions of the payload bytes.
 
     Args:
         length: payload length with the CRC, bytes.

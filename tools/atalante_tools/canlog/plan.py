@@ -52,7 +52,7 @@ class Plan:
         self._index_identifiers()
         count = len(self.layouts)
         headers = [header_word(_can_id(m), m.length, _flags(m)) for m in self.layouts]
-        #: Expected header word of the frames of each row; 0 for unsupported messages and, as last element, for `UNKNOWN`.
+        #: Expected header word of each row; 0 for unsupported messages. The last element is 0, for the index `UNKNOWN`.
         self.headers = np.array([*headers, *([0] * len(self.refused)), 0], np.uint64)
         self.lengths = np.array([m.length for m in self.layouts], np.int64)
         self.cycle_ns = np.array([1e6 * (m.cycle_ms or 0.0) if m.cyclic else 0.0 for m in self.layouts])
@@ -132,7 +132,10 @@ class Plan:
         return rows
 
     def rows_in_other_format(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
-        """Return the row of the same number in the other identifier format (11 or 29 bits), or `UNKNOWN`. Shape (n,)."""
+        """Return the row of each identifier in the other format: 29 bits instead of 11, or 11 instead of 29. Shape (n,).
+
+        The row is `UNKNOWN` if the DBC has no such message.
+        """
         numbers = can_ids & np.uint32(_ALL_BITS)
         short = self._standard[np.where(numbers < _STANDARD, numbers, 0)]
         short[numbers >= _STANDARD] = UNKNOWN

@@ -21,7 +21,7 @@ _Column = TypeVar("_Column", bound=npt.NDArray[Any])
 
 @dataclass(frozen=True)
 class Stream:
-    """Frames of a chunk sorted by message row, then in the order of the log; n frames of m messages."""
+    """Frames of a chunk: n frames of m messages, sorted by message row. Each message keeps the order of the log."""
 
     rows: Rows  # row of the message of each frame, shape (n,)
     stamps: npt.NDArray[np.int64]  # ns

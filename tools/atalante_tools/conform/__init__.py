@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     default=30.0,
     show_default=True,
     metavar="S",
-    help="How long to wait for each manual action, in seconds.",
+    help="Longest wait for the effect of each manual action, in seconds.",
 )
 @json_option
 def command(
@@ -53,7 +53,7 @@ def command(
     patience: float,
     as_json: bool,
 ) -> None:
-    """Test one NODE (LEFT_SK, IMU_TORSO, FOOT_LEFT, HAPTICS, PENDANT, ...) and print an acceptance protocol.
+    """Test one NODE (LEFT_SK, IMU_TORSO, FOOT_LEFT, HAPTICS, PENDANT, ...) and print an acceptance report.
 
     The command sends SYNC and commands in place of the HAL. When a drive is tested, its joint must be free to move by about
     10 cm, and the exoskeleton must be empty. The exit code is 1 if a requirement failed or could not be tested.

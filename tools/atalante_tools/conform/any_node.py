@@ -21,9 +21,9 @@ NMT: Final = {0: "BOOTUP", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE_OPERATIONAL
 _OFF: Final = 250
 #: Number of cycles for the test of the heartbeat, and for the test of the answers to SYNC.
 _HEARTBEAT_CYCLES, _ANSWER_CYCLES = 520, 200
-#: Largest relative deviation of the mean heartbeat period, and of a single period, from the DBC.
+#: Largest relative deviation from the heartbeat period in the DBC: of the mean period, and of a single period.
 _MEAN, _SINGLE = 0.1, 0.5
-#: Random frames per cycle of the flood test, and number of its cycles. The bus load stays below 100 %.
+#: Number of random frames per cycle of the flood test, and number of its cycles. The bus load stays below 100 %.
 _FLOOD, _FLOOD_CYCLES = 6, 100
 #: Bits of SYNC that are flipped, one in each wrong SYNC: bits of the CRC, the HAL state and the cycle number.
 _DAMAGED: Final = (0, 5, 10, 15, *range(24, 32), *range(48, 56))
@@ -222,7 +222,7 @@ def keeps_its_heartbeat(tester: NodeTester) -> Outcome:
 
 
 def answers_every_sync(tester: NodeTester) -> Outcome:
-    """Test NODE-04: the node sends one state frame per SYNC, or one per period."""
+    """Test NODE-04: the node answers every SYNC with one state frame, or sends its state with the period in the DBC."""
     return _answered(tester, tester.idle(_ANSWER_CYCLES), _ANSWER_CYCLES)
 
 
@@ -257,7 +257,7 @@ def tolerates_foreign_frames(tester: NodeTester) -> Outcome:
 
 
 def _ignores_sync(wrong: Callable[[NodeTester, int], Frames]) -> Callable[[NodeTester], Outcome]:
-    """Return a test that sends wrong and right SYNCs alternately. The node must answer only the right ones."""
+    """Return a test that sends defective and valid SYNCs alternately. The node must answer only the valid SYNCs."""
 
     def test(tester: NodeTester) -> Outcome:
         answers: Counter[bool] = Counter()
@@ -276,7 +276,7 @@ def _sync_of_another_length(tester: NodeTester, number: int) -> Frames:
 
 
 def _foreign_frames(random: np.random.Generator, known: list[int]) -> Frames:
-    """Return random frames with unknown identifiers, of which the first has the highest bus priority. Shape (_FLOOD,)."""
+    """Return random frames with unknown identifiers. The first frame has the highest bus priority. Shape (_FLOOD,)."""
     frames = new_frames(_FLOOD)
     frames["data"][:, :8] = random.integers(0, 256, (_FLOOD, 8), np.uint8)
     for index, frame in enumerate(frames):
@@ -294,7 +294,7 @@ def _foreign_frames(random: np.random.Generator, known: list[int]) -> Frames:
 
 
 def _all(defects_of: Callable[[list[ReceivedFrame]], list[str]]) -> Callable[[NodeTester], Outcome]:
-    """Return a test of all received frames, which passes if `defects_of` returns no defect."""
+    """Return a test of all received frames. It passes if `defects_of` returns no defect."""
 
     def test(tester: NodeTester) -> Outcome:
         if tester.dropped:
@@ -335,7 +335,7 @@ def _statuses(tester: NodeTester, received: list[ReceivedFrame] | None = None) -
 
 
 def _answered(tester: NodeTester, received: list[ReceivedFrame], cycles: int) -> Outcome:
-    """Return whether the node sent the expected state frames in `cycles` cycles, in number and spacing."""
+    """Return whether the number and the spacing of the state frames in `cycles` cycles are as expected."""
     period = tester.state_message.cycle_ms
     at = [frame.cycle for frame in received if frame.message is tester.state_message]
     if period == 1:

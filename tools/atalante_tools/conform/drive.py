@@ -18,7 +18,7 @@ E2E: Final = "AUTOSAR E2E Profile 5"
 
 
 def requirements(tester: NodeTester) -> list[Requirement]:
-    """Return the requirements for a drive, in the order of a first commissioning."""
+    """Return the requirements for a drive, in the order of the tests."""
     torque = tester.limits.torque
     return [
         Requirement(
@@ -149,7 +149,7 @@ def requirements(tester: NodeTester) -> list[Requirement]:
         ),
         Requirement(
             "DRIVE-19",
-            "Ignores a different command with the counter of the last one, or latches the hold: it comes from another sender.",
+            "Ignores a command of a second sender (changed command, unchanged counter), or latches the hold.",
             "2, then 10 commands with the counter of the last valid command",
             f"{E2E}, fault matrix F05, F51",
             ignores(lambda axis, _: axis.bad_command(counter=axis.tester.command.counter), may_hold=True),

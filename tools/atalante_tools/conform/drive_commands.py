@@ -1,6 +1,6 @@
 """Tests of a drive with defective, foreign and lost commands, and with lost SYNC.
 
-A few such cycles must have no effect. More of them must latch the hold.
+A few such cycles must have no effect. More consecutive cycles must latch the hold.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def ignores_invalid_codes(tester: NodeTester) -> Outcome:
 
 
 def ignores(bad: Callable[[Axis, int], Frames], *, may_hold: bool = False) -> Callable[[NodeTester], Outcome]:
-    """Return a test with defective commands: two must have no effect, ten consecutive ones must latch the hold.
+    """Return a test with defective commands: two must have no effect, ten consecutive commands must latch the hold.
 
     Args:
         bad: function that returns the defective command number `n` for an axis.

@@ -1,4 +1,4 @@
-"""Tests of the torque of a drive: zero unless enabled, sign and magnitude as commanded, limited to MaxTorque."""
+"""Tests of the torque of a drive: zero while disabled, sign and magnitude as commanded, at most MaxTorque."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def requirements_of(tester: NodeTester) -> list[Requirement]:
     """
     before, after = any_node.requirements(tester)
     special = _REQUIREMENTS[tester.node.kind](tester)
-    # DRIVE-01 tests the state after start-up, so it is tested before the first command.
+    # DRIVE-01 tests the state after start-up, so it must run before the first command.
     early = 1 if tester.node.kind == "drive" else 0
     return [before[0], *special[:early], *before[1:], *special[early:], *after]
 

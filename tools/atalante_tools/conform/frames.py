@@ -17,7 +17,7 @@ _FD: Final = FLAG_FDF | FLAG_BRS
 
 
 class MessageSender:
-    """Sender of one message. A frame is valid except for the defects requested by arguments."""
+    """Sender of one message. A frame has only the defects that the arguments request."""
 
     def __init__(self, message: Message) -> None:
         self.message = message

@@ -38,7 +38,7 @@ class NotTested(Exception):  # noqa: N818
 class Clock(Protocol):
     """Clock that starts the cycles."""
 
-    delay: float  # longest delay of a cycle start by this computer since the last reset to 0 [s]
+    delay: float  # longest delay of a cycle start on this computer [s]; each test resets it to 0
 
     def next_cycle(self, *, sync: bool, listen: Callable[[float], None]) -> None:
         """Wait for the start of the next cycle.
@@ -117,7 +117,7 @@ class NodeTester:
 
     Attributes:
         received: frames of the node since the start of the examination.
-        frame_count: number of frames of the node recorded so far, including those removed from `received` since then.
+        frame_count: number of frames of the node recorded so far, including the frames that were removed from `received`.
         cycle_number: number of cycles of 1 ms, with or without SYNC.
     """
 
@@ -275,7 +275,7 @@ class NodeTester:
     def run_until(
         self, shows: Callable[[list[ReceivedFrame]], bool], cycle: Callable[[], list[ReceivedFrame]] | None = None
     ) -> bool:
-        """Run cycles until a condition holds. Return False if the patience of the technician ends first.
+        """Run cycles until a condition holds, for at most `technician.patience`. Return whether it holds.
 
         Args:
             shows: condition on the frames received in a cycle.
@@ -294,7 +294,7 @@ class NodeTester:
 
         Args:
             action: manual action on the node.
-            shows: condition on the frames received in a cycle that shows the effect.
+            shows: function that returns whether the frames of one cycle show the effect.
             cycle: function that runs one cycle; None: `self.cycle`.
 
         Raises:

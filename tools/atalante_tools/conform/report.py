@@ -1,4 +1,4 @@
-"""Acceptance protocol: each requirement with its test, the measured values and the verdict."""
+"""Acceptance report: each requirement with its test, the measured values and the verdict."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def as_object(tester: NodeTester, result: Result) -> dict[str, Any]:
 
 
 def heading(tester: NodeTester, target: str, date: str) -> str:
-    """Return the head of the protocol: node, bus, date, network hash and torque limit."""
+    """Return the heading of the report: node, bus, date, network hash and torque limit."""
     torque = f", at most {tester.limits.torque:g} Nm" if tester.node.kind == "drive" else ""
     return (
-        f"ACCEPTANCE PROTOCOL  {tester.node.name} ({tester.node.kind})\n"
+        f"ACCEPTANCE REPORT  {tester.node.name} ({tester.node.kind})\n"
         f"on {target}, {date}; network {tester.network.hash32:#010x}{torque}\n"
     )
 
@@ -47,7 +47,7 @@ def entry(result: Result) -> str:
 
 
 def conclusion(tester: NodeTester, results: Sequence[Result]) -> str:
-    """Return the last line of the protocol: the number of passed requirements, and the identifiers of all others."""
+    """Return the last line of the report: the number of passed requirements, and the identifiers of the other requirements."""
     counts = Counter(result.verdict for result in results)
     missed = [r.requirement.id for r in results if r.verdict is not Verdict.PASSED]
     text = f"{tester.node.name}: {counts[Verdict.PASSED]} of {len(results)} requirements passed"

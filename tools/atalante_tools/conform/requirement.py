@@ -9,7 +9,7 @@ from typing import Final
 
 from atalante_tools.conform.node_tester import NodeTester, NotTested
 
-#: Delay of a cycle above which this computer may be the cause of a failed test [s].
+#: Delay of a cycle start [s]. With a larger delay, this computer may be the cause of a failed test.
 LATE: Final = 2e-3
 #: Number of attempts for a test that fails while this computer is late.
 ATTEMPTS: Final = 3
@@ -69,7 +69,7 @@ def _result(tester: NodeTester, requirement: Requirement) -> Result:
         silence = _silence(tester, frames, cycle)
         measured = silence + outcome.measured
         if outcome.passed:
-            # A requirement that forbids frames or torque also holds for a node that is not there.
+            # An absent node meets a requirement that forbids frames or torque, so this is no pass.
             return Result(requirement, Verdict.NOT_TESTED if silence else Verdict.PASSED, measured)
         if tester.clock.delay < LATE:
             return Result(requirement, Verdict.FAILED, measured)
@@ -78,9 +78,9 @@ def _result(tester: NodeTester, requirement: Requirement) -> Result:
 
 
 def _silence(tester: NodeTester, frames: int, cycle: int) -> str:
-    """Return the beginning of a result whose test received no frame of the node; empty if it received one.
+    """Return a remark if the test received no frame of the node, otherwise an empty text.
 
-    A test that runs no cycle of its own judges all frames received so far.
+    A test that runs no cycle evaluates all frames received before it.
 
     Args:
         tester: tester of the node.

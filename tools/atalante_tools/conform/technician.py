@@ -52,7 +52,7 @@ class HumanTechnician:
 
 
 class EmulatorTechnician:
-    """Program that carries out manual actions on an emulated robot, which starts with the examination."""
+    """Program that carries out manual actions on an emulated robot. The robot starts with the examination."""
 
     def __init__(self, emulator: Emulator, operator: Operator) -> None:
         self._emulator, self._operator = emulator, operator

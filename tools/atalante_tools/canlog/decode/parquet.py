@@ -121,7 +121,7 @@ class ParquetSink:
         self._integers.clear()
 
     def _texts_of(self, field: Field, codes: npt.NDArray[np.int64]) -> npt.NDArray[np.int32] | None:
-        """Return the index into `_texts` for each code; -1 for a code without a name.
+        """Return for each raw code the index of its name in `_texts`; -1 for a raw code without a name.
 
         Returns:
             The indices, shape (n,); None if the field has no value table.
@@ -139,7 +139,7 @@ class ParquetSink:
 
 
 def _exact(field: Field, values: npt.NDArray[Any]) -> Any:
-    """Return the values as decimals if float64 is not exact for the field, otherwise as nulls."""
+    """Return the column `integer`: exact decimals if float64 cannot hold every value of the field, otherwise nulls."""
     codes = raw_range(field) if field.kind != "float" else range(0)
     if values.dtype.kind == "f" or not codes or max(-codes[0], codes[-1]) * abs(field.factor) <= _EXACT:
         return pa.nulls(len(values), _DECIMAL)

@@ -32,7 +32,7 @@ from atalante_tools.canlog.reader.chunk import NO_DIRECTION, RECEIVED, SENT, Cha
 Text = npt.NDArray[np.uint8]
 Positions = npt.NDArray[np.intp]
 
-#: Size of the padding before and after the text [byte]; the parser reads less than this beyond a line.
+#: Padding before and after the text [byte]. The parser may read bytes outside a line, but never more than this.
 MARGIN = 160
 _NEWLINE, _RETURN, _SPACE, _OPEN, _CLOSE, _HASH, _DOT = b"\n\r ()#."
 _NAME_BYTES = 16  # longest channel name that the array operations parse; Linux allows 15
@@ -47,7 +47,7 @@ _HEX_PAIR = np.full(1 << 16, 0xFFFF, np.uint16)
 _HEX_PAIR.reshape(256, 256)[:] = np.where(
     (_HEX < 16) & (_HEX < 16)[:, None], _HEX.astype(np.uint16) << 4 | _HEX[:, None], 0xFFFF
 )
-#: Bit masks for the last k bytes of a 64-bit word, k = 0 to 8.
+#: Bit masks that select the last k bytes of a 64-bit word, for k = 0 to 8.
 _TAIL = np.array([0, *((((1 << 8 * k) - 1) << 64 - 8 * k) for k in range(1, 9))], np.uint64)
 _ZEROS = np.uint64(0x3030303030303030)
 _LINE = re.compile(
@@ -162,7 +162,7 @@ class _Lines:
         return closes
 
     def _one_per_line(self, found: Positions, regular: npt.NDArray[np.bool_], *, alone: bool = True) -> Positions:
-        """Return the first of the found positions in each line. Shape (lines,).
+        """Return for each line the first of the found positions. Shape (lines,).
 
         Args:
             found: positions in the text, ascending.
@@ -214,7 +214,7 @@ def _times(lines: _Lines, stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_
 def _number(
     word: npt.NDArray[np.uint64], digits: npt.NDArray[np.intp]
 ) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.bool_]]:
-    """Parse the last `digits` of eight characters as a decimal number.
+    """Parse the last `digits` characters of each word of eight characters as a decimal number.
 
     Args:
         word: eight characters of each line, shape (lines,).
@@ -228,14 +228,14 @@ def _number(
     changes = np.flatnonzero(word[1:] != word[:-1]) + 1
     if len(changes) * 4 > len(word):
         return _parse_digits(word)
-    runs = np.concatenate([[0], changes])  # thousands of consecutive lines have equal seconds, which are parsed once
+    runs = np.concatenate([[0], changes])  # equal words of consecutive lines (their seconds) are parsed once
     number, valid = _parse_digits(word[runs])
     lengths = np.diff(runs, append=len(word))
     return number.repeat(lengths), valid.repeat(lengths)
 
 
 def _parse_digits(word: npt.NDArray[np.uint64]) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.bool_]]:
-    """Parse eight decimal digits, of which the first is in the lowest byte.
+    """Parse words of eight decimal digits. The first digit is in the lowest byte.
 
     The digits are combined in pairs, then in fours, then in one number.
 

@@ -1,6 +1,6 @@
 """Reader of CAN logs in chunks of frames: an array parser for candump logs, and python-can for all other formats.
 
-The chunk size bounds the memory for a log of any length. The reader returns all readable frames. Unreadable parts of a log
+The chunk size limits the memory for a log of any length. The reader returns all readable frames. Unreadable parts of a log
 become remarks, which the validator reports as findings.
 """
 
@@ -43,7 +43,7 @@ class Log(LogFile):
         if backwards:
             self.remark(
                 "log-unsorted",
-                f"{self.path} is not in order of time ({backwards} steps back, the longest {-furthest * 1e-9:.6f} s); the frames "
+                f"{self.path} is not in order of time ({backwards} jumps back, the longest {-furthest * 1e-9:.6f} s); the frames "
                 "were sorted within each chunk of the log",
                 backwards,
                 first_backwards,

@@ -1,6 +1,6 @@
 """Rules for drive states: only transitions of CiA 402 are legal, and a drive must respond to a controlword in time.
 
-The rules check only the frames in which the state or the controlword changes, because such frames are rare in any log.
+State and controlword change rarely. To save time, the rules check only the frames with a change.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class DriveRules:
             decoded: decoded frames of the families in the chunk, by the first row of the family.
             family_of: family of each row.
             stream: frames of the chunk by message, shape (n,).
-            steps: steps of the alive counters, shape (n,).
+            steps: increments of the alive counters, shape (n,).
         """
         for first, drives in self.drives.items():
             states = decoded.get(first)

@@ -1,4 +1,4 @@
-"""Rules for end-to-end protection (E2E): CRC of every frame, and steps of the alive counters."""
+"""Rules for end-to-end protection (E2E): CRC of every frame, and increments of the alive counters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from atalante_tools.canlog.validate.findings import Findings
 
 Steps = npt.NDArray[np.int64]
 
-#: Counter step of a repeated frame, and code for a frame without a counter or without a previous frame.
+#: Increment of the alive counter in a repeated frame, and code for a frame without a counter or without a previous frame.
 REPEATED, NO_STEP = 0, -1
 
 
@@ -98,7 +98,7 @@ def _at(plan: Plan, length: int) -> npt.NDArray[np.intp]:
 
 
 class Counters:
-    """Calculator of alive counter steps, which stores the last counter of each message."""
+    """Calculator of alive counter increments. It stores the last counter of each message."""
 
     def __init__(self, plan: Plan) -> None:
         self._protected = plan.protected
@@ -106,7 +106,7 @@ class Counters:
         self._seen = np.zeros(len(plan.layouts), np.bool_)
 
     def steps(self, stream: Stream) -> Steps:
-        """Return the counter step of each frame; `NO_STEP` for a frame without counter or previous frame. Shape (n,)."""
+        """Return the counter increment of each frame; `NO_STEP` for a frame without counter or previous frame. Shape (n,)."""
         counters = stream.frames.view(np.uint8).reshape(-1, FRAME_BYTES)[:, HEADER_BYTES + COUNTER_BYTE].copy()
         steps = counter_steps(counters, stream.before(counters, self._last))
         steps[stream.starts[~self._seen[stream.present]]] = NO_STEP

@@ -13,7 +13,7 @@ from atalante_tools.canlog.plan import Plan
 from atalante_tools.canlog.validate.rules import RULE_OF
 
 Stamps = npt.NDArray[np.int64]
-#: Maximum number of unknown identifiers with a finding of their own. The finding `OTHERS` combines all further ones.
+#: Maximum number of unknown identifiers with a finding of their own. The finding `OTHERS` combines all further identifiers.
 MAX_UNKNOWN_IDS = 100
 OTHERS = "(others)"
 #: Rules that can have more findings than the DBC has messages.
@@ -150,7 +150,7 @@ class Findings:
             )
 
     def add_whole(self, rule: str, row: int, first: int, last: int, *, shown: float, count: int = 1) -> None:
-        """Add a violation by one message that lasts from the time stamp `first` to `last` [ns]."""
+        """Add a violation by one message. The violation lasts from the time stamp `first` to `last` [ns]."""
         worst = _text(shown, RULE_OF[rule].worst, "")
         self._merge(
             Finding(

@@ -64,7 +64,7 @@ class LoadRules:
 
     @property
     def checked(self) -> bool:
-        """Return whether the bus load is checked, which needs a bit rate in the DBC."""
+        """Return whether the bus load is checked. The check needs a bit rate in the DBC."""
         return self._nominal > 0
 
     def _layout_time(self, row: int) -> float:
@@ -138,7 +138,7 @@ class LoadRules:
             seconds[indices[key == value]] = time
 
     def _bus(self, chunk: Chunk, known: npt.NDArray[np.bool_], rows: npt.NDArray[np.int16]) -> npt.NDArray[np.int64]:
-        """Return the column of `load` for each frame. Shape (n,).
+        """Return for each frame the column of its bus in `load`. Shape (n,).
 
         The column is the bus of the channel. On a channel with several buses, it is the bus of the message.
         """

@@ -1,4 +1,4 @@
-"""Plausibility rules: velocity against position, norm of quaternions, steps of slow values, and values without noise.
+"""Plausibility rules: velocity against position, norm of quaternions, change of slow values, and measured values without noise.
 
 The signals are selected by name (`codec.group_of`). The rules file of a project may set other names.
 """
@@ -46,7 +46,7 @@ class MotionRules:
         Args:
             decoded: decoded frames of the family.
             stream: frames of the chunk by message, shape (n,).
-            steps: steps of the alive counters of the whole stream, shape (n,).
+            steps: increments of the alive counters of the whole stream, shape (n,).
         """
         for rule in self._families[decoded.family.rows.start]:
             rule.check(decoded, stream, steps)
@@ -169,7 +169,7 @@ class _Quaternion:
 
 
 class _Columns:
-    """Raw codes of some fields of a family, paired with those of the previous frame of the same message."""
+    """Store of the last raw codes of some fields of a family. It pairs each frame with the previous frame of its message."""
 
     def __init__(self, family: Family, indices: Sequence[int]) -> None:
         self._indices = np.array(indices, np.intp)
@@ -180,7 +180,7 @@ class _Columns:
     def with_before(
         self, decoded: Decoded, stream: Stream
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], list[int]]:
-        """Pair the raw codes of each frame with those of the previous frame, which may be in an earlier chunk.
+        """Pair the raw codes of each frame with the raw codes of the previous frame, even if that is in an earlier chunk.
 
         Returns:
             The codes, the codes of the previous frame, shape (fields, n) each, and the indices of the frames without a previous
@@ -214,7 +214,7 @@ class _Steps:
         fields = [family.codec.fields[p] for p in self.indices]
         self._limits = np.array([limit / abs(f.factor) for limit, f in zip(limits.values(), fields, strict=True)])
         self._first_row = family.rows.start
-        #: Mask of the invalid last values, shape (fields, rows). A step from an invalid to a valid value is no finding.
+        #: Whether the last value was invalid, shape (fields, rows). A change from an invalid to a valid value is no finding.
         self._was_bad = np.zeros((len(self.indices), len(family.rows)), np.bool_)
 
     @classmethod
@@ -241,9 +241,9 @@ class _Steps:
     def _check_column(
         self, decoded: Decoded, stream: Stream, steps: Steps, at: int, moved: npt.NDArray[np.int64]
     ) -> None:
-        """Check the steps of one field.
+        """Check the changes of one field.
 
-        Frames after lost frames, invalid values and values directly after an invalid value are not checked.
+        A change is not checked if frames were lost before it, or if one of its two values is invalid.
         """
         index = self.indices[at]
         wrong = (moved > self._limits[at]) & (steps[decoded.span] <= 1)
@@ -263,7 +263,7 @@ class _Steps:
 
 
 class _Stuck:
-    """Rule that reports a measured value as stuck if its raw code stays constant, without noise."""
+    """Rule that reports a measured value as stuck if its raw code stays constant. A healthy sensor has noise."""
 
     id = "stuck"
 

@@ -15,13 +15,13 @@ from atalante_tools.canlog.validate.project import Project
 
 Indices = npt.NDArray[np.intp]
 
-#: Prefix of the name of the message that starts the cycle of its bus.
+#: Name prefix of the messages that start the cycle of a bus.
 SYNC = "SYNC"
 
 
 @dataclass
 class _Bus:
-    """Bus with a SYNC message, with the state of its order check after the last chunk."""
+    """Bus with a SYNC message, and the state of the order check after the last chunk."""
 
     sync: int  # row of the SYNC message
     states: list[int]  # rows of the state messages
@@ -61,7 +61,7 @@ class OrderRules:
 
         Args:
             stream: frames of the chunk by message, shape (n,).
-            steps: steps of the alive counters, shape (n,).
+            steps: increments of the alive counters, shape (n,).
         """
         for bus in self.buses:
             span = stream.of(bus.sync)
@@ -80,9 +80,9 @@ class OrderRules:
     def _check_lateness(
         self, bus: _Bus, row: int, stamps: npt.NDArray[np.int64], begins: npt.NDArray[np.int64], number: Indices
     ) -> None:
-        """Report the state frames after the deadline of their cycle.
+        """Report the state frames that were received after the deadline of their cycle, but before the next SYNC.
 
-        `_check_order` reports the state frames in the next cycle.
+        `_check_order` reports the state frames that were received after the next SYNC.
         """
         after = stamps - begins
         late = (after > self._deadline * bus.cycle_ns) & (after < bus.cycle_ns)
@@ -100,7 +100,7 @@ class OrderRules:
         cycles: Indices,
         begins: npt.NDArray[np.int64],
     ) -> None:
-        """Report the state frames in the wrong cycle.
+        """Report the state frames that were received in the wrong cycle.
 
         If a cycle has two states and the next cycle has none, the second state was received before its SYNC. If a cycle has no
         state and the next cycle has two, the first state was late. A SYNC that is missing in the log also gives two states in
@@ -110,7 +110,7 @@ class OrderRules:
             bus: bus of the state message.
             row: row of the state message.
             stamps: time stamp of each state [ns], shape (n,).
-            steps: step of the alive counter of each state, shape (n,).
+            steps: increment of the alive counter of each state, shape (n,).
             cycles: number of the cycle of each state, shape (n,).
             begins: time stamps of the last SYNC before the chunk and of each SYNC in the chunk [ns], shape (m + 1,).
         """

@@ -52,7 +52,7 @@ class Project:
 
     thresholds: Mapping[str, Mapping[str, Threshold]] = field(default_factory=dict)
     silences: tuple[Silence, ...] = ()
-    channels: Mapping[str, str] = field(default_factory=dict)  # bus in the DBC, by channel of the log
+    channels: Mapping[str, str] = field(default_factory=dict)  # channel of the log -> bus in the DBC
 
     def threshold(self, rule: str, name: str) -> Threshold:
         """Return a threshold of a rule."""
@@ -118,7 +118,7 @@ def _thresholds(path: Path, rule: str, table: Any) -> dict[str, Threshold]:
         raise ProjectError(f"{path}: a rule must be one of {', '.join(RULE_OF)}, got {rule!r}")
     known = RULE_OF[rule].thresholds
     if not known:
-        raise ProjectError(f"{path}: {rule} has no threshold; remove it")
+        raise ProjectError(f"{path}: {rule} has no threshold; remove the table [{rule}]")
     if not isinstance(table, dict):
         raise ProjectError(f"{path}: {rule} must be a table of thresholds, got {table!r}")
     found: dict[str, Threshold] = {}

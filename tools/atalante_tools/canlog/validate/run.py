@@ -1,4 +1,4 @@
-"""Check of a log or a live bus: passes the frames to the validator and returns the report."""
+"""Check of a log or a live bus. It passes the frames to the validator and returns the report."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def validate_log(
 
 
 def _read_ahead(log: Log) -> Iterator[tuple[Chunk, float]]:
-    """Yield the chunks of a log, each with the share of the log that has been read, 0 to 1.
+    """Yield the chunks of a log. Each comes with the share of the log that has been read, 0 to 1.
 
     A thread reads the next chunk while the caller checks the current one. numpy releases the interpreter lock in both.
     """

@@ -35,7 +35,7 @@ class TimingRules:
         default = project.number("timeout", "default_cycles") * plan.cycle_ns
         self._timeout = np.where(plan.cycle_ns > 0, np.where(plan.timeout_ns > 0, plan.timeout_ns, default), 0.0)
         self._last = np.full(count, _NEVER, np.int64)  # time stamp of the last valid frame [ns], by row
-        self._arrived = np.full(count, _NEVER, np.int64)  # time stamp of the last frame, valid or rejected [ns], by row
+        self._arrived = np.full(count, _NEVER, np.int64)  # time stamp of the last valid or rejected frame [ns], by row
         self._first = np.full(count, _NEVER, np.int64)
         self._last_share = np.full(count, np.inf)
         self._last_steps = np.zeros(count, np.int64)
@@ -43,7 +43,7 @@ class TimingRules:
         self.histogram = np.zeros((count, BINS), np.int64)
         self.intervals = np.zeros(count, np.int64)
         self._sum = np.zeros(count)
-        #: Counter gaps for the plot: (time stamp of the next frame [ns], row, number of lost frames).
+        #: Counter gaps for the plot: (time stamp of the frame after the gap [ns], row, number of lost frames).
         self.gaps: list[tuple[int, int, int]] = []
 
     def exclude(self, row: int) -> None:
@@ -57,7 +57,7 @@ class TimingRules:
         return checked
 
     def seen(self, row: int) -> bool:
-        """Return whether a frame of the message was received, valid or rejected."""
+        """Return whether at least one frame of the message was received, even if it was rejected."""
         return bool(self._arrived[row] != _NEVER)
 
     def arrived(self, rows: Rows, stamps: npt.NDArray[np.int64]) -> None:
@@ -101,7 +101,7 @@ class TimingRules:
     def _check_timeouts(
         self, stream: Stream, intervals: Steps, share: Vector, rejected_before: Steps | None
     ) -> npt.NDArray[np.intp]:
-        """Report the messages that were received again after a timeout; return the indices of these frames."""
+        """Report the messages that returned after a timeout. Return the indices of their first frames after the timeout."""
         timeout = self._timeout[stream.present]
         shortest = float(timeout[timeout > 0].min(initial=np.inf))
         indices = np.flatnonzero(intervals > shortest)
@@ -253,7 +253,7 @@ class TimingRules:
         mean = self._sum[row] / count
         if count >= self._project.number("cycle-mean", "min_intervals"):
             tolerance = self._project.number("cycle-mean", "tolerance")
-            # A wrong cycle time changes mean and median. A long gap changes only the mean and is reported as a gap.
+            # A wrong cycle time changes mean and median. A long gap changes only the mean, and another rule reports it.
             if abs(mean / cycle - 1.0) > tolerance and abs(median(self.histogram[row]) - 1.0) > 0.5 * tolerance:
                 self._findings.add_whole("cycle-mean", row, first, last, shown=mean * 1e-6, count=count)
         if count >= self._project.number("cycle-jitter", "min_intervals"):
@@ -273,7 +273,7 @@ def median(histogram: npt.NDArray[np.int64]) -> float:
 
 
 def jitter_p99(histogram: npt.NDArray[np.int64]) -> float:
-    """Return the 99 % quantile of the distance to the median interval, in cycles, of a histogram of shape (BINS,)."""
+    """Return the jitter of a histogram of shape (BINS,): 99 % quantile of the deviation from the median interval, in cycles."""
     total = int(histogram.sum())
     distance = np.abs(np.arange(len(histogram)) - int(median(histogram) * BINS_A_CYCLE))
     order = np.argsort(distance, kind="stable")

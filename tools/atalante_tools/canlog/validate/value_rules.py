@@ -137,7 +137,7 @@ class ValueRules:
     def _check_outside(
         self, decoded: Decoded, stream: Stream, index: int, outside: Mask, values: npt.NDArray[np.float64]
     ) -> None:
-        """Report values outside the range, as "no value" or as out of range. Values with a name are valid.
+        """Report the values outside the range. The code for "no value" has its own rule. A value with a name is valid.
 
         Args:
             decoded: decoded frames of the family, in which invalid values are marked.
@@ -269,7 +269,7 @@ def is_enumeration(named: Field) -> bool:
 
 
 def is_hash(field: Field, signal: str) -> bool:
-    """Return whether the field contains the hash of the DBC of a node.
+    """Return whether the field contains the DBC hash that a node reports.
 
     Args:
         field: field of a message.
