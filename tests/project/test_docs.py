@@ -13,6 +13,7 @@ from pathlib import Path
 import click
 import pytest
 
+from atalante_hal.bus.adapters import ADAPTERS, refusal
 from atalante_tools.cli import COMMANDS, cli
 
 ROOT = Path(__file__).parents[2]
@@ -146,6 +147,20 @@ def test_every_page_is_in_the_navigation_once():
 def test_the_command_line_page_has_every_command():
     page = PAGES["docs/reference/cli.md"]
     assert re.findall(r"^\| `atalante (\w+)` \|", page, re.MULTILINE) == list(COMMANDS)
+
+
+def test_the_page_on_adapters_agrees_with_the_table_of_the_bus():
+    page = PAGES["docs/howto/real-bus.md"]
+    rows = re.findall(r"^\| `(\w+)` \| `([^`]+)` \| (.+) \|$", page, re.MULTILINE)
+    usable = {name: adapter for name, adapter in ADAPTERS.items() if not refusal(name)}
+    assert [(name, tried) for name, _, tried in rows] == [(name, adapter.tried) for name, adapter in usable.items()]
+    for name, channel, _ in rows:
+        assert channel in usable[name].channel
+    rejected = page.split("Rejected, because")[1].split("## 2.")[0]
+    assert set(ADAPTERS) - set(usable) <= set(re.findall(r"`(\w+)`", rejected))
+    for name in ("pcan", "kvaser", "vector", "nixnet"):
+        assert blocks("docs/howto/real-bus.md", "ini") == [ADAPTERS[name].configuration + "\n"]
+    assert f"{ADAPTERS['socketcan'].setup}\n" in blocks("docs/howto/real-bus.md", "console")[0]
 
 
 def test_the_picture_is_small():
