@@ -30,16 +30,16 @@ CLASSIC_LENGTHS = tuple(range(9))
 class Batch(NamedTuple):
     """Array of frames and the views that a bus copies from or to."""
 
-    frames: Frames  # reference that keeps the array alive, so that its id() stays unique
+    frames: Frames
     memory: memoryview  # bytes of the array, length 72 n
     headers: npt.NDArray[np.uint64]  # identifier, length and flags of each frame, shape (n,)
 
 
 class Batches:
-    """Cache of the arrays that were passed to one bus, with the `id()` of each array as its key."""
+    """Cache of the arrays that were passed to one bus, and their views."""
 
     def __init__(self) -> None:
-        self._batches: dict[int, Batch] = {}
+        self._batches: list[Batch] = []
         self._legal: set[bytes] = set()
 
     def to_fill(self, frames: Frames) -> memoryview:
@@ -54,7 +54,7 @@ class Batches:
         Raises:
             TypeError: If `frames` is not a contiguous array of `FRAME`.
         """
-        return (self._batches.get(id(frames)) or self._add(frames))[1]
+        return self._batch_of(frames).memory
 
     def to_send(self, frames: Frames) -> tuple[memoryview, bytes]:
         """Check a batch of frames to send, and return its bytes and header words.
@@ -69,7 +69,7 @@ class Batches:
             ValueError: If a frame is not a valid CAN frame; the message names the first one.
             TypeError: If `frames` is not a contiguous array of `FRAME`.
         """
-        _, memory, words = self._batches.get(id(frames)) or self._add(frames)
+        _, memory, words = self._batch_of(frames)
         headers = words.tobytes()
         if headers not in self._legal:
             require_legal(frames)
@@ -77,6 +77,13 @@ class Batches:
                 self._legal.clear()
             self._legal.add(headers)
         return memory, headers
+
+    def _batch_of(self, frames: Frames) -> Batch:
+        """Return the views of this array object, cached for the next call."""
+        for batch in self._batches:
+            if batch.frames is frames:
+                return batch
+        return self._add(frames)
 
     def _add(self, frames: Frames) -> Batch:
         if not isinstance(frames, np.ndarray) or frames.dtype != FRAME or frames.ndim != 1:
@@ -88,7 +95,7 @@ class Batches:
         batch = Batch(frames, frames.view(np.uint8).data, as_words(frames)[:, 0])
         if len(self._batches) >= REMEMBERED:
             self._batches.clear()
-        self._batches[id(frames)] = batch
+        self._batches.append(batch)
         return batch
 
 

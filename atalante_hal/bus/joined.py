@@ -50,14 +50,17 @@ class JoinedBus:
             raise ValueError(
                 f"buses must have an entry for each of {', '.join(network.buses)}; {missing[0]} is missing"
             )
-        self._links = list({id(buses[name]): buses[name] for name in network.buses}.values())
+        self._links: list[Bus] = []
+        for name in network.buses:
+            if buses[name] not in self._links:
+                self._links.append(buses[name])
         self._link_of = {m.frame_id: self._links.index(buses[m.bus]) for m in network.messages}
         self.name = " + ".join(link.name for link in self._links)
         self.stamps: Stamps = np.zeros(capacity, np.int64)
         self._capacity = capacity
         self._batches = Batches()
         self._shares: dict[bytes, list[Share]] = {}
-        self._tails: dict[int, list[Frames]] = {}
+        self._tails: list[list[Frames]] = []  # slices `frames[i:]` for all i, of each receive buffer
         self._turn = (
             0  # index of the channel that is read first; rotates, because a busy channel could block the others
         )
@@ -161,14 +164,14 @@ class JoinedBus:
 
     def _tails_of(self, frames: Frames) -> list[Frames]:
         """Return the slices `frames[i:]` for all i, cached for the next call."""
-        tails = self._tails.get(id(frames))
-        if tails is None:
-            self._batches.to_fill(frames)  # raises TypeError if the argument is not an array of frames
-            if len(self._tails) >= REMEMBERED:
-                self._tails.clear()
-            tails = [frames, *(frames[offset:] for offset in range(1, len(frames)))]
-            self._tails[id(frames)] = tails
-        return tails
+        for tails in self._tails:
+            if tails[0] is frames:
+                return tails
+        self._batches.to_fill(frames)  # raises TypeError if the argument is not an array of frames
+        if len(self._tails) >= REMEMBERED:
+            self._tails.clear()
+        self._tails.append([frames, *(frames[offset:] for offset in range(1, len(frames)))])
+        return self._tails[-1]
 
     def _divide(self, headers: bytes, frames: Frames) -> list[Share]:
         """Divide a batch among the channels, and cache the result for batches with the same headers."""
