@@ -13,7 +13,7 @@ from pathlib import Path
 import click
 import pytest
 
-from atalante_hal.bus.adapters import ADAPTERS, refusal
+from atalante_hal.bus.adapters import ADAPTERS
 from atalante_tools.cli import COMMANDS, cli
 
 ROOT = Path(__file__).parents[2]
@@ -152,7 +152,7 @@ def test_the_command_line_page_has_every_command():
 def test_the_page_on_adapters_agrees_with_the_table_of_the_bus():
     page = PAGES["docs/howto/real-bus.md"]
     rows = re.findall(r"^\| `(\w+)` \| `([^`]+)` \| (.+) \|$", page, re.MULTILINE)
-    usable = {name: adapter for name, adapter in ADAPTERS.items() if not refusal(name)}
+    usable = {name: adapter for name, adapter in ADAPTERS.items() if adapter.can_fd and not adapter.unusable}
     assert [(name, tried) for name, _, tried in rows] == [(name, adapter.tried) for name, adapter in usable.items()]
     for name, channel, _ in rows:
         assert channel in usable[name].channel
