@@ -1,4 +1,4 @@
-"""Interfaces of python-can as data: CAN FD, driver, channel, bit timing, and what was tried with each.
+"""Facts about the interfaces of python-can: CAN FD, driver, channel, bit timing, and what was tried.
 
     interface -> Adapter -> refusal, for the commands, `PythonCanBus` and `atalante doctor` alike
 

@@ -23,7 +23,7 @@ class ResilientBus(WrappedBus):
 
     Args:
         bus: Wrapped bus. `close` closes it, too.
-        report: Called with the error message when the link is lost, and with a message when it is back.
+        report: Function called with the error message when the link is lost, and with a message when it is back.
 
     Attributes:
         down: Error message of the link while it is lost; empty otherwise.

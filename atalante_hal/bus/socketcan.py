@@ -320,7 +320,7 @@ def require_channel(channel: str) -> None:
         channel: Name of the interface.
 
     Raises:
-        BusAbsent: If it is not; the message contains the command that helps.
+        BusAbsent: If it is not such an interface; the message contains the command that helps.
     """
     doctor = "run `atalante doctor`"
     create = f"ip link add {channel} type vcan && ip link set {channel} mtu 72 txqueuelen 1000 up"

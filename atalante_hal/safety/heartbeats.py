@@ -71,7 +71,7 @@ class Heartbeats:
         }
         self._status_of = {codec.messages[s.row].frame_id: s for s in self._statuses}
         self._amplitude, self._amplitude_row = codec.slice("Amplitude"), codec.rows["HAPTICS_STATE"]
-        self._seen = 0  # last cycle that the ages in the process image include
+        self._seen = 0  # cycle of the last call of `image.new_cycle`
         #: Node -> diagnostic and error code of its active emergency. The entry is removed when the error is cleared.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
@@ -145,7 +145,7 @@ class Heartbeats:
             self._judge_status(cycle, memory, status)
 
     def overdue(self, cycle: int) -> bool:
-        """Return whether a status message timed out. Call this periodically, because `judge` is skipped while all is well."""
+        """Return whether a status message timed out. Call this periodically: without a fault `judge` is not called."""
         self._age(cycle)
         ages = self.image.age[self._status_rows]
         return bool(((ages >= self._timeouts) & (ages < NEVER)).any())

@@ -92,7 +92,7 @@ class MessageMonitor:
         return all(self.qualification[row].trusted for row in self._needed)
 
     def trusts(self, row: int) -> bool:
-        """Return whether the sender of a row is trusted."""
+        """Return whether the sender of the message in a row is trusted."""
         return self.qualification[row].trusted
 
     def hears(self, row: int) -> bool:

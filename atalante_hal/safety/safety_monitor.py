@@ -265,7 +265,7 @@ class SafetyMonitor:
                 )
 
     def _judge_start(self, nodes_well: bool) -> None:
-        """Process a START until the state changes, the drives exceed `ENABLE_CYCLES`, or the start is refused.
+        """Process a START until the state changes, `ENABLE_CYCLES` are over, or the start is refused.
 
         Args:
             nodes_well: True if every required node is trusted and has sent a status message.
@@ -336,7 +336,10 @@ class SafetyMonitor:
         self.memory.events.append(Event(state.cycle, after.name, text, severity, value=after))
 
     def _lead_assistance(self) -> None:
-        """Set the assistance factor to the operator's value, or ramp it to 1 in FULL_ASSIST and FINISH_STEP, and back after."""
+        """Set the assistance factor to the operator's value, or ramp it to 1 in FULL_ASSIST and FINISH_STEP.
+
+        If the robot is ACTIVE again, the factor is ramped back to the operator's value.
+        """
         state, wanted = self._state, self._pendant.assistance_factor
         if wanted is not None:
             self._assistance_factor = wanted

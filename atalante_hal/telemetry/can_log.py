@@ -63,7 +63,7 @@ class CanLog(Closing):
         suffix = check_format(path)
         self.path = path
         self.frames = 0
-        self.finished = False  # True if the file was closed and has every frame that was written
+        self.finished = False  # True if the file was closed and contains every frame passed to `write`
         names = (*buses, FOREIGN)
         by_name = suffix.startswith(".log")
         self._channels: dict[str, str | int] = {name: name if by_name else number for number, name in enumerate(names)}

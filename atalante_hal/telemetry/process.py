@@ -42,13 +42,13 @@ RUN_GAP_NS = 1_000_000_000
 HANGS_AFTER = 2.0
 #: Largest number of restarts in a session.
 RESTARTS = 3
-#: Period of the check whether the start of a killed subprocess has ended [s].
+#: Time between two attempts to kill a subprocess that is not ready in time [s].
 _KILLED = 0.1
 #: Time limit for the subprocess to end its Zenoh session, after it has printed its summary [s].
 _SESSION_END = 2.0
 #: Time limit for a restarted subprocess to become ready [s].
 _RESTART = 30.0
-#: Time limit for a subprocess that becomes ready during a run [s]. After it the subprocess is replaced.
+#: Time limit for a subprocess to become ready during a run [s]. If it takes longer, it is replaced.
 _JOIN = 60.0
 
 
@@ -140,7 +140,7 @@ class TelemetrySummary:
     published: int = 0  # messages
     recorded: int = 0  # messages
     frames_logged: int = 0
-    can_log_complete: bool = True  # False if the CAN log that was requested is not one closed file with every frame
+    can_log_complete: bool = True  # False if a CAN log was requested, but is not one closed file with every frame
     lost: int = 0  # cycles that telemetry lost
     frames_lost: int = 0  # lost records of the CAN frame ring; a cycle adds about one record
     restarts: int = 0  # restarts of the subprocess after it ended or hung
@@ -180,7 +180,7 @@ class TelemetryProcess(Closing):
         self._closed = False
         self._tap: RingTap | None = None
         self._child: subprocess.Popen[bytes] | None = None
-        self._unread = b""  # output of the subprocess that follows its last line read
+        self._unread = b""  # output of the subprocess after the last line that was read
         self._restarts = 0
         self._faults: list[str] = []  # faults of subprocesses, one sentence each
         self._recordings: list[str] = []  # names of the files begun so far
@@ -214,8 +214,8 @@ class TelemetryProcess(Closing):
     def start(self, timeout: float = 60.0) -> None:
         """Start the subprocess and wait until it has opened its files and its Zenoh session.
 
-        On the wall clock, a subprocess that is not ready in time joins later. The rings keep the newest records until then;
-        older ones are counted as lost. In lock-step the loop needs the subprocess from the first cycle on.
+        On the wall clock, a subprocess that is not ready in time joins later. Until then the rings keep the newest records, and
+        older records are counted as lost. In lock-step the loop needs the subprocess from the first cycle on.
 
         Args:
             timeout: Longest wait [s].
@@ -237,7 +237,7 @@ class TelemetryProcess(Closing):
         """Start the subprocess in a thread and wait for it.
 
         Args:
-            timeout: Longest wait [s]. After it the thread goes on.
+            timeout: Longest wait [s]. If it is exceeded, the thread continues in the background.
 
         Raises:
             TelemetryError: If the start fails within the timeout.
@@ -448,7 +448,7 @@ class TelemetryProcess(Closing):
         return summary
 
     def _await_start(self, timeout: float) -> None:
-        """Wait for the end of a start in the background, and kill the subprocess if it is not ready in time.
+        """Wait until a start in the background has finished, and kill the subprocess if it is not ready in time.
 
         Args:
             timeout: Longest wait [s].

@@ -131,7 +131,7 @@ class ReceiveImage:
         self._offered: tuple[Frames, Words] | None = None
         self._ordered = _Received(new_frames(count), count)
         self._received = self._ordered
-        # These calls have no data and change nothing.
+        # These first calls have no received frames, so they change nothing.
         words, table = self._ordered.words, self.codec.table
         self._accept_exact = specialised(
             accept_exact, words, self._e2e, _NO_TAG, table, self.values, self.values_before
@@ -324,7 +324,7 @@ def _words_of(frames: Frames) -> Words:
 
 
 def _no_rows(count: int) -> Words:
-    """Return an array for the row and `Check` of `count` frames, which are not messages of a process image so far."""
+    """Return an array for the row and the `Check` of `count` frames, in which no frame belongs to a row yet."""
     return np.full((count, 2), _FOREIGN)
 
 
@@ -425,7 +425,7 @@ def judge_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int, re
     Args:
         words: received frames as a flat array of 64-bit words.
         row: row of the message of the frame.
-        offset: offset of the frame from its row in the frame array [bytes].
+        offset: position of the frame minus the position of its row in the frame array [bytes].
         e2e: expected format and sequence of each row; the sequence is updated if the counter is accepted.
         tag: expected counter of all frames in this cycle, or `_NO_TAG`.
         restarts: True if a sender may restart at any counter.
@@ -484,7 +484,7 @@ class TransmitImage:
         rows = len(self.codec.messages)
         self._counters: Words = np.zeros(rows, np.int64)
         self._singles = [self.frames[row : row + 1] for row in range(rows)]
-        # These calls set every counter to 0xFF, so the first frame has counter 0.
+        # These first calls set every counter to 0xFF, so the first frame to be sent has counter 0.
         self._protect = specialised(protect, self._octets, self._spans, self._counters)
         self._seal = specialised(seal, self.values, self.codec.table, self._words, self._spans, self._counters, 0xFF)
 
@@ -567,7 +567,7 @@ def seal(values: Vector, table: SignalTable, words: Words, spans: Words, counter
         counter: new counter of every row, or `_NO_TAG` for the last counter of each row plus 1.
 
     Returns:
-        `NO_CODE`, or the index of a signal that could not be encoded, as from `codec.encode`. In that case no frame is changed.
+        `NO_CODE`, or the index of a signal that could not be encoded, see `codec.encode`. In that case no frame is changed.
     """
     unencodable = encode(values, table, words)
     if unencodable == NO_CODE:
