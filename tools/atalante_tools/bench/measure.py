@@ -1,4 +1,4 @@
-"""Measurement of a benchmark: run value and baseline alternately in short blocks, and compute the median of each.
+"""Measurement of a benchmark. Short blocks of value and baseline run alternately. The results are the medians.
 
 Absolute times depend on the machine and its load. Value and baseline run under the same conditions, so their ratio is comparable
 between machines.
@@ -13,9 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-#: Number of blocks of value and of baseline in a normal run, for a robust median.
+#: Number of blocks of the value, and of the baseline, in a normal run. The number gives a robust median.
 ROUNDS: Final = 200
-#: Number of blocks of value and of baseline with `--quick`.
+#: Number of blocks of the value, and of the baseline, with `--quick`.
 QUICK_ROUNDS: Final = 5
 
 #: Function that runs one block and returns the time per repetition [s].
@@ -46,7 +46,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Effort:
-    """Settings of a measurement: normal or quick, and `progress(done, total)`, which is called after each round."""
+    """Settings of a measurement. The function `progress(done, total)` is called after each round."""
 
     quick: bool = False
     progress: Callable[[int, int], None] = field(default=lambda _done, _total: None)

@@ -1,4 +1,4 @@
-"""Recorded nodes: prepared frames with valid counters and CRCs, played to a HAL in lock-step.
+"""Recorded nodes: prepared frames with valid counters and CRCs, which a HAL receives in lock-step.
 
 They replace the emulator in benchmarks of the HAL. The answer to a SYNC is only copied, which takes little time. The joints
 oscillate about the first pose of a swing with a small tracking error, so the guide filter gets realistic values and no

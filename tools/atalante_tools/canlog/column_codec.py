@@ -1,4 +1,4 @@
-"""Codec for logs: decodes many frames of one message in one call, for any DBC, and computes E2E CRCs.
+"""Codec for logs. It decodes many frames of one message in one call, for any DBC, and computes E2E CRCs.
 
 The codec of the control loop (`codec.Codec`) decodes many messages of one cycle and requires that no signal crosses a 64-bit
 word. This codec decodes many frames of one message. It supports Intel and Motorola layouts, signals across 64-bit words, 64-bit

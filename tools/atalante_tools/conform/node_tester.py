@@ -113,7 +113,7 @@ class Limits:
 
 
 class NodeTester:
-    """Tester of one node: sends SYNC and commands, and records every frame of the node.
+    """Tester of one node. It sends SYNC and commands, and records every frame of the node.
 
     Attributes:
         received: frames of the node since the start of the examination.

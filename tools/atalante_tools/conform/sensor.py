@@ -112,7 +112,7 @@ def agrees_with_gravity(tester: NodeTester) -> Outcome:
     )
     mean = measured.mean(axis=0)
     w, x, y, z = mean[:4] / np.linalg.norm(mean[:4])
-    # World z axis in the sensor frame.
+    # `up` is the world z axis in the sensor frame.
     up = np.array([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)])
     cosine = float(up @ mean[4:] / np.linalg.norm(mean[4:]))
     tilt = math.acos(max(-1.0, min(1.0, cosine)))

@@ -1,4 +1,4 @@
-"""Independent check of all command frames of the HAL: decode them with the bit positions of the DBC and compare with the limits.
+"""Independent check of all command frames of the HAL. It decodes them by the bit positions of the DBC and checks the limits.
 
 It shares no code with the limiter, the codec and the process image, so it can detect errors in them.
 """

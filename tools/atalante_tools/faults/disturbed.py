@@ -45,7 +45,7 @@ class HostFaults:
 
 
 class DisturbedController:
-    """Controller with the faults `raise`, `raise_in_reset`, `request`, `shake` and `shape`."""
+    """Controller that injects the faults `raise`, `raise_in_reset`, `request`, `shake` and `shape`."""
 
     def __init__(self, controller: Controller, now: HostFaults) -> None:
         self._controller, self._now = controller, now
@@ -89,7 +89,7 @@ class DisturbedController:
 
 
 class DisturbedClock:
-    """Lock-step clock with the faults `late` and `slow`."""
+    """Lock-step clock that injects the faults `late` and `slow`."""
 
     def __init__(self, now: HostFaults) -> None:
         self._now = now
@@ -111,7 +111,7 @@ class DisturbedClock:
 
 
 class DisturbedBus(WrappedBus):
-    """Bus of the HAL with the faults `bus_down` and `bus_full`."""
+    """Bus of the HAL that injects the faults `bus_down` and `bus_full`."""
 
     def __init__(self, bus: Bus, now: HostFaults) -> None:
         super().__init__(bus)

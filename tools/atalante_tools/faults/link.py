@@ -95,7 +95,7 @@ SCENARIOS: Final = (
                     node=_KNEE,
                     reacted=reacted,
                     recovers=False,
-                    observed=40,  # must end before cycle 100, when the constant forces are detected as a fault
+                    observed=40,  # short, because the constant forces would be detected as a fault in cycle 100
                 )
                 for frames, state, dtc, reacted in (
                     (5, SupervisorState.FINISH_STEP, "SWING_TIMEOUT", 5),

@@ -141,7 +141,7 @@ class Summary:
 
 
 def survived(endurance: Endurance) -> str:
-    """Return as text for how many cycles of a fault the walk continues.
+    """Return the number of cycles for which the walk survives a fault, as text for a table.
 
     Args:
         endurance: result of the run.

@@ -74,7 +74,7 @@ def run_context() -> RunContext:
 
 @functools.cache
 def first_walk_cycle() -> int:
-    """Return the HAL cycle in which the first step of a fault-free walk begins. It is the same in every run.
+    """Return the HAL cycle in which the first walking step of a fault-free walk begins. It is the same in every run.
 
     Raises:
         RuntimeError: If the robot does not start without a fault.

@@ -184,7 +184,7 @@ def run_task(task: Task) -> Result:
 
 
 def _cycles_until_stop(case: Case, cycles: int) -> int | None:
-    """Run a permanent fault for `cycles` cycles; return the number of cycles until the walk stopped; None if it continued."""
+    """Run a permanent fault for `cycles` cycles. Return the number of cycles until the walk stopped; None if it continued."""
     limited = replace(case, stimuli=tuple(_limited(stimulus, cycles) for stimulus in case.stimuli))
     run = observe(limited, cycles, recovery=False)
     for cycle in range(run.first, run.last + 1):

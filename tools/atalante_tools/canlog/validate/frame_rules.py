@@ -1,4 +1,4 @@
-"""Rules for frame headers: identifier, bus, sender, flags and length. First stage of the validator.
+"""Rules for frame headers: identifier, bus, sender, flags and length. They are the first stage of the validator.
 
 Nearly all frames pass one comparison of their header word with the DBC. Only the remaining frames are checked one property at a
 time.

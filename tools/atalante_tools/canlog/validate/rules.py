@@ -16,7 +16,7 @@ Threshold = float | str | Mapping[str, float] | tuple[str, ...]
 
 @dataclass(frozen=True)
 class Rule:
-    """Property of frames or logs that the validator checks."""
+    """Rule: a property of frames or logs that the validator checks."""
 
     id: str
     meaning: str  # the violation, in one line
