@@ -71,6 +71,29 @@ def test_a_silent_pendant_gives_up_only_if_the_other_continues(more: int, lost: 
     assert rule.sends is not lost
 
 
+def test_a_frame_of_another_pendant_extends_the_silence() -> None:
+    rule = after(Takeover(established=True), (0,), (0,), (), (), (0,), *[()] * QUIET_CYCLES)
+    assert rule.silent
+    assert after(rule, (), first=5 + QUIET_CYCLES).sends
+
+
+def test_a_pendant_that_stopped_early_does_not_silence_a_new_pendant() -> None:
+    rule = Takeover(seed=1)
+    rule.start()
+    for tag in range(TAKEOVER_CYCLES + DRAW_CYCLES + 1):
+        assert after(rule, (0,) if tag < 10 else (), first=tag).sends
+    assert rule.established
+
+
+def test_a_pendant_that_sends_again_does_so_for_some_cycles() -> None:
+    times = []
+    for seed in range(200):
+        rule = after(Takeover(established=True, seed=seed), (0,), (0,), *[()] * (QUIET_CYCLES + 1))
+        times.append(next(tag for tag in range(6, 200) if not after(rule, (0,), first=tag).sends) - 5)
+    assert min(times) == RETRY_CYCLES
+    assert max(times) == RETRY_CYCLES + DRAW_CYCLES - 1
+
+
 def test_a_silence_is_shorter_than_the_timeout_of_the_pendant(network: Network) -> None:
     rule = Takeover(established=True, seed=1)
     sends = []
@@ -279,8 +302,9 @@ def test_the_signals_of_another_pendant_are_kept_only_from_fresh_frames(network:
     rule = Takeover()
     reader = PendantReader(network, rule)
     reader.read(np.concatenate([traffic.sync(1), traffic.state(200)]), 2)
+    reader.read(np.concatenate([traffic.sync(2), traffic.state(2)]), 2)
     assert reader.other == {}
-    for cycle in range(2, 6):
+    for cycle in range(3, 6):
         reader.read(np.concatenate([traffic.sync(cycle), traffic.state(cycle)]), 2)
     assert reader.other["DeadMan"] == 0.0
     assert rule.present
