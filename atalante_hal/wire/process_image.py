@@ -137,7 +137,7 @@ class ReceiveImage:
             accept_exact, words, self._e2e, _NO_TAG, table, self.values, self.values_before
         )
         self._accept_frames = specialised(
-            accept_frames, words, _no_rows(0), self._e2e, _NO_TAG, restarts, table, self.values, self._status
+            accept_frames, words, _results(0), self._e2e, _NO_TAG, restarts, table, self.values, self._status
         )
 
     def new_cycle(self, elapsed: int = 1) -> None:
@@ -148,7 +148,7 @@ class ReceiveImage:
         """
         self.all_fresh = False
         self.age += elapsed
-        self._e2e.silent[:] += elapsed
+        np.add(self._e2e.silent, elapsed, out=self._e2e.silent)
         self.check.fill(Check.NO_DATA)
         self.refused = []
 
@@ -250,7 +250,7 @@ class ReceiveImage:
             Indices in `frames` of the frames that are not messages of this process image.
         """
         self.values_before[:] = self.values
-        found = _no_rows(count)
+        found = _results(count)
         self._accept_frames(
             _words_of(frames),
             found,
@@ -320,12 +320,12 @@ class _Received:
 
 def _words_of(frames: Frames) -> Words:
     """Return the frames as a flat array of 64-bit words, the only array type that the specialised functions accept."""
-    return as_words(frames).view(np.int64).ravel()
+    return frames.view(np.int64).ravel()
 
 
-def _no_rows(count: int) -> Words:
-    """Return an array for the row and the `Check` of `count` frames, in which no frame belongs to a row yet."""
-    return np.full((count, 2), _FOREIGN)
+def _results(count: int) -> Words:
+    """Return an uninitialized array for the results of `accept_frames`, shape (count, 2)."""
+    return np.empty((count, 2), np.int64)
 
 
 def accept_exact(
@@ -384,7 +384,7 @@ def accept_frames(
     for index in range(len(found)):
         first = index * WORDS
         row = row_of(words[first], e2e.headers)
-        found[index, 0] = row
+        found[index, 0], found[index, 1] = row, _FOREIGN
         if row == _FOREIGN:
             continue
         offset = (index - row) * FRAME_BYTES
