@@ -68,6 +68,23 @@ def test_recovery_from_hold_requires_start(rig):
     assert rig.until(S.ACTIVE, 20).supervisor is S.ACTIVE
 
 
+def test_start_with_enabled_drives_continues_from_their_torque(make_rig):
+    rig = make_rig(starts=False)
+    signals = rig.emulator.signals
+
+    def enabled(_: int, values: np.ndarray) -> None:
+        values[signals.slice("DriveState")] = DriveState.OPERATION_ENABLED
+        values[signals.slice("Torque")] = 50.0
+
+    rig.emulator.before_send.append(enabled)
+    rig.until(S.READY)
+    rig.operator.start()
+    rig.until(S.ACTIVE, 5)
+    first = [v for c in rig.last_commands().values() for k, v in c.items() if k.endswith("TargetTorque")]
+    lowest = 50.0 - rig.hal.robot.torque_rate_max * PERIOD
+    assert (np.array(first) >= lowest - 0.1).all()
+
+
 @pytest.mark.parametrize("cycles", [0, 1, 2])
 def test_end_of_the_program_during_a_start_enables_no_drive(rig, cycles):
     while not rig.hal.conditions.start_wanted:
