@@ -50,11 +50,11 @@ class Body(Protocol):
 
     @property
     def contact(self) -> Sequence[tuple[int, int, Vector3]]:
-        """Contacts of the last step, each with index of the foot, index of the force cell, and force in world axes [N]."""
+        """Contacts of the last time step, each with index of the foot, index of the force cell, and force in world axes [N]."""
 
     @property
     def foot_rotation(self) -> Sequence[tuple[float, ...]]:
-        """Attitude of each foot in the order of FEET, quaternion xyzw. It is updated only in steps with a contact."""
+        """Attitude of each foot in the order of FEET, quaternion xyzw. It is updated only in time steps with a contact."""
 
     def reset(self, position: Sequence[float]) -> None:
         """Set the joint positions and zero the velocities.
@@ -93,7 +93,7 @@ class PyBulletBody:
         Raises:
             ValueError: If the text is not a URDF, or a required joint or link is missing.
         """
-        # A new physics client makes two runs identical. Restoring a saved state does not.
+        # Each body has a new physics client, because a restored PyBullet state does not repeat a simulation exactly.
         self._client = pybullet.connect(pybullet.DIRECT)
         client = {"physicsClientId": self._client}
         pybullet.setPhysicsEngineParameter(
@@ -155,7 +155,7 @@ class PyBulletBody:
         self._moving_links = [self._imus[row] for row in self._moving]
 
     def _link_states(self, links: Sequence[int]) -> Any:
-        # Without the forward kinematics flag, PyBullet returns the poses of the previous step.
+        # Without the forward kinematics flag, PyBullet returns the poses of the previous time step.
         return pybullet.getLinkStates(self._body, links, 1, 1, physicsClientId=self._client)
 
     def reset(self, position: Sequence[float]) -> None:
@@ -167,7 +167,7 @@ class PyBulletBody:
         for joint, angle in zip(self._joints, position, strict=True):
             pybullet.resetJointState(self._body, joint, angle, 0.0, physicsClientId=self._client)
         self._unpack(*self._read())
-        self.contact = ()  # no step since the reset, so no contacts
+        self.contact = ()  # PyBullet finds contacts only in a time step, and none was computed since the reset
 
     def step(self, torque: Sequence[float]) -> None:
         """Apply joint torques for one `PERIOD` and update the motion, the link states and the contacts.

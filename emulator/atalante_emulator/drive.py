@@ -105,7 +105,7 @@ class Drives:
         self.encoders = Encoders(robot, parameters.velocity_bandwidth, signals.position, signals.velocity)
         self.motors = Motors(robot, parameters.motor, signals.torque, signals.temperature)
         self._slow_phase = 0
-        self._steady = b""  # controlwords that changed no drive state when last applied
+        self._steady = b""  # the last controlwords if they changed no drive state, otherwise empty
         self._hold_at = np.zeros(len(JOINTS))  # setpoint of the local hold of each drive [rad]
         self._target, self._limit = np.zeros((2, len(JOINTS)))
         self._own_limit = robot.torque_max.copy()  # torque limit of each drive at its present temperature [Nm]
@@ -197,7 +197,7 @@ class Drives:
                 self.fail(drive, code)
 
     def miss_sync(self, leg: int, cycle: int) -> None:
-        """Count a cycle without SYNC on the bus of a leg. After `WATCHDOG` consecutive ones, start the local hold of the leg.
+        """Count a cycle without SYNC on the bus of a leg. Start the local hold of the leg after `WATCHDOG` such cycles in a row.
 
         Args:
             leg: index of the leg, 0 is left.
@@ -320,7 +320,7 @@ class Drives:
             self._steady = words
 
     def _apply_controlword(self, drive: int, word: int) -> bool:
-        """Apply a controlword to a drive. Return whether the state or the latch of the drive changed."""
+        """Apply a controlword to a drive. Return whether it changed the drive state or acknowledged a local hold."""
         state, latched = self.state[drive], self.latched[drive]
         after = next_state(state, word, latched=latched)
         if self.errors.any_persists(drive) and (state is DriveState.FAULT or after is DriveState.OPERATION_ENABLED):

@@ -26,7 +26,7 @@ COMMAND_TIMEOUT: Final = 0x8250  # command timed out
 _REGISTER: Final = {0x2: 0x03, 0x3: 0x05, 0x4: 0x09, 0x7: 0x21, 0x8: 0x11}
 _GENERIC: Final = 0x01
 
-#: Age at which a warning ends, and age from which it may be sent again [calls of `Errors.advance`].
+#: Ages of a warning, in calls of `Errors.advance`: the age at its end, and the age at the end of its inhibit time.
 _ENDED, _REPEATABLE = 2, 3
 
 

@@ -46,7 +46,7 @@ _RECEIVE_BUDGET = 128
 _BATCH = 128
 #: Values of `Check` for which a received command frame is rejected.
 _REJECTED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
-#: Timeout for the other SYNCs of a cycle after its first SYNC [s].
+#: Longest wait after the first SYNC of a cycle for its SYNCs on the other buses [s].
 _SYNC_SKEW = 200e-6
 
 
@@ -143,7 +143,7 @@ class Emulator:
         self._rx.values.fill(0.0)  # before the first command: zero torque, zero vibration, HAL state OFF
         self._scratch = new_frames(_RECEIVE_BUDGET)
         self._scratch_from = [self._scratch[offset:] for offset in range(_RECEIVE_BUDGET)]
-        self._waiting = 0  # number of frames in the scratch buffer that arrived before their SYNC
+        self._waiting = 0  # number of frames in the scratch buffer whose SYNC has not arrived yet
 
         self._sync_rows = [self._rx.codec.rows[m.name] for m in syncs]
         self._sync_ids = {m.frame_id for m in syncs}
@@ -154,7 +154,7 @@ class Emulator:
         self._whole = [self._tx.frames]
         #: Index of each leg's SYNC in the list of SYNCs.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        self._answered = self._shares  # answer to each SYNC in the last imperfect cycle
+        self._answered = self._shares  # answer to each SYNC in the last cycle with missing or rejected frames
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data
         self._batch_up_to = [batch[:count] for count in range(_BATCH + 1)]
@@ -350,7 +350,7 @@ class Emulator:
         self._sealed = True
 
     def _complete_answer(self, number: int) -> None:
-        """Add counter and CRC to the answer if they are missing, or if this SYNC requires other content.
+        """Add counter and CRC to the answer, unless they were added in advance and still fit this SYNC.
 
         Args:
             number: cycle number received in SYNC.

@@ -174,7 +174,7 @@ NODE_KINDS: Final[Mapping[str, Kind]] = {
     ),
 }
 
-#: Kinds of sensor faults. They replace the sent values including their noise.
+#: Kinds of sensor faults. They replace the values of a node after the noise was added to them.
 SENSOR_KINDS: Final[Mapping[str, Kind]] = {
     "imu_invalid": Kind("an IMU sends the invalid code in all measured signals", "imu"),
     "imu_saturated": Kind("gyroscope and accelerometer report the end of their range", "imu"),

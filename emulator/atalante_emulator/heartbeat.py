@@ -32,7 +32,7 @@ class Heartbeats:
 
     def __init__(self, network: Network, messages: Sequence[Message]) -> None:
         self._period = max(m.cycle_ms for m in messages)
-        # At most one node sends its periodic status in a cycle.
+        # The periodic status messages are due at intervals of `gap`, so that no cycle contains two of them.
         gap = self._period // len(messages)
         self._due: dict[int, _Status] = {}
         self._of: dict[str, _Status] = {}

@@ -19,12 +19,12 @@ from atalante_hal.types import PERIOD, Vector
 
 @dataclass(frozen=True)
 class ImuParameters:
-    """Noise, bias and temperature of the emulated IMUs, for each axis at a sample rate of 1 kHz."""
+    """Noise, bias and temperature of the emulated IMUs. Noise and bias are given per axis. The sample rate is 1 kHz."""
 
-    gyro_noise: float = 3.9e-3  # noise density 0.01 deg/s/sqrt(Hz) times the root of 500 Hz [rad/s rms]
-    gyro_bias: float = 5.2e-5  # standard deviation of the bias between devices [rad/s], equal to 0.003 deg/s
+    gyro_noise: float = 3.9e-3  # noise density 0.01 deg/s/sqrt(Hz) times the root of the bandwidth 500 Hz [rad/s rms]
+    gyro_bias: float = 5.2e-5  # standard deviation of the bias over all devices [rad/s], equal to 0.003 deg/s
     accel_noise: float = 0.05  # noise [m/s2 rms]
-    accel_bias: float = 0.02  # standard deviation of the bias between devices [m/s2]
+    accel_bias: float = 0.02  # standard deviation of the bias over all devices [m/s2]
     temperature: float = 32.0  # constant temperature of all IMUs [degC]
 
 

@@ -40,7 +40,7 @@ class _Disturbance:
 
     def __init__(self, fault: Fault, network: Network, seed: str) -> None:
         self.fault = fault
-        # `inject` sends copies of a received frame, so it must receive frames one cycle before its start.
+        # `inject` sends copies of a received frame. It is active one cycle earlier, so that it has received a frame at its start.
         self.from_cycle = fault.start - (fault.kind == "inject")
         self.messages = {message.frame_id: message for message in messages_of(fault, network)}
         self.random = random.Random(seed)
@@ -225,7 +225,7 @@ class FaultyBus(WrappedBus):
             FaultError: If the network has no such target or signal.
         """
         super().__init__(bus)
-        #: Whether the last `receive` got a SYNC of the HAL, also if a fault removed that SYNC.
+        #: Whether the HAL sent a SYNC that arrived in the last `receive`. True even if an injected fault removed this SYNC.
         self.synced = False
         self._clock, self._cycle, self._begun = clock, -1, -1
         self._all = [
@@ -236,7 +236,7 @@ class FaultyBus(WrappedBus):
         self._active: list[_Disturbance] = []
         self._syncs = {m.frame_id for m in network.messages if m.name.startswith("SYNC_")}
         self._from_hal = {m.frame_id for m in network.sent_by("HAL")}
-        self._for_nodes: list[Frames] = []  # frames to the nodes that are not received yet
+        self._for_nodes: list[Frames] = []  # frames of the HAL that the nodes have not received yet
         #: Arbitration of the frames on each bus, computed only during a flood.
         self.wire = Wire(network)
 
@@ -300,7 +300,7 @@ class FaultyBus(WrappedBus):
         return passing if self.wire.idle else self.wire.carry(passing, from_hal=from_hal)
 
     def _begin_cycle(self) -> None:
-        """Send the delayed frames that are due and the added frames. Only the first call in a cycle has an effect."""
+        """Send the due delayed frames and the frames that the faults add. Only the first call in a cycle has an effect."""
         self._now()
         if self._begun == self._cycle:
             return

@@ -59,7 +59,7 @@ class NodeFaults:
         self._faults = [(fault, nodes_of(fault, network)) for fault in faults if fault.kind in NODE_KINDS]
         self._sensors = [(fault, nodes_of(fault, network)[0]) for fault in faults if fault.kind in SENSOR_KINDS]
         self.rewrites = bool(self._sensors)
-        self._position: Vector = np.zeros(len(NODES))  # joint positions at the encoders [rad]
+        self._position: Vector = np.zeros(len(NODES))  # joint positions that the encoders measure [rad]
         self._stuck_at: dict[Fault, float] = {}
         self._frozen: dict[Fault, Vector] = {}
         self._hold_up: dict[Fault, HoldUp] = {}
@@ -72,7 +72,7 @@ class NodeFaults:
             position: true joint positions, shape (12,) [rad].
 
         Returns:
-            Joint positions at the encoders, shape (12,) [rad].
+            Joint positions that the encoders measure, shape (12,) [rad]. They contain the effects of the faults.
         """
         self._position = position.copy()
         for fault, nodes in self._faults:
@@ -114,7 +114,7 @@ class NodeFaults:
             self._drives.leave(drive, AUTOMATIC[self._drives.state[drive]])
 
     def _reset(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
-        """Keep a drive in its reset state during the fault, and boot the node at the end. `link` drops its frames meanwhile."""
+        """Boot the node at the end of the fault. Until then a drive stays in its reset state, and `link` drops its frames."""
         (node,) = nodes
         if cycle == fault.end:
             self._heartbeats.boot(node, cycle)

@@ -76,12 +76,12 @@ class Operator:
         self._press(Request.START)
 
     def stop(self) -> None:
-        """Press the STOP button. From now on, the operator presses START only in `start()`."""
+        """Press the STOP button. From now on, START is pressed only by a call of `start()`."""
         self._starts = False
         self._press(Request.STOP)
 
     def hold(self) -> None:
-        """Press the HOLD button. From now on, the operator presses START only in `start()`."""
+        """Press the HOLD button. From now on, START is pressed only by a call of `start()`."""
         self._starts = False
         self._press(Request.HOLD)
 

@@ -15,9 +15,9 @@ from atalante_hal.safety.diagnostics import Dtc, Reaction
 from atalante_hal.safety.state_machine import Conditions, next_state
 from atalante_hal.types import SupervisorState
 
-#: Conditions without a fault, with a pressed dead-man switch and without a request of the operator.
+#: Conditions of normal operation: no fault, the dead-man switch is pressed, and the operator requests no change.
 WELL: Final = Conditions(nodes_well=True, drives_enabled=True, dead_man=True)
-#: Rows of the first table: description and conditions, without a diagnostic.
+#: Rows of the first table: description of the conditions, and the conditions. No diagnostic is active.
 FACTS: Final = (
     ("nothing", WELL),
     ("a node is missing or not trusted", replace(WELL, nodes_well=False)),

@@ -17,9 +17,9 @@ from atalante_hal.types import PERIOD
 from atalante_hal.wire.frame import Frames
 from atalante_tools.session.rig import PATIENCE
 
-#: Latest arrival of a state after the SYNC [us]: on the wall clock the HAL waits for half a cycle.
+#: Longest accepted time from a SYNC to a state [us]. On the wall clock, the HAL waits half a cycle for the states.
 STATE_BUDGET: Final = PATIENCE * 1e6
-#: Latest arrival of a command after the SYNC: before the next SYNC, at which the drives apply it [us].
+#: Longest accepted time from a SYNC to a command [us]: one cycle, because the drives apply the command at the next SYNC.
 COMMAND_BUDGET: Final = PERIOD * 1e6
 #: Node kinds that answer every SYNC with a state.
 _ANSWERING: Final = ("drive", "imu", "foot")
@@ -37,7 +37,7 @@ class Latency:
     median_us: float
     p99_us: float
     max_us: float
-    wire_us: float  # longest wire time of all these frames of a cycle together, computed from the DBC
+    wire_us: float  # worst-case sum of the wire times of these frames in one cycle, computed from the DBC
     budget_us: float
 
     @property

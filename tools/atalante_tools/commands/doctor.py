@@ -57,7 +57,7 @@ class CheckResult:
 
     name: str
     ok: bool
-    needed: bool  # whether the chosen interface requires this check to pass
+    needed: bool  # whether the chosen interface works only if this check passes
     text: str  # result of the check for the user
     fix: str = ""  # shell command that fixes the problem
 

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 #: Longest wait after the move until the joint is at rest [s].
 SETTLE: Final = 1.0
-#: Position error [rad] and speed [rad/s] below which the joint counts as at rest.
+#: Position deviation [rad] and speed [rad/s] below which the joint counts as at rest.
 RESTED: Final = (math.radians(0.05), math.radians(0.5))
-#: Largest position error at the end of the move [rad]. The command fails if the error is larger.
+#: Largest accepted position deviation at the end of the move [rad]. If the deviation is larger, the command fails.
 TOLERANCE: Final = math.radians(1.0)
 
 

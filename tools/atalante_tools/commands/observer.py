@@ -29,7 +29,7 @@ class NodeReport:
 
     node: str
     kind: str
-    age_ms: int | None  # age of the newest frame among the messages with the shortest period. None: no frame received.
+    age_ms: int | None  # time since the last frame of the node's fastest messages (HAL: SYNC). None: no frame received.
     late: bool  # whether the age is above the timeout of the DBC
     state: str | None
     dbc_ok: bool | None

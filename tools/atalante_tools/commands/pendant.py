@@ -1,4 +1,4 @@
-"""Command `atalante pendant`: acts as the operator's pendant, from any process on the bus.
+"""Command `atalante pendant`: acts as the operator's pendant on the bus, in a process of its own.
 
 keyboard -> Session -> PendantNode -> bus -> HAL
 """

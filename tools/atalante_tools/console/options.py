@@ -274,7 +274,8 @@ def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command]
 def _refusal(interface: str) -> str:
     from atalante_hal.bus.adapters import ADAPTERS, refusal
 
-    return refusal(interface) if interface in ADAPTERS else ""  # an unknown interface is an error of the open bus
+    # The error of an unknown interface is raised later, when the bus is opened.
+    return refusal(interface) if interface in ADAPTERS else ""
 
 
 def _target(interface: str, channel: str, lockstep: bool | None = None, *, embedded: bool) -> Target:

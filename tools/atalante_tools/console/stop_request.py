@@ -54,7 +54,7 @@ class StopRequest:
             raise Stopped(self.exit_code)
 
     def settle(self) -> None:
-        """Clear the request. The command then ends with exit code 0, although a signal arrived."""
+        """Clear the request, so that the command ends with exit code 0 even if a signal arrived."""
         self.wanted = False
         self.exit_code = 0
 
@@ -107,7 +107,7 @@ def _handled(react: Callable[[StopRequest, int, bool], None]) -> Iterator[StopRe
 
 @contextmanager
 def interruptible() -> Iterator[StopRequest]:
-    """Raise `Stopped` at each SIGINT and SIGTERM inside the block. The block is the whole program.
+    """Raise `Stopped` at each SIGINT and SIGTERM inside the block. Use it once, around the whole program.
 
     Python reports an exception that it ignores, for example in `__del__`. It does not report an ignored `Stopped`, because the
     request is stored. After the block, a signal ends the process with the default action of the system.

@@ -55,13 +55,13 @@ def compile_host_test(build: Build, folder: Path) -> Path:
 
 
 def run_host_test(build: Build, program: Path, images: int, seed: int) -> int:
-    """Run the host test on random images and return the number of frames that it compared.
+    """Run the host test on test vectors and return the number of frames that it compared.
 
     Args:
         build: network and node.
         program: compiled host test.
-        images: number of random images.
-        seed: seed of the random images.
+        images: number of images, each with one payload of every message.
+        seed: seed of the random payloads.
 
     Raises:
         Failed: If the C code and the Python codec differ, or a sanitizer reports an error.
@@ -246,7 +246,7 @@ def _size(build: Build, message: Message) -> int:
 
 
 def _message(build: Build, message: Message, other: Message) -> str:
-    """Return the C test function of a message; its frames must fail the check with the Data ID of the message `other`."""
+    """Return the C test function of a message. It also tests that the Data ID of the message `other` fails the check."""
     body = ""
     if received := build.received(message):
         body += _receive(build, message, received, other)

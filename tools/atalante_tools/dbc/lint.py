@@ -33,5 +33,5 @@ def _finding(path: Path, line: str) -> Finding:
     number, colon, rest = text.partition(":")
     if colon and number.isdigit():
         return Finding(int(number), rest.strip())
-    found = _LINE.search(text)  # error text of the cantools parser
+    found = _LINE.search(text)  # the cantools parser writes the line number inside its error text
     return Finding(int(found[1]) if found else None, text.strip())

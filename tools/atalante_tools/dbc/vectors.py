@@ -57,7 +57,7 @@ class Vectors:
         self._order = self._stream_order()
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return the byte order of an image: index of each byte of the stream in the concatenated arrays; see `images`."""
+        """Return the position of each byte of an image in the concatenated arrays of `images`, in the order of the stream."""
         build, codec = self._build, self._codec
         rows = len(build.messages)
         parts = (FRAME_BYTES * rows, FRAME_BYTES * rows, 8 * codec.size, 8 * codec.size, rows)
@@ -91,7 +91,7 @@ class Vectors:
             yield np.concatenate([part.view(np.uint8) for part in parts])[self._order].tobytes()
 
     def examples(self) -> Iterator[dict[str, Any]]:
-        """Yield a JSON object per message for minimum, maximum, invalid and random values. Can be called once per instance."""
+        """Yield four JSON objects per message: minimum, maximum, invalid and random values. Can be called once per instance."""
         for image, kind in enumerate(("minimum", "maximum", "invalid codes", "random")):
             self._next(image)
             for row, message in enumerate(self._build.messages):

@@ -28,7 +28,7 @@ _COLOURS = {"left": "tab:orange", "right": "tab:blue"}
 class _Demands(NamedTuple):
     """Joint angles, torques, centre of pressure and swing clearance of a step with n samples."""
 
-    phase: Vector  # time over the step duration, 0 to 1, shape (n,)
+    phase: Vector  # time divided by the step duration, 0 to 1, shape (n,)
     q: Vector  # joint angles [rad], shape (n, 12)
     torque: Vector  # joint torques [Nm], shape (n, 12)
     pressure: Vector  # centre of pressure relative to the sole centre, in the axes of the stance foot [m], shape (n, 2)

@@ -62,7 +62,7 @@ class Options:
     telemetry: (
         Path | None
     )  # TOML file with endpoint, TLS certificate and users. None: publish on the loopback interface only.
-    subject: Subject | None = None  # patient and step, for which the gait network computes a gait. None: default gait.
+    subject: Subject | None = None  # patient and step parameters: inputs of the gait network. None: default gait.
 
 
 @dataclass
@@ -295,7 +295,7 @@ class _Walk:
 
     def _describe(self, state: State) -> str:
         statistics = self._controller.statistics
-        # The statistics start after the first completed step.
+        # The statistics start after the first completed step. Before, they contain no ratio.
         largest = f"   largest |e|/q_bound {statistics.max_ratio:.2f}" if statistics.cycles else ""
         return (
             f"{self._name:<11} step {statistics.steps:3d}/{self._steps}   t {state.time:6.1f} s   "
@@ -327,7 +327,7 @@ def _controllers(
 
 
 def _announce(certificates: Collection[Certificate]) -> None:
-    """Print the certificate of each guide shape: tolerated disturbance torques, and the effects that it does not include."""
+    """Print the certificate of each guide shape: the tolerated disturbance torques and the effects that are not included."""
     for certificate in certificates:
         name, xi, bound = certificate.shape, certificate.xi, certificate.joint_torque
         if bound is None:
@@ -463,7 +463,7 @@ def _close(telemetry: TelemetryProcess, walked: Walked) -> None:
 
 def _result(certificate: Certificate, controller: AirwalkController, hal: Hal, statistics: Statistics) -> Result:
     walking = controller.statistics
-    # The first step is not counted, and the run ends in the first cycle after the last step.
+    # The statistics omit the first step, so a run of one step leaves only its last cycle, which is too little.
     counted = walking.steps >= 2
     return Result(
         shape=certificate.shape,

@@ -24,7 +24,7 @@ _LEFT_HIP = "left_SH"
 _RIGHT_STANCE = 1
 #: Phase that the last step of a run must reach to count as complete, 0 to 1.
 _WHOLE = 0.9
-#: Samples of one step. A sample is phase, measured angle, desired angle, upper edge and lower edge of the guide [deg].
+#: Samples of one walking step: phase, measured angle, desired angle, upper edge and lower edge of the guide [deg].
 _Step = list[tuple[float, ...]]
 
 

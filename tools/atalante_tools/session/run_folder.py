@@ -33,10 +33,10 @@ class Result:
     certified: bool  # whether the guide has a certificate at every assistance factor of the run
     bound_hip_nm: (
         float | None
-    )  # certified disturbance at the hip, simultaneous with the knee [Nm]. None: not certified.
+    )  # certified disturbance torque at the hip, if the knee is disturbed at the same time [Nm]. None: not certified.
     bound_knee_nm: (
         float | None
-    )  # certified disturbance at the knee, simultaneous with the hip [Nm]. None: not certified.
+    )  # certified disturbance torque at the knee, if the hip is disturbed at the same time [Nm]. None: not certified.
     steps: int  # number of completed right-stance steps
     max_ratio: float | None  # largest ratio of tracking error to guide width, |e| / q_bound
     inside: float | None  # share of the time with both assisted joints inside the guide, 0 to 1

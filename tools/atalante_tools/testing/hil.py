@@ -35,7 +35,7 @@ _POLL: Final = 0.01
 _QUIET: Final = 0.15
 #: Largest number of frames in a recording, about 30 s.
 KEPT: Final = 600_000
-#: Time between the time stamps of two frames of a cycle in a recording [ns].
+#: Difference between the time stamps of consecutive frames of a cycle in a recording [ns].
 _FRAME_NS: Final = 20_000
 
 
@@ -63,7 +63,7 @@ def open_bus(network: Network, target: Target, *, emulated: bool) -> tuple[Bus, 
     hal_bus = join(network, open_buses(network, target))
     if not emulated:
         return hal_bus, None
-    # The nodes of a robot send heartbeats without SYNC, too.
+    # A connected robot is detected even without a HAL, because its nodes send heartbeats without SYNC.
     scratch = new_frames(1)
     if hal_bus.receive(scratch, _QUIET):
         hal_bus.close()

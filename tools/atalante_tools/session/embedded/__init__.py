@@ -75,13 +75,14 @@ class EmbeddedRobot(Closing):
             process_group=0,
         )
         self._begun = False
-        os.close(child_bell)  # while the parent has a copy open, it cannot detect the end of the child
+        # The parent detects the end of the child only if the child holds the only copy of this descriptor.
+        os.close(child_bell)
         self.bus = SharedBus("embedded", memory, parent_bell, 0)
         self.bus.patience = _PATIENCE
         self._part_from_child()
 
     def _part_from_child(self) -> None:
-        """Assign different processor cores to this thread and to the child. All children share their cores."""
+        """Assign different processor cores to this thread and to the child. All children share the same cores."""
         if not self._open:
             EmbeddedRobot._cores = os.sched_getaffinity(0)
         self._open.append(self)

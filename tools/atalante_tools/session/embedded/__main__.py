@@ -15,7 +15,7 @@ from atalante_hal.bus.shared import SharedBus
 from atalante_tools.session.body import no_banner, open_described
 from atalante_tools.session.embedded import SpawnConfig
 
-with no_banner():  # slow imports, in parallel with the preparations of the parent
+with no_banner():  # these imports are slow and run while the parent prepares its part
     from atalante_emulator.emulator import Emulator
     from atalante_emulator.pendant import Operator
 
