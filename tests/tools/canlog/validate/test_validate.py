@@ -6,8 +6,10 @@ import json
 import threading
 import time
 import xml.etree.ElementTree as ET
+from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import can
 import numpy as np
@@ -25,7 +27,7 @@ from atalante_tools.canlog.reader.chunk import NO_DIRECTION, Chunk
 from atalante_tools.canlog.reader.log import open_log
 from atalante_tools.canlog.reader.log_file import LogError
 from atalante_tools.canlog.validate.project import Project, ProjectError, load_project
-from atalante_tools.canlog.validate.report import report, text
+from atalante_tools.canlog.validate.report import Report, report, text
 from atalante_tools.canlog.validate.rules import RULES
 from atalante_tools.canlog.validate.run import listen
 from atalante_tools.canlog.validate.timing_rules import BINS, jitter_p99
@@ -33,6 +35,7 @@ from atalante_tools.canlog.validate.validator import Validator
 from atalante_tools.cli import cli
 
 NETWORK = atalante_dbc.load()
+MakeRig = Callable[..., Any]
 HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: A B\n\n'
 BEGIN = 1_700_000_000.0
 
@@ -362,6 +365,7 @@ def test_list_rules_as_json_has_every_threshold() -> None:
         ((), "the input must be log files or a live bus (-i socketcan -c can0), got neither"),
         (("a.log", "-i", "virtual", "-c", "x"), "(-i socketcan -c can0), got both"),
         (("-i", "virtual"), "virtual needs a channel"),
+        (("a.log", "--lockstep"), "--lockstep needs a live bus"),
         (("a.log", "--node", "NO_NODE"), "--node must be a sender in the DBC"),
     ],
 )
@@ -540,12 +544,14 @@ class Played:
 
     def __init__(self, chunk: Chunk, fails: bool) -> None:
         self.stamps = np.zeros(0, np.int64)
+        self.failed = False
         self._chunk, self._fails, self._at = chunk, fails, 0
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
         part = self._chunk.select(np.arange(self._at, min(self._at + 37, len(self._chunk))))
         self._at += len(part)
         if not len(part) and self._fails:
+            self.failed = True
             raise BusDown("played is down: the adapter was unplugged")
         frames[: len(part)], self.stamps = part.frames, part.stamps
         return len(part)
@@ -573,7 +579,7 @@ def test_live_bus_gives_the_findings_of_its_log(fails: bool, count: int, good: P
         plan,
         Project(),
         name="played",
-        stopped=lambda: not fails and all(bus.ended for bus in buses.values()),
+        stopped=lambda: all(bus.ended and bus.failed is fails for bus in buses.values()),
         node="LEFT_FH",
     )
     assert result.validator.frames == len(chunk)
@@ -581,6 +587,70 @@ def test_live_bus_gives_the_findings_of_its_log(fails: bool, count: int, good: P
     assert "dropped" in rules
     assert ("log-truncated" in rules) == fails
     assert (rules - {"dropped", "log-truncated"} == set()) == (count == 1)
+
+
+class Tap:
+    """Every frame that a HAL sends or receives, in order."""
+
+    def __init__(self) -> None:
+        self.kept: list[Frames] = []
+
+    def sent(self, frames: Frames) -> None:
+        self.kept.append(frames.copy())
+
+    def received(self, frames: Frames, count: int) -> None:
+        self.kept.append(frames[:count].copy())
+
+
+def lock_step_chunk(make_rig: MakeRig, seed: int = 0) -> tuple[Chunk, int]:
+    """Return the frames of a lock-step run at a speed that changes from 0.05 to 20 times real time, and its cycles."""
+    rig, frames = make_rig(), Tap()
+    rig.hal.tap = frames
+    rig.run(2000)
+    random = np.random.default_rng(seed)
+    per_part = np.exp(random.uniform(np.log(1e-5), np.log(1e-2), len(frames.kept)))  # a cycle has about two parts
+    stamps = np.cumsum(per_part * 1e9).astype(np.int64) + 1_700_000_000_000_000_000
+    joined = np.concatenate(frames.kept)
+    counts = [len(part) for part in frames.kept]
+    count = len(joined)
+    chunk = Chunk(joined, stamps.repeat(counts), np.zeros(count, np.uint8), np.full(count, NO_DIRECTION, np.int8))
+    return chunk, rig.hal.state.cycle
+
+
+def listen_to(chunk: Chunk, plan: Plan, *, lockstep: bool) -> Report:
+    bus = Played(chunk, fails=False)
+    bus.dropped = 0
+    return listen(
+        {"can0": bus}, plan, Project(), name="played", stopped=lambda: bus.ended, lockstep=lockstep, node=None
+    )
+
+
+def test_lock_step_bus_has_no_findings_in_lock_step_time(make_rig: MakeRig, plan: Plan) -> None:
+    chunk, cycles = lock_step_chunk(make_rig)
+    on_the_wall_clock = listen_to(chunk, plan, lockstep=False)
+    assert {"cycle-gap", "cycle-fast"} <= {finding.rule for finding in on_the_wall_clock.findings}
+    result = listen_to(chunk, plan, lockstep=True)
+    assert [(finding.rule, finding.message) for finding in result.findings] == []
+    assert result.validator.frames == len(chunk)
+    assert result.validator.end - result.validator.begin == pytest.approx(cycles * 1e6, abs=2e6)
+
+
+def test_lost_state_is_found_in_lock_step_time(make_rig: MakeRig, plan: Plan) -> None:
+    chunk, _ = lock_step_chunk(make_rig)
+    state = NETWORK.message("LEFT_SK_STATE").frame_id
+    at = np.flatnonzero(chunk.frames["can_id"] == state)
+    for lost, rule in ((at[700:702], "counter-lost"), (at[700:750], "recovered")):
+        result = listen_to(chunk.select(np.delete(np.arange(len(chunk)), lost)), plan, lockstep=True)
+        assert {finding.message for finding in result.findings} == {"LEFT_SK_STATE"}
+        assert rule in {finding.rule for finding in result.findings}
+
+
+def test_lock_step_time_needs_a_cycle_number(tmp_path: Path) -> None:
+    path = tmp_path / "foreign.dbc"
+    path.write_text(FOREIGN)
+    result = run("validate", "-i", "virtual", "-c", "lock-step", "--lockstep", "--for", "1", "--dbc", path)
+    assert result.exit_code == 2
+    assert "lock-step time needs a cyclic message SYNC* with the signal Cycle" in result.output
 
 
 def test_missing_bus_gives_exit_code_3() -> None:

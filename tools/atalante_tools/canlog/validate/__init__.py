@@ -32,6 +32,7 @@ class Options:
 
     interface: str  # python-can interface of the live bus; empty: check log files
     channel: str  # channels of the live bus
+    lockstep: bool  # judge times of the live bus by the cycle of SYNC
     seconds: float | None  # listening time on the live bus [s]; None: until Ctrl-C
     dbc: Path | None  # None: the DBC of the robot
     node: str | None  # require only the messages of this node; None: of all nodes
@@ -59,6 +60,11 @@ _options = options_as(
             default="",
             metavar="CHANNEL",
             help="Channel of the live bus: can0, or several: left_leg=can0,right_leg=can1.",
+        ),
+        click.option(
+            "--lockstep",
+            is_flag=True,
+            help="The live bus runs in lock-step: judge times by the cycle number of SYNC.  [default: wall clock]",
         ),
         click.option(
             "--for",
@@ -128,6 +134,8 @@ def command(logs: tuple[Path, ...], options: Options) -> None:
         raise click.UsageError(f"the input must be log files or a live bus (-i socketcan -c can0), got {received}")
     if options.interface and not options.channel:
         raise click.UsageError(f"{options.interface} needs a channel: -c can0")
+    if options.lockstep and not options.interface:
+        raise click.UsageError("--lockstep needs a live bus: -i socketcan -c can0")
     plan, project = _prepare(options)
     results, code = _listen(options, plan, project) if options.interface else _read(logs, plan, project, options.node)
     for result in results:
@@ -215,12 +223,15 @@ def _listen(options: Options, plan: Plan, project: Project) -> tuple[list[Report
                 buses,
                 plan,
                 project,
-                name=f"{options.interface} {options.channel}",
+                name=f"{options.interface} {options.channel}{' in lock-step' if options.lockstep else ''}",
                 stopped=lambda: stop.wanted or (end is not None and time.monotonic() >= end),
                 node=options.node,
+                lockstep=options.lockstep,
                 progress=show,
                 notice=notice,
             )
+    except ValueError as error:
+        raise click.UsageError(str(error)) from error
     finally:
         for bus in buses.values():
             bus.close()

@@ -16,6 +16,7 @@ from atalante_hal.wire.frame import new_frames
 from atalante_tools.canlog.plan import Plan
 from atalante_tools.canlog.reader.chunk import NO_DIRECTION, Chunk, concatenated
 from atalante_tools.canlog.reader.log import Log, open_log
+from atalante_tools.canlog.validate.lock_step import LockStepClock
 from atalante_tools.canlog.validate.project import Project
 from atalante_tools.canlog.validate.report import Report, report
 from atalante_tools.canlog.validate.validator import Validator
@@ -101,6 +102,7 @@ def listen(
     name: str,
     stopped: Callable[[], bool],
     node: str | None = None,
+    lockstep: bool = False,
     progress: Callable[[int], None] = lambda frames: None,
     notice: Callable[[str], None] = lambda message: None,
 ) -> Report:
@@ -115,9 +117,14 @@ def listen(
         name: name of the report.
         stopped: function that is called in every iteration; True ends the loop.
         node: require only the messages of this node; None: of all nodes.
+        lockstep: True: judge times in robot time, see `lock_step`; False: by the stamps of the bus.
         progress: called after each check with the frames so far.
         notice: called with a message when a link is lost or back.
+
+    Raises:
+        ValueError: If lock-step time is requested and the DBC has no SYNC with a cycle number.
     """
+    clock = LockStepClock(plan) if lockstep else None
     validator = Validator(plan, project, node=node)
     links = {channel: ResilientBus(bus, notice) for channel, bus in buses.items()}
     names, scratch = list(links), new_frames(_LIVE_FRAMES)
@@ -137,9 +144,9 @@ def listen(
             time.sleep(_RECEIVE_TIMEOUT / 10)
         if time.monotonic() >= next_time:
             next_time += _CHECK_PERIOD
-            _check_received(validator, received, names)
+            _check_received(validator, received, names, clock)
             progress(validator.frames)
-    _check_received(validator, received, names)
+    _check_received(validator, received, names, clock)
     validator.finish((), dropped=sum(bus.dropped for bus in links.values()))
     for label, link in links.items():
         if link.losses:
@@ -158,11 +165,13 @@ def _chunk(bus: Bus, frames: np.ndarray, channel: int) -> Chunk:
     return Chunk(frames.copy(), stamps, np.full(count, channel, np.uint8), np.full(count, NO_DIRECTION, np.int8))
 
 
-def _check_received(validator: Validator, received: list[Chunk], names: list[str]) -> None:
+def _check_received(validator: Validator, received: list[Chunk], names: list[str], clock: LockStepClock | None) -> None:
     if not received:
         return
     chunk = concatenated(received)
     received.clear()
+    if clock is not None:
+        chunk = clock.restamp(chunk)
     validator.check(chunk.select(np.argsort(chunk.stamps, kind="stable")), names)
 
 

@@ -1,0 +1,142 @@
+"""Time base of a lock-step bus: time stamps that follow the cycle of SYNC instead of the wall clock.
+
+    chunk with wall-clock stamps -> lock-step clock -> chunk with stamps in robot time -> rules
+
+In lock-step a cycle takes as long as the slowest program needs, so the wall clock says nothing about the period of a message.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_tools.canlog.column_codec import ColumnCodec, payload_words
+from atalante_tools.canlog.plan import Plan
+from atalante_tools.canlog.reader.chunk import Chunk
+from atalante_tools.canlog.validate.order_rules import SYNC
+
+Stamps = npt.NDArray[np.int64]
+
+#: Signal of SYNC that contains the cycle number.
+CYCLE: Final = "Cycle"
+#: Time after a SYNC from which the wall clock counts, because the loop has stopped [ns].
+PAUSE_NS: Final = 200_000_000
+#: Largest step of the cycle number between two SYNCs. A larger step (restarted HAL, damaged frame) counts as one cycle.
+MOST_STEPS: Final = 1000
+#: Distance of the stamps of two frames in a cycle, and largest distance of a frame from its SYNC, as a share of the cycle.
+_SPACING_NS, _LAST = 1000, 0.7
+
+
+@dataclass
+class _Channel:
+    """Robot time of one channel after its last frame."""
+
+    sync: int = -1  # row of the SYNC that counts the cycles: the first one received; -1: none yet
+    cycle: int = 0  # cycle number of the last SYNC
+    begin: int = 0  # robot time of the last SYNC [ns]
+    wall: int = 0  # wall clock of the last SYNC [ns]
+    count: int = 0  # number of frames since the last SYNC
+    last: int = -(1 << 62)  # stamp of the last frame [ns]
+
+
+class LockStepClock:
+    """Clock that replaces wall-clock stamps by robot time.
+
+    A frame gets the start time of its cycle and a small offset, in the order of arrival. The cycle number of the first SYNC has
+    the same stamp in both times. Before the first SYNC of a channel, and while SYNC pauses, the wall clock continues.
+
+    Args:
+        plan: compiled DBC.
+
+    Raises:
+        ValueError: If the DBC has no SYNC message with a cycle number.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        self._codecs: dict[int, ColumnCodec] = {}
+        for row, layout in enumerate(plan.layouts):
+            named = any(field.name == CYCLE for field in layout.fields)
+            if named and layout.name.upper().startswith(SYNC) and plan.cycle_ns[row]:
+                self._codecs[row] = ColumnCodec(layout)
+        if not self._codecs:
+            raise ValueError(
+                f"lock-step time needs a cyclic message {SYNC}* with the signal {CYCLE} in the DBC, got none"
+            )
+        self._channels: dict[int, _Channel] = {}
+        self._origin: int | None = None  # stamp of cycle 0 [ns]
+
+    def restamp(self, chunk: Chunk) -> Chunk:
+        """Return the chunk with stamps in robot time.
+
+        Args:
+            chunk: next frames of all channels; the frames of each channel in the order of arrival.
+        """
+        rows = self._plan.rows(chunk.frames["can_id"])
+        stamps = chunk.stamps.copy()
+        for number in np.unique(chunk.channels).tolist():
+            at = np.flatnonzero(chunk.channels == number)
+            stamps[at] = self._of_channel(self._channels.setdefault(number, _Channel()), chunk.select(at), rows[at])
+        return Chunk(chunk.frames, stamps, chunk.channels, chunk.sent)
+
+    def _of_channel(self, channel: _Channel, chunk: Chunk, rows: npt.NDArray[np.int16]) -> Stamps:
+        """Return the stamps of the frames of one channel in robot time. Shape (n,) [ns]."""
+        wall = chunk.stamps
+        if channel.sync < 0:
+            known = np.flatnonzero(np.isin(rows, list(self._codecs)))
+            if not len(known):
+                return wall
+            channel.sync = int(rows[known[0]])
+        syncs = np.flatnonzero(rows == channel.sync)
+        begins, walls = [channel.begin], [channel.wall]
+        for index, cycle in zip(syncs.tolist(), self._cycles(channel.sync, chunk, syncs), strict=True):
+            begins.append(self._next_begin(channel, cycle, int(wall[index]), int(wall[max(0, index - 1)])))
+            walls.append(channel.wall)
+        number = np.searchsorted(syncs, np.arange(len(wall)), side="right")
+        place = np.arange(len(wall)) - np.concatenate([[-channel.count], syncs])[number]
+        limit = int(_LAST * self._plan.cycle_ns[channel.sync])
+        since = wall - np.array(walls)[number]
+        stamps = np.array(begins)[number] + np.where(since > PAUSE_NS, since, np.minimum(_SPACING_NS * place, limit))
+        if not walls[0]:  # no SYNC before the first one of this chunk
+            stamps[: syncs[0]] = np.minimum(wall[: syncs[0]], begins[1])
+        stamps = np.maximum.accumulate(np.maximum(stamps, channel.last))
+        channel.last, channel.count = int(stamps[-1]), int(place[-1]) + 1
+        return stamps
+
+    def _cycles(self, row: int, chunk: Chunk, syncs: npt.NDArray[np.intp]) -> list[int]:
+        """Return the cycle number of each SYNC.
+
+        Args:
+            row: row of the SYNC message.
+            chunk: frames of the channel.
+            syncs: indices of the SYNC frames in the chunk, shape (k,).
+        """
+        codec = self._codecs[row]
+        words = payload_words(chunk.frames[syncs], codec.layout.length)
+        numbers: list[int] = codec.extract(words)[codec.index(CYCLE)].tolist()
+        return numbers
+
+    def _next_begin(self, channel: _Channel, cycle: int, wall: int, wall_before: int) -> int:
+        """Return the robot time of the next SYNC [ns], and store it in the channel.
+
+        Args:
+            channel: channel of the SYNC.
+            cycle: cycle number in the SYNC.
+            wall: wall clock of the SYNC [ns].
+            wall_before: wall clock of the frame before the SYNC [ns].
+        """
+        period = int(self._plan.cycle_ns[channel.sync])
+        if self._origin is None:
+            self._origin = wall - cycle * period
+        if not channel.wall:
+            begin = self._origin + cycle * period
+        else:
+            steps = cycle - channel.cycle
+            begin = channel.begin + (steps if 0 <= steps <= MOST_STEPS else 1) * period
+            if (paused := wall_before - channel.wall) > PAUSE_NS:
+                begin = max(begin, channel.begin + paused + period)
+        channel.cycle, channel.begin, channel.wall = cycle, begin, wall
+        return begin
