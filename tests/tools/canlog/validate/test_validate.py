@@ -603,7 +603,7 @@ class Tap:
 
 
 def lock_step_chunk(make_rig: MakeRig, seed: int = 0) -> tuple[Chunk, int]:
-    """Return the frames of a lock-step run at a speed that changes from 0.05 to 20 times real time, and its cycles."""
+    """Return the frames of a lock-step run at a speed that changes from 0.05 to 50 times real time, and its cycles."""
     rig, frames = make_rig(), Tap()
     rig.hal.tap = frames
     rig.run(2000)
