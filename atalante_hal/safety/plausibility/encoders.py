@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from atalante_hal.compiled import compiled
+from atalante_hal.compiled import specialised
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Cycles, Signals
@@ -56,7 +56,6 @@ class EncoderChecks:
         self._now, self._before = now, before
         self._travel = robot.velocity_max * robot.gear * period
         self._noise = 3.0 * robot.encoder_noise * robot.gear
-        self._reach = self._travel + self._noise
         self.jumps = [0] * len(JOINTS)
         self._jump_of: dict[int, float] = {}  # size of the last jump of a joint [rad]
         self._lost: dict[int, Lost] = {}
@@ -80,13 +79,13 @@ class EncoderChecks:
         self._wrong = [0] * len(JOINTS)
         self._wrong_findings: tuple[Finding, ...] = ()
         self._gear = robot.gear.tolist()
-        self._within_reach = compiled(within_reach)
-        self.within_reach()  # compile the function before the first cycle
+        #: Arguments of `within_reach`: the same arrays in every call.
+        self._positions = now.position, before.position, self._travel + self._noise, self._low, self._high
+        self._within_reach = specialised(within_reach, *self._positions)
 
     def within_reach(self) -> bool:
         """Return whether every joint is in its range and moved by no more than is possible in one cycle."""
-        ranges = self._low, self._high
-        return not self.outside and self._within_reach(self._now.position, self._before.position, self._reach, *ranges)
+        return not self.outside and self._within_reach(*self._positions)
 
     def accept(self, joint: int, cycles: int) -> bool:
         """Check the new position of one joint for a jump, and return whether the position may be used.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from atalante_hal.compiled import compiled
+from atalante_hal.compiled import specialised
 from atalante_hal.robot import IMUS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import IMU_NODES, Signals
@@ -36,13 +36,13 @@ class Imus:
         #: IMU index -> largest reading [rad/s or m/s2], for each saturated IMU.
         self.saturated: dict[int, float] = {}
         self._confirmed: dict[int, bool] = {}
-        self._usable = compiled(usable)
-        self.usable()  # compile the function before the first cycle
+        #: Arguments of `usable`: the same arrays in every call.
+        self._readings = now.quaternion, now.gyro, now.accel, self._norm_error, self._gyro_end, self._accel_end
+        self._usable = specialised(usable, *self._readings)
 
     def usable(self) -> bool:
         """Return whether every quaternion has unit norm and no IMU is saturated."""
-        now = self._now
-        return self._usable(now.quaternion, now.gyro, now.accel, self._norm_error, self._gyro_end, self._accel_end)
+        return self._usable(*self._readings)
 
     def accept(self, imu: int, cycles: int, *, frozen: bool) -> bool:
         """Check the new values of one IMU, and return whether the values may be used.
