@@ -756,3 +756,33 @@ def test_a_lost_link_releases_the_dead_man_until_start_is_typed(
         "the HAL is ACTIVE",
         "STOP: the HAL is HOLD",
     ]
+
+
+def test_a_start_typed_after_a_gap_is_pressed_when_the_hal_trusts_the_pendant_again(
+    world: World, capsys: pytest.CaptureFixture[str]
+) -> None:
+    end = world.wire.end(world.cycle)
+    node = PendantNode(world.network, end)
+
+    class TypesAfterGap(Keyboard):
+        """After 300 answers, loses 30 SYNCs, and types start immediately."""
+
+        def lines(self) -> list[str]:
+            if node.answered != 300 or world.hal.state.supervisor is not ACTIVE:
+                return []
+            world.run(30)
+            end.queue.clear()
+            assert world.hal.state.supervisor is HOLD
+            return ["start"]
+
+    operator = Session(node, TARGET, StopRequest(), TypesAfterGap(None), now=lambda: world.now)
+    operator.take_over()
+    operator.start_wanted = True
+    operator.run(0.5)
+    assert capsys.readouterr().err.splitlines()[4:] == [
+        "the HAL is ACTIVE",
+        "the HAL is HOLD",
+        "START pressed",
+        "the HAL is ACTIVE",
+        "STOP: the HAL is HOLD",
+    ]

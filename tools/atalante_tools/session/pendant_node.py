@@ -42,6 +42,7 @@ class PendantNode:
     Attributes:
         hal: State of the HAL in the last SYNC. None: no SYNC received.
         cycles: Number of received SYNCs.
+        answered_in_row: Number of SYNCs answered since the last gap. After a gap the HAL must trust the pendant again.
         answered: Number of answered SYNCs.
         found_another: Whether another pendant sent before `start_sending()`.
     """
@@ -73,6 +74,7 @@ class PendantNode:
         self.hal: SupervisorState | None = None
         self.cycles = 0
         self.answered = 0
+        self.answered_in_row = 0
         self.found_another = False
 
     @property
@@ -127,13 +129,15 @@ class PendantNode:
         Returns:
             Whether a SYNC was received.
         """
-        was_silent = self._takeover.silent
+        was_silent, gaps = self._takeover.silent, self._reader.gaps
         synced = self._reader.read(self._scratch, self._bus.receive(self._scratch, timeout))
         if not self._sending and self._takeover.present:
             self.found_another = True
             self._copy_signals()
         if self._takeover.silent and not was_silent:
             self._release_start()
+        if self._reader.gaps > gaps:
+            self.answered_in_row = 0
         if not synced:
             return False
         self.hal = SupervisorState(self._reader.hal_state)
@@ -158,6 +162,7 @@ class PendantNode:
             self._status.values[self._uptime_at] = self.answered * PERIOD
             self._send(self._status.seal())
         self.answered += 1
+        self.answered_in_row += 1
 
     def _send(self, frames: Frames) -> None:
         with suppress(BusFull):  # the HAL detects missing frames by a timeout

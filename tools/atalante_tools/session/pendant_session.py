@@ -65,6 +65,7 @@ class Session:
         self.node, self.stop = node, stop
         #: Whether to press START as soon as the HAL is in READY or HOLD.
         self.start_wanted = False
+        self._start_typed = False  # START is pressed as soon as the HAL trusts the pendant
         self._target, self._keyboard, self._now = target, keyboard, now
         self._begun = self._synced_at = now()
         self._hal_present = True
@@ -107,6 +108,8 @@ class Session:
         while self.node.answered < last and not (self.node.displaced or self.node.takeover_failed):
             if self.node.poll(POLL_TIMEOUT):
                 received_at = self._now()
+                if self._start_typed:
+                    self._press_start()
             elif self._now() - received_at > HAL_TIMEOUT:
                 return
             if self.stop.wanted and not stopping:
@@ -146,7 +149,7 @@ class Session:
         """Release the dead-man switch after a lost link: the operator must press it again."""
         self._lost_before = self._losses()
         self.node.dead_man = False
-        self.start_wanted = False
+        self.start_wanted = self._start_typed = False
         say("the dead-man switch is released; type start to press it again, with START")
 
     def _elapsed(self) -> float:
@@ -155,6 +158,7 @@ class Session:
 
     def press_stop(self) -> None:
         """Press STOP for some cycles, then release the dead-man switch."""
+        self._start_typed = False
         self.node.press(Request.STOP)
         self.answer_syncs(STOP_SYNCS)
         self.node.dead_man = False
@@ -171,16 +175,26 @@ class Session:
         word, *arguments = line.lower().split() or [""]
         if word in ("start", "stop", "hold") and not arguments:
             self.start_wanted = False
-            self._pressed_at = self.node.cycles if word == "start" else None
-            if word == "start":
+            self._start_typed = word == "start"
+            self._pressed_at = None
+            if self._start_typed:
                 self.node.dead_man = True
-            self.node.press(Request[word.upper()])
-            say(f"{word.upper()} pressed")
+            else:
+                self.node.press(Request[word.upper()])
+                say(f"{word.upper()} pressed")
         elif word == "xi" and len(arguments) == 1 and (factor := _factor(arguments[0])) is not None:
             self.node.assist(factor)
             say(f"assistance factor {factor:g}")
         elif word:
             say(f"a command must be start, stop, hold or xi X with X from 0 to 1, got {line.strip()!r}")
+
+    def _press_start(self) -> None:
+        """Press START if the HAL trusts the pendant, which needs `REQUALIFY` consecutive valid frames."""
+        if self.node.answered_in_row > REQUALIFY:
+            self.start_wanted = self._start_typed = False
+            self._pressed_at = self.node.cycles
+            self.node.press(Request.START)
+            say("START pressed")
 
     def _react_to_sync(self) -> None:
         """Print a change of the HAL state, and press START if the session wants to start and the HAL is ready for it."""
@@ -193,12 +207,8 @@ class Session:
                 say("each START changes the state once; type start to press START again")
             self._pressed_at = None
         startable = node.hal in (SupervisorState.READY, SupervisorState.HOLD)
-        # The HAL ignores requests until it received `REQUALIFY` consecutive valid frames of the pendant.
-        if self.start_wanted and startable and node.answered > REQUALIFY:
-            self.start_wanted = False
-            self._pressed_at = node.cycles
-            node.press(Request.START)
-            say("START pressed")
+        if self._start_typed or (self.start_wanted and startable):
+            self._press_start()
         elif self._pressed_at is not None and node.cycles - self._pressed_at > START_TIMEOUT:
             self._pressed_at = None
             say("the HAL did not become ACTIVE, see its event log; type start to press START again")

@@ -121,6 +121,7 @@ class PendantReader:
     Attributes:
         tag: Counter of the answers to the last SYNC, 0 to 255.
         hal_state: Signal HalState of the last SYNC.
+        gaps: Number of rejected SYNCs. After a gap, SYNCs are rejected until enough consecutive ones were received.
         other: Signals of the last frame of another pendant that answered its SYNC, by name. Empty before.
     """
 
@@ -141,6 +142,7 @@ class PendantReader:
         self._hal_index, self._cycle_index = index(sync.name, "HalState"), index(sync.name, "Cycle")
         self.tag = 0
         self.hal_state = 0
+        self.gaps = 0
         self.other: dict[str, float] = {}
 
     def read(self, frames: Frames, count: int) -> bool:
@@ -168,7 +170,9 @@ class PendantReader:
             counter = int(frame["data"][0, COUNTER_BYTE])
             if self._takeover.answer(counter) and check.fresh:
                 self.other = {name: float(image.values[at]) for name, at in self._state_index.items()}
-        if not Check(image.check[self._sync_row]).fresh:
+        sync = Check(image.check[self._sync_row])
+        if not sync.fresh:
+            self.gaps += sync is not Check.NO_DATA
             return False
         self.tag = int(image.values[self._cycle_index]) & 0xFF
         self.hal_state = int(image.values[self._hal_index])
