@@ -281,3 +281,34 @@ def test_pose_hold_keeps_every_joint_at_its_measured_angle(network: Network, rob
         watched(rig, seconds=0.5).conclude()
         caught = rig.hal.record[rig.hal.layout["controller.reference"]]
         assert np.abs(rig.hal.state.position - caught).max() < math.radians(0.1)
+
+
+@pytest.mark.parametrize("resumes", [False, True])
+def test_a_hold_ends_the_run_or_waits_for_the_next_start(
+    network: Network, robot: Robot, capsys: pytest.CaptureFixture[str], resumes: bool
+) -> None:
+    with embedded(network, robot) as rig:
+        assert rig.operator is not None
+        operator, controller = rig.operator, PoseHold(rig.hal.robot)
+        watch = Watch(
+            rig, StopRequest(), lambda state: controller.elapsed >= 0.05, lambda state: "moving", resumes=resumes
+        )
+        held: list[int] = []
+
+        def until(state: State) -> bool:
+            if state.supervisor is ACTIVE and not held and controller.elapsed >= 0.02:
+                operator.hold()
+            if state.supervisor is HOLD:
+                held.append(state.cycle)
+                if len(held) == 50:
+                    operator.start()
+            return watch(state) or state.cycle > 2000
+
+        rig.run(controller, until=until)
+        assert len(held) >= 50 if resumes else len(held) == 1
+        if resumes:
+            watch.conclude()
+            assert "HOLD: the operator asked" in capsys.readouterr().err
+        else:
+            with pytest.raises(Failed, match="the robot went to HOLD: the operator asked"):
+                watch.conclude()
