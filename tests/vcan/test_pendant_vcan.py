@@ -38,7 +38,7 @@ def test_a_second_pendant_takes_over_and_holds(vcan: str, network: Network, robo
         for work in (lambda: emulator.poll(0.05), lambda: first.poll(0.05), lambda: second.poll(0.05)):
             stack.enter_context(repeated(work))
 
-        cycles = Loop(hal, lambda: listener.take(block, listening.receive(block), time.monotonic())).cycles
+        cycles = Loop(hal, lambda: listener.accept(block, listening.receive(block), time.monotonic())).cycles
         assert cycles(400, SupervisorState.READY) is SupervisorState.READY, hal.missing()
         first.press(Request.START)
         assert cycles(60, SupervisorState.ACTIVE) is SupervisorState.ACTIVE, hal.reason
