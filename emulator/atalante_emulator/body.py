@@ -80,7 +80,7 @@ class PyBulletBody:
     Two bodies with the same URDF and the same torques give identical results, bit by bit.
 
     Joints and links are found by name: joints are `JOINTS`, IMU links `imu_<IMU>`, feet `<foot>_foot` and contact pads
-    `<foot>_foot_<cell>`, with their joint frames as sensor frames.
+    `<foot>_foot_<cell>`. The sensor frame of such a link is the frame of its joint.
     """
 
     def __init__(self, urdf: str, *, ground: float | None = None) -> None:

@@ -152,7 +152,7 @@ class Drives:
         """Return the joint torques of the next `PERIOD`.
 
         Args:
-            velocity: true joint velocities, which friction depends on, shape (12,) [rad/s].
+            velocity: true joint velocities, shape (12,) [rad/s]. The friction depends on them.
 
         Returns:
             Joint torques, shape (12,) [Nm].

@@ -31,7 +31,7 @@ class Feet:
         """Sample all force cells. Must be called once per `PERIOD`.
 
         Args:
-            contact: per contact of the last step: index of the foot, index of the cell, force on the foot in world axes [N].
+            contact: per contact of the last time step: index of the foot, index of the cell, force on the foot in world axes [N].
             rotation: attitude of each foot, quaternion xyzw from the foot frame to the world.
         """
         if not contact:

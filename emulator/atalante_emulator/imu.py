@@ -81,7 +81,7 @@ class Imus:
         """Sample all IMUs. Must be called once per `PERIOD`.
 
         Args:
-            links: attitude and velocities of each IMU after the last step, as in `Body.imu`, shape (4, 10).
+            links: attitude and velocities of each IMU after the last time step, as in `Body.imu`, shape (4, 10).
         """
         self._sample(links, self._before, *self._signals)
 
@@ -105,8 +105,8 @@ class Imus:
         Args:
             generator: source of the random numbers.
             bias: gyroscope and accelerometer biases from `draw_bias`.
-            gyro: receives the gyroscope errors, shape (cycles, 12) [rad/s], in signal order.
-            accel: receives the accelerometer errors, shape (cycles, 12) [m/s2], in signal order.
+            gyro: receives noise plus bias of the gyroscopes, shape (cycles, 12) [rad/s], in signal order.
+            accel: receives noise plus bias of the accelerometers, shape (cycles, 12) [m/s2], in signal order.
         """
         parameters = self._parameters
         for out, scale, offset in ((gyro, parameters.gyro_noise, bias[0]), (accel, parameters.accel_noise, bias[1])):

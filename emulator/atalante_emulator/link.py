@@ -59,7 +59,7 @@ class _Disturbance:
         """Apply the fault to a frame, and return the frames to pass on instead, shape (1,) each.
 
         Args:
-            frame: frame as sent, shape (1,).
+            frame: frame to which the fault is applied, shape (1,).
             cycle: number of the cycle.
         """
         message = self.messages.get(_id(frame))

@@ -38,7 +38,7 @@ def _advance(velocity: Vector, motors: Vector, tracking: float, friction_speed: 
     Args:
         velocity: true joint velocities, shape (12,) [rad/s].
         motors: motor array, shape (6, 12). Its joint torques are updated.
-        tracking: share of the torque error that the current loop removes per `PERIOD`.
+        tracking: share of the torque deviation that the current loop removes per `PERIOD`.
         friction_speed: joint speed at which dry friction reaches 76 % of its full value [rad/s].
         torque: motor torques, shape (12,) [Nm]. Updated here.
     """
@@ -100,7 +100,7 @@ class Motors:
         plus the external torque.
 
         Args:
-            velocity: true joint velocities, on which friction depends, shape (12,) [rad/s].
+            velocity: true joint velocities, shape (12,) [rad/s]. The friction depends on them.
 
         Returns:
             Joint torques, shape (12,) [Nm].

@@ -22,8 +22,9 @@ def command(shape: str, target: Target, options: Options, as_json: bool) -> None
     """Walk in the air inside one virtual guide, with a real or an emulated robot.
 
     The robot starts when the operator presses START (`atalante pendant start`). The operator may change the assistance
-    factor at any time. After a HOLD the command waits for the next START, and counts the steps from there. The robot ends in
-    HOLD: after the steps, on Ctrl-C, or in FAULT.
+    factor at any time. After a HOLD the command waits for the next START and counts the steps from 0 again; with -i embedded
+    it ends instead. After the steps or Ctrl-C the robot is in HOLD. If a fault ends the command, the robot stays in
+    FAULT.
 
     \b
     Example: atalante emulator -i socketcan -c vcan0     (in another terminal)

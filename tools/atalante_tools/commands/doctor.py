@@ -94,7 +94,7 @@ class CheckResult:
 def command(interface: str, channel: str, measure: bool, seconds: float, as_json: bool) -> None:
     """Check whether this computer is ready, and print the commands that fix problems.
 
-    With -i, the command prints what is known of the interface: CAN FD, driver, form of the channel, bit timing, what was tried.
+    With -i, the command prints the known facts about the interface: CAN FD, driver, form of the channel, bit timing, tests.
     With -c, it opens the channels as every other command does, and closes them. It sends no frames and changes nothing.
     With --bus, it listens to a running HAL and its nodes, and compares the receive timestamps with the cycle of 1 ms. The exit
     code is 1 if the chosen interface requires something that is missing, or if the bus does not fit into the cycle.

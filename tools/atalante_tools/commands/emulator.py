@@ -141,7 +141,7 @@ def end_condition(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[
 
 
 def status_line(emulator: Emulator, bus: Line) -> str:
-    """Return the status line with cycles, frames and drive states. It also names another robot, and the error of the interface.
+    """Return the status line with cycles, frames and drive states. Append a note about another robot or a failed interface.
 
     Args:
         emulator: Emulator whose status is printed.

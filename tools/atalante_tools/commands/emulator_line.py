@@ -18,8 +18,8 @@ from atalante_hal.wire.e2e import COUNTER_BYTE, check_counter
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_tools.session.takeover import PendantReader, Takeover
 
-#: Time without a frame of another pendant after which the emulated pendant sends again [cycles]. It is longer than the time of a
-#: pendant process, so that the process sends first.
+#: Time without a frame of another pendant after which the emulated pendant sends again [cycles]. It is longer than the
+#: `QUIET_CYCLES` of a pendant process, so that the process sends first.
 PENDANT_QUIET: Final = 12
 #: Number of consecutive frames of one message after which another robot is recognised.
 ROBOT_FRAMES: Final = 3

@@ -40,8 +40,9 @@ _BLANK: Final = "-"
 def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
     """Listen to a bus and print its nodes, joints (degrees, Nm), supervisor state and bus load.
 
-    The measured load is the longest wire time of the received frames. The computed worst case counts every message of the DBC at
-    its shortest period. The command sends no frames. The exit code is 1 if no frame was received, and 4 if a fault is latched.
+    The measured load counts each received frame with its longest possible wire time. The computed worst case counts every
+    message of the DBC at its shortest period. The command sends no frames. The exit code is 1 if
+    no frame was received, and 4 if a fault is latched.
 
     \b
     Example: atalante status -i socketcan -c vcan0

@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 def command(patient: Patient | None, urdf_file: Path | None, picture: Path | None, as_json: bool) -> None:  # fmt: skip
     """Print the links of the model and check its consistency; the exit code is 1 if a check fails.
 
-    With --mass and --height the model is the exoskeleton with a patient. Without them it is the exoskeleton without a patient,
-    as used by the joint idealization. Masses are in kg, centres of mass in m in the frame of the link, moments of inertia in
-    kg m2 about the centre of mass.
+    With --mass and --height the model is the exoskeleton with a patient. Without them it is the empty exoskeleton, whose
+    dynamics the controller cancels (joint idealization). Masses are in kg, centres of mass in m in the
+    frame of the link, moments of inertia in kg m2 about the centre of mass.
 
     \b
     Example: atalante model --mass 75 --height 175

@@ -88,7 +88,7 @@ class PendantNode:
         return self._takeover.lost and not self._takeover.established
 
     def start_sending(self) -> None:
-        """Answer every SYNC from now on."""
+        """Start sending: answer every SYNC from now on, unless the takeover rule forbids it."""
         self._sending = True
         self._takeover.start()
 
@@ -152,7 +152,7 @@ class PendantNode:
             self._tx.values[self._at[name]] = value
 
     def _release_start(self) -> None:
-        """Release START: after the silence, a request counter other than the other pendant's would count as a new press."""
+        """Release START, because the HAL would read a changed request counter after the silence as a new press."""
         if self._tx.values[self._at["Request"]] == Request.START:
             self._tx.values[self._at["Request"]] = Request.NONE
 

@@ -27,8 +27,8 @@ LISTEN_CYCLES: Final = 3
 HAL_TIMEOUT: Final = 1.0
 #: Longest wait for a frame [s]. After it, stop request and keyboard are checked.
 POLL_TIMEOUT: Final = 0.02
-#: Number of SYNCs that a new pendant answers with the signals of the older pendant, until the older pendant stops sending. If the
-#: signals differ, the HAL holds the robot after four cycles.
+#: Number of SYNCs that a new pendant answers with the signals of the older pendant. In this time the older pendant stops sending.
+#: If the signals of the two pendants differed, the HAL would hold the robot after four cycles.
 COPY_SYNCS: Final = 20
 #: Number of SYNCs that `pendant stop` and `pendant hold` answer.
 PRESS_SYNCS: Final = 500
@@ -153,7 +153,7 @@ class Session:
         say("the dead-man switch is released; type start to press it again, with START")
 
     def _elapsed(self) -> float:
-        """Return the time since the start [s]. It counts cycles after the first answered SYNC, and wall-clock time before."""
+        """Return the time since the start [s]: answered SYNCs times `PERIOD`, or wall-clock time before the first answer."""
         return self.node.answered * PERIOD if self.node.answered else self._now() - self._begun
 
     def press_stop(self) -> None:
@@ -197,7 +197,7 @@ class Session:
             say("START pressed")
 
     def _react_to_sync(self) -> None:
-        """Print a change of the HAL state, and press START if the session wants to start and the HAL is ready for it."""
+        """Print a change of the HAL state, and press START if START is requested and the HAL accepts it."""
         node = self.node
         self._synced_at, self._hal_present = self._now(), True
         if node.hal is not self._hal and node.hal is not None:

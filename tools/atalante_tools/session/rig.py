@@ -51,8 +51,8 @@ class Rig:
     Attributes:
         target: Bus and clock.
         hal: HAL of the run.
-        emulator: Emulator of a robot in this process. None: the robot is in another process or real.
-        operator: Emulated operator of a robot in this process. None: the robot is in another process or real.
+        emulator: Emulator of a robot in this process. None: the robot is real or in another process.
+        operator: Emulated operator of a robot in this process. None: the robot is real or in another process.
     """
 
     target: Target
@@ -66,7 +66,7 @@ class Rig:
         """Run the control loop on the clock of the target. The run ends in HOLD.
 
         On the wall clock, the process requests real-time priority and locked memory. After a stop signal, the HAL rejects every
-        START and changes to HOLD. Further signals do not interrupt this. `until` must read the stop request.
+        START and changes to HOLD. Further signals do not interrupt this. The function `until` must read the stop request.
 
         Args:
             controller: Controller that computes the command of every cycle.
@@ -201,9 +201,9 @@ def join(network: Network, buses: dict[str, Bus]) -> Bus:
 class Watch:
     """End condition of a run, called once per cycle. It also prints a progress line.
 
-    A run ends when `done(state)` returns True while ACTIVE, when a signal arrives, or when the robot is in FAULT. When the robot
-    leaves ACTIVE, the run ends, or waits in HOLD for the operator's START. After the run `conclude` raises an error unless `done`
-    ended the run.
+    A run ends when `done(state)` returns True while ACTIVE, when a signal arrives, or when the robot is in FAULT. If the robot
+    leaves ACTIVE for another state, the run ends too, unless `resumes` is True: then it waits for the operator's START. After the
+    run, `conclude` raises an error unless `done` ended the run.
     """
 
     def __init__(

@@ -26,7 +26,8 @@ TAKEOVER_CYCLES: Final = 50
 RETRY_CYCLES: Final = 8
 #: Range of the random time that is added to `TAKEOVER_CYCLES` and `RETRY_CYCLES` [cycles].
 DRAW_CYCLES: Final = 50
-#: Number of consecutive frames of another pendant after which a pendant stops sending. The HAL tolerates three such cycles.
+#: Number of consecutive frames of another pendant after which a pendant stops sending. The HAL tolerates two senders for three
+#: cycles.
 PRESENT_FRAMES: Final = 2
 #: Number of consecutive frames of another pendant after which a silent pendant gives up.
 LOST_FRAMES: Final = 3

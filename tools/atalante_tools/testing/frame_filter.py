@@ -56,13 +56,13 @@ class Fault:
 class FrameFilter(WrappedBus):
     """Bus that applies faults to frames. Without a fault it passes all frames on.
 
-    Time stamps are not moved with the frames: after a dropped or delayed frame, a frame has the time stamp of another frame.
+    Time stamps are not moved with the frames. After a dropped or delayed frame, the next frames have time stamps of other frames.
 
     Args:
         bus: wrapped bus, owned by the caller.
         network: nodes and messages of the DBC.
         tap: recorder of the frames that are passed on; None: frames are not recorded.
-        step: function that runs the emulated robot, called in every `receive`, which then does not wait; None: a real robot.
+        step: function that runs the emulated robot. Every `receive` calls it and then does not wait. None: a real robot.
         seed: seed of the random faults.
     """
 
@@ -90,10 +90,10 @@ class FrameFilter(WrappedBus):
         Args:
             name: name of a message (LEFT_SK_STATE), of a node (LEFT_SK: all its messages), or a pattern (LEFT_*, *_STATE).
             frames: number of frames of each message. None means until the fault ends.
-            probability: probability that a frame is affected, above 0 to 1.
+            probability: probability that a frame is affected, above 0 and at most 1.
 
         Returns:
-            The fault, to end it or to count its frames.
+            The fault. The caller can end it, and read its number of affected frames.
 
         Raises:
             ValueError: If there is no such message or node, or the probability is out of range.
@@ -107,10 +107,10 @@ class FrameFilter(WrappedBus):
             name: name or pattern of messages or nodes, as in `drop`.
             cycles: delay in cycles, from 1.
             frames: number of frames of each message. None means until the fault ends.
-            probability: probability that a frame is affected, above 0 to 1.
+            probability: probability that a frame is affected, above 0 and at most 1.
 
         Returns:
-            The fault, to end it or to count its frames.
+            The fault. The caller can end it, and read its number of affected frames.
 
         Raises:
             ValueError: If an argument is out of range, or there is no such message or node.
@@ -130,10 +130,10 @@ class FrameFilter(WrappedBus):
             name: name or pattern of messages or nodes, as in `drop`.
             bit: index of the bit, modulo the payload length. None means a random bit.
             frames: number of frames of each message. None means until the fault ends.
-            probability: probability that a frame is affected, above 0 to 1.
+            probability: probability that a frame is affected, above 0 and at most 1.
 
         Returns:
-            The fault, to end it or to count its frames.
+            The fault. The caller can end it, and read its number of affected frames.
 
         Raises:
             ValueError: If an argument is out of range, or there is no such message or node.
