@@ -26,7 +26,7 @@ TERMINALS = (ROBOT, CONTROLLER, PENDANT)
 #: Most cycles from the first one in which all three send until the robot is ACTIVE: two seconds of robot time.
 ACTIVE_BY = 2000
 SEEDS = range(20)
-#: Events of the random sequence, one for each seed: a terminal is killed and restarted, the interface goes down and up, or is removed and created.
+#: Events, one for each seed. A terminal is killed and restarted, or the interface goes down and up, or it is removed and created.
 EVENTS = (*TERMINALS, "down", "removed")
 
 
