@@ -65,7 +65,7 @@ class Session:
         self.node, self.stop = node, stop
         #: Whether to press START as soon as the HAL is in READY or HOLD.
         self.start_wanted = False
-        self._start_typed = False  # START is pressed as soon as the HAL trusts the pendant
+        self._start_typed = False  # START was typed, and is pressed as soon as the HAL trusts the pendant
         self._target, self._keyboard, self._now = target, keyboard, now
         self._begun = self._synced_at = now()
         self._hal_present = True
