@@ -42,7 +42,7 @@ class PendantNode:
     Attributes:
         hal: State of the HAL in the last SYNC. None: no SYNC received.
         cycles: Number of received SYNCs.
-        answered_in_row: Number of SYNCs answered since the last gap. After a gap, the HAL ignores requests until it trusts the pendant.
+        answered_in_row: Number of SYNCs answered since the last gap. The HAL ignores requests until it trusts the pendant again.
         answered: Number of answered SYNCs.
         found_another: Whether another pendant sent before `start_sending()`.
     """
