@@ -61,14 +61,14 @@ class Commands:
         self._state.fill(state)
 
     def hold(self) -> None:
-        """Set the values of HOLD: quick stop for every drive, zero torque, vibration motors off."""
+        """Set the command values for HOLD: quick stop for every drive, zero torque, vibration motors off."""
         self._holding = True
         self.torque.fill(0.0)
         self.control.fill(Controlword.QUICK_STOP)
         self._level.fill(0.0)
 
     def drive(self, torque: Vector, vibration: Vector) -> None:
-        """Set the values of a motion: enabled drives, torques and vibration levels.
+        """Set the command values for a motion: drives enabled, torques and vibration levels.
 
         Args:
             torque: Torques after the limiter, shape (12,) [Nm].
@@ -105,7 +105,7 @@ class Commands:
         return self._record()
 
     def send_prepared_hold(self, cycle: int) -> Vector:
-        """Send the HOLD frames that were encoded in advance, and set the values of HOLD.
+        """Send the HOLD frames that were encoded in advance, and set the command values for HOLD.
 
         Args:
             cycle: Number of the present cycle.
@@ -116,7 +116,7 @@ class Commands:
         self._image.seal_prepared(self._prepared_hold)
         self._transceiver.send(self._commands)
         self.hold()
-        self._seal(cycle + 1, self._image.counter)  # only the commands were encoded in advance, not the next SYNC
+        self._seal(cycle + 1, self._image.counter)  # the next SYNC was not encoded in advance
         return self._record()
 
     def _seal(self, next_cycle: int, counter: int | None) -> None:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Values of `PENDANT_STATE.Request`.
+#: Values of the signal Request in PENDANT_STATE: no request, and START.
 _NONE, _START = 0, 1
 _SIGNALS = ("DeadMan", "Request", "RequestCounter", "AssistanceFactor", "AssistanceSet")
 
@@ -69,7 +69,7 @@ class Pendant:
         self._slice = slice(indices[0], indices[-1] + 1)
         #: Signal values as received, a view of the process image.
         self.signals = image.values[self._slice]
-        #: Bytes of `signals` at the last call of `hear`; a change of `signals` requires another call.
+        #: Bytes of `signals` at the last call of `hear`. If `signals` has changed since then, `hear` must be called again.
         self.heard = b""
         self.dead_man = False
         self.stop_requested = False

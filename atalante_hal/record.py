@@ -43,7 +43,7 @@ class Record:
         self.motor_side = self.values[self.layout["motor_position"].start : self.layout["motor_torque"].stop]
         #: Position [rad] and velocity [rad/s] of the joints, shape (2, 12).
         self.motion = self.joint_side[: 2 * len(JOINTS)].reshape(2, len(JOINTS))
-        #: State and temperature of the drives, shape (24,), in one view. One comparison detects a change.
+        #: State and temperature of the drives, shape (24,), in one view, so that one comparison detects any change.
         self.drive_side = self.values[self.layout["drive_state"].start : self.layout["temperature"].stop]
         assert self.drive_side.size == 2 * len(JOINTS)
         self.torque_command = self.values[self.layout["torque_command"]]

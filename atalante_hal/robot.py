@@ -55,13 +55,13 @@ class Derating:
     """Torque limit of a hot drive as a function of its temperature."""
 
     start: float  # degC, highest temperature at which `torque_max` is allowed
-    end: float  # degC, temperature from which only `floor` is allowed
+    end: float  # degC, temperature from which only the share `floor` of `torque_max` is allowed
     floor: float  # share of torque_max, 0 to 1
 
 
 @dataclass(frozen=True)
 class Sensors:
-    """Tolerances of healthy sensors, see `plausibility`."""
+    """Tolerances for sensors without a fault, and load thresholds of the force cells, see `plausibility`."""
 
     velocity_error: float  # rad/s at the joint, mean difference between reported velocity and encoder motion
     attitude_error: float  # rad per axis, difference between the encoders and the IMUs of a leg
@@ -128,7 +128,7 @@ class Robot:
 
 
 class _Key(NamedTuple):
-    """Valid values of a key. The wide range detects a wrong unit or a misplaced decimal point."""
+    """Count, range and unit of the numbers of a key. The range is wide: it only detects wrong units and decimal points."""
 
     size: int
     low: float
@@ -247,7 +247,7 @@ def load_robot(path: Path | None = None) -> Robot:
 
 
 def _table(where: str, table: Any, keys: dict[str, _Key]) -> dict[str, list[float]]:
-    """Return the numbers of each key of a table, which must have exactly the given keys."""
+    """Return the numbers of each key of a table. The table must have exactly the given keys."""
     if not isinstance(table, dict):
         raise RobotError(f"{where} must be a table with the keys {', '.join(keys)}, got {table!r}")
     if unknown := sorted(set(table) - set(keys)):
@@ -259,7 +259,7 @@ def _table(where: str, table: Any, keys: dict[str, _Key]) -> dict[str, list[floa
 
 def _numbers(where: str, value: Any, valid: _Key) -> list[float]:
     numbers = value if isinstance(value, list) else [value]
-    # The comparison is also false for NaN.
+    # The range comparison is false for NaN, so this check also rejects NaN.
     if len(numbers) != valid.size or not all(type(n) in (int, float) and valid.low <= n <= valid.high for n in numbers):
         count = "1 number" if valid.size == 1 else f"{valid.size} numbers"
         valid_range = f"from {valid.low:.6g} to {valid.high:.6g} ({valid.unit})"

@@ -34,7 +34,7 @@ class TransmitDenied(Exception):  # noqa: N818
 
 
 class HalDuplicate(BusError):  # noqa: N818
-    """Error of a second HAL that is active on the same bus."""
+    """Error of a HAL that starts while another HAL is active on the same bus."""
 
 
 class FrameTap(Protocol):
@@ -119,7 +119,7 @@ class Transceiver:
         return Outgoing(frames)
 
     def send(self, batch: Outgoing) -> None:
-        """Send a batch; frames that the bus rejects are dropped, and `faults` reports it.
+        """Send a batch. Frames that the bus rejects are dropped, and `faults` reports the loss.
 
         Args:
             batch: Batch that `grant` returned.
@@ -188,7 +188,7 @@ class Transceiver:
                 self._find(Dtc.FRAME_UNKNOWN, True, can_id, f"id 0x{can_id:X} is not a message to this HAL")
 
     def listen(self, seconds: float = LISTEN) -> None:
-        """Before this HAL sends its first frame, check that no other HAL sends on the bus.
+        """Check that no other HAL sends on the bus. Call this before the first frame of this HAL is sent.
 
         All frames received meanwhile are dropped.
 
@@ -209,7 +209,7 @@ class Transceiver:
                 )
 
     def discard(self) -> None:
-        """Drop all queued frames: after a gap they are answers to old SYNCs."""
+        """Drop all queued frames, because after a gap between cycles they answer old SYNCs."""
         try:
             for _ in range(RECEIVE_BUDGET):
                 if self.bus.receive(self.scratch) < RECEIVE_BUDGET:

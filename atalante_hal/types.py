@@ -79,7 +79,7 @@ class Controller(Protocol):
 
     @property
     def telemetry(self) -> Vector:
-        """Return the values to record. It is the same array in every cycle, and `update` overwrites it."""
+        """Return the controller's values to record. The array is the same in every cycle, and `update` overwrites it."""
 
     @property
     def telemetry_fields(self) -> Sequence[tuple[str, int]]:

@@ -49,7 +49,7 @@ class Bus(Protocol):
 
     @property
     def name(self) -> str:
-        """Return the name of the channel for messages to the user."""
+        """Return the name of the channel, as it is shown in messages to the user."""
         ...
 
     @property

@@ -1,4 +1,4 @@
-"""Facts about the interfaces of python-can: CAN FD, driver, channel, bit timing, and what was tried.
+"""Facts about the interfaces of python-can: CAN FD support, driver, channel, bit timing, and whether each was tried.
 
     interface -> Adapter -> refusal, for the commands, `PythonCanBus` and `atalante doctor` alike
 
@@ -25,7 +25,7 @@ SEGMENTS: Final = (
     ("data_tseg2", "4"),
     ("data_sjw", "4"),
 )
-#: The same bit rates for backends that choose the segments themselves.
+#: Entries for the same bit rates, for backends that calculate the bit segments themselves.
 BIT_RATES: Final = (("bitrate", "1000000"), ("data_bitrate", "5000000"))
 #: Source of most facts.
 SOURCES: Final = "sources of python-can 4.6.1"
@@ -48,7 +48,7 @@ class Adapter:
         reports_can_fd: Whether `can.BusABC.protocol` of the open bus is CAN FD. If not, `PythonCanBus` relies on `can_fd`.
         unusable: Reason why a HAL and a robot in two processes cannot use the interface. Empty: they can.
         note: What else an operator must know.
-        tried: What was tried with this project.
+        tried: Test that was run on this interface with this project.
         source: Where the facts come from.
     """
 
@@ -249,7 +249,7 @@ def refusal(interface: str, *, one_process: bool = False) -> str:
     if adapter is None:
         import can
 
-        if interface in can.VALID_INTERFACES:  # an interface of a plug-in: the open bus reports its protocol
+        if interface in can.VALID_INTERFACES:  # for a plug-in, only the open bus reports whether it has CAN FD
             return ""
         known = ", ".join(sorted(can.VALID_INTERFACES))
         return f"there is no CAN interface {interface!r}; use one of {known}"

@@ -22,13 +22,13 @@ from atalante_hal.wire.frame import (
     as_words,
 )
 
-#: Largest number of cached arrays, and of cached header patterns; a HAL or an emulator uses about five.
+#: Largest number of cached arrays. It is also the limit for header patterns. A HAL or an emulator uses about five.
 REMEMBERED = 64
 CLASSIC_LENGTHS = tuple(range(9))
 
 
 class Batch(NamedTuple):
-    """Array of frames and the views that a bus copies from or to."""
+    """Array of frames, with a view of its bytes and a view of its header words."""
 
     frames: Frames
     memory: memoryview  # bytes of the array, length 72 n
@@ -36,14 +36,14 @@ class Batch(NamedTuple):
 
 
 class Batches:
-    """Cache of the arrays that were passed to one bus, and their views."""
+    """Cache of the arrays that were passed to one bus, each with its views."""
 
     def __init__(self) -> None:
         self._batches: list[Batch] = []
         self._legal: set[bytes] = set()
 
     def to_fill(self, frames: Frames) -> memoryview:
-        """Return the bytes of an array to receive into.
+        """Return the bytes of a receive buffer, into which the bus writes the received frames.
 
         Args:
             frames: Receive buffer, shape (n,).
@@ -79,7 +79,7 @@ class Batches:
         return memory, headers
 
     def _batch_of(self, frames: Frames) -> Batch:
-        """Return the views of this array object, cached for the next call."""
+        """Return the cached views of this array object, or create and cache them."""
         for batch in self._batches:
             if batch.frames is frames:
                 return batch

@@ -27,7 +27,7 @@ class Share(NamedTuple):
 
     link: Bus
     indices: list[int]  # indices of these frames in the batch
-    frames: Frames  # reused for each batch, because a bus caches memory views
+    frames: Frames  # always the same array, because a bus caches memory views of it
 
 
 class JoinedBus:
@@ -60,7 +60,7 @@ class JoinedBus:
         self._capacity = capacity
         self._batches = Batches()
         self._shares: dict[bytes, list[Share]] = {}
-        self._tails: list[list[Frames]] = []  # slices `frames[i:]` for all i, of each receive buffer
+        self._tails: list[list[Frames]] = []  # for each receive buffer: its slices `frames[i:]` for all i
         self._turn = (
             0  # index of the channel that is read first; rotates, because a busy channel could block the others
         )

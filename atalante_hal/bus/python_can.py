@@ -127,7 +127,7 @@ class PythonCanBus:
             lost: tuple[type[Exception], ...] = (*self._link_errors, ValueError)
             try:
                 self._bus.shutdown()
-            except lost:  # remote cannot shut a lost connection down: ValueError
+            except lost:  # the backend `remote` raises ValueError if its connection was lost
                 can.BusABC.shutdown(self._bus)
 
     def _require_open(self) -> None:
@@ -194,7 +194,7 @@ def pack(message: can.Message, memory: memoryview, offset: int) -> bool:
 
 
 def _link_errors(interface: str) -> tuple[type[Exception], ...]:
-    """Return the exceptions of an open bus that mean a lost link."""
+    """Return the exceptions that an open bus raises when its link is lost."""
     if interface != "remote":
         return (can.CanError, OSError)
     from can_remote.websocket import WebsocketClosed

@@ -29,18 +29,18 @@ from atalante_hal.bus.batch import Batches
 from atalante_hal.memory import anonymous_file
 from atalante_hal.wire.frame import FRAME_BYTES, Frames
 
-#: Counters in the header of each end: frames sent, frames received, steps requested, steps completed.
+#: Indices of the counters of each end: frames sent, frames received, calls of `step` requested, calls of `step` completed.
 _SENT, _RECEIVED, _REQUESTED, _COMPLETED = range(4)
-#: Flags in the header of each end: it serves steps, it sleeps, it is closed.
+#: Indices of the flags of each end: it is in `serve`, it sleeps, it is closed.
 _SERVING, _SLEEPING, _CLOSED = range(4, 7)
 #: Number of 64-bit header words of each end: one cache line.
 _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
 #: Time for which a waiting end polls before it sleeps [s]. It is longer than the computing time of a cycle.
 _POLL_TIME = 500e-6
-#: After a wait in which polling received nothing, this number of waits do not poll. This saves computing time.
+#: Number of waits that sleep without polling, after a wait in which polling found nothing. This saves computing time.
 _WAITS_WITHOUT_POLLING = 32
-#: Longest sleep before the shared memory is read again [ms]. A new value may become visible only after its wake-up byte.
+#: Longest sleep [ms]. Then the shared memory is read again, because a new value may become visible after its wake-up byte.
 _SLEEP = 20
 _WAKE_UP = b"\0"
 _REASON_BYTES = 4096
@@ -225,12 +225,12 @@ class SharedBus:
         self._own[_REQUESTED] = requested = self._own[_REQUESTED] + 1
         if peers[_SLEEPING]:
             self._wake_peer()
-        # The server publishes the frames of a step before it marks the step as completed.
+        # The server publishes the frames of a step before it marks the step as completed, so no frame is missed here.
         self._until(lambda: peers[_SENT] != received or peers[_COMPLETED] == requested, self.patience)
         return peers[_SENT] != received
 
     def _wait(self, timeout: float) -> bool:
-        """Wait for frames for at most `timeout` [s] and return whether any arrived. A server does not wait."""
+        """Wait up to `timeout` [s] for frames and return whether any arrived. The end that runs `serve` does not wait."""
         peers, received = self._peers, self._received
         return timeout > 0.0 and not self._own[_SERVING] and self._until(lambda: peers[_SENT] != received, timeout)
 

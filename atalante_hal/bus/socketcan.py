@@ -224,7 +224,7 @@ class SocketCanBus:
         self._socket.close()
 
     def _wait(self, room: int, timeout: float) -> int:
-        """Wait until a frame arrives, then receive.
+        """Wait until a frame arrives, then receive the queued frames.
 
         Args:
             room: Largest number of frames to receive.

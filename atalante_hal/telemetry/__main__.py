@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _INSTALL = "install it with `pip install 'atalante-hal[telemetry]'`"
 
 
-#: Time limit for closing the Zenoh session [s]. SIGALRM then ends the process. The files are already closed at that time.
+#: Time limit for closing the Zenoh session [s]. If it is exceeded, SIGALRM ends the process; the files are already closed.
 _SESSION_END = 1.0
 
 

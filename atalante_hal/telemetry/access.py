@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-#: Keys of a telemetry file whose values are texts, and keys whose values are paths relative to the file.
+#: Keys of a telemetry file. The values of the first group are texts; those of the second are paths relative to that file.
 _TEXTS, _FILES = ("robot", "listen"), ("certificate", "private_key", "client_ca", "users")
 
 
-#: Valid protocols of an endpoint with a certificate, and of an endpoint without. The first protocol is the default.
+#: Valid protocols of an endpoint with a TLS certificate and of an endpoint without one. The first of each group is the default.
 _PROTECTED, _UNPROTECTED = ("tls", "quic"), ("tcp",)
 #: Valid endpoint: protocol, host, port. Zenoh's suffixes `?` and `#` are rejected, because they override TLS settings.
 _ENDPOINT = re.compile(r"(?P<protocol>[^/]+)/(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):(?P<port>[0-9]{1,5})", re.ASCII)

@@ -21,7 +21,7 @@ from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_E
 
 #: File formats of python-can that store CAN FD frames completely.
 FORMATS = (".log", ".asc", ".blf", ".log.gz", ".asc.gz")
-#: Channel of frames whose identifier is not in the DBC.
+#: Name of the channel in the log for frames with an identifier that is not in the DBC.
 FOREIGN = "foreign"
 
 
@@ -130,6 +130,6 @@ class CanLog(Closing):
 
     def _failed(self, error: OSError) -> SinkError:
         self._open = False
-        with contextlib.suppress(OSError):  # writing the buffered frames fails, too
+        with contextlib.suppress(OSError):  # `stop` writes the buffered frames, which can fail again
             self._logger.stop()
         return SinkError(f"the CAN log {self.path} stopped: {error.strerror}", "RECORD_STOPPED")

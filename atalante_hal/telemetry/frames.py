@@ -32,7 +32,7 @@ Stamps = npt.NDArray[np.int64]
 
 
 class RingTap:
-    """`transceiver.FrameTap` that writes every frame the HAL sends or receives to a ring.
+    """Frame tap (`transceiver.FrameTap`) that copies each sent and each received frame of the HAL to a ring.
 
     Args:
         ring: Ring of `FRAME_RECORD` records.
@@ -53,7 +53,7 @@ class RingTap:
         self._used = 0
 
     def begin_run(self, base_ns: int) -> None:
-        """Set the time to which the stamps of all following frames are relative.
+        """Set the time base of all following frames. Their stamps are relative to it.
 
         Args:
             base_ns: Time of stamp 0 [ns]: 0 on the wall clock, the start of the run in virtual time.

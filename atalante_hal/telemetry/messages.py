@@ -19,7 +19,7 @@ from atalante_hal.telemetry.schema import message_class
 
 #: Assisted joints (sagittal hip and knee of the swing leg) in left stance and in right stance.
 ASSISTED = (("right_SH", "right_SK"), ("left_SH", "left_SK"))
-#: Field of the message `Guide` -> name of the controller's field.
+#: Field of the message `Guide` -> name of the controller's field in the record.
 _GUIDE_FIELDS = {"error": "error", "bound": "q_bound", "h": "h", "lambda": "lambda", "desired_position": "q_des"}
 _GUIDE_OTHERS = ("filter_active", "step", "phase", "stance")
 
@@ -45,7 +45,7 @@ class Stream:
 
 
 class Encoder:
-    """Encoder of all messages from records with a given layout.
+    """Encoder that converts records with a given layout to the messages of all streams.
 
     Args:
         layout: Layout of the records.
@@ -54,7 +54,7 @@ class Encoder:
 
     def __init__(self, layout: Layout, diagnostics: Sequence[str] = ()) -> None:
         self.cycle_at, self.time_at = layout["cycle"].start, layout["time"].start
-        #: Streams for which the layout has all fields.
+        #: Streams that can be encoded, because the layout has all their fields.
         self.streams = _streams(layout, diagnostics)
         self.window = LoopWindow(layout)
 
@@ -66,7 +66,7 @@ class Encoder:
     def sample(
         self, record: npt.NDArray[np.float64], cycle: int, start_ns: int, run: int = 0, run_name: str = ""
     ) -> Sample:
-        """Create the sample of a record.
+        """Create a `Sample` from the record of one cycle.
 
         Args:
             record: Values of the record, shape (layout.size,).
@@ -268,7 +268,7 @@ class LoopWindow:
         self._cycles, self._cost_sum, self._cost_max, self._lateness_max = 0, 0.0, 0.0, 0.0
 
     def add(self, records: npt.NDArray[np.float64]) -> None:
-        """Add the records of consecutive cycles.
+        """Add the records of consecutive cycles to the statistics.
 
         Args:
             records: Values of the records, shape (n, layout.size).
@@ -280,7 +280,7 @@ class LoopWindow:
             self._lateness_max = max(self._lateness_max, float(records[:, self._lateness].max()))
 
     def encode(self, sample: Sample, lost: int) -> bytes:
-        """Encode the message for the cycles up to a sample, and begin the next window.
+        """Encode the statistics of the cycles up to a sample as a message, then reset the statistics.
 
         Args:
             sample: Last sample of the window; its counters are copied to the message.
@@ -302,7 +302,7 @@ class LoopWindow:
 
 
 def _named(repeated: Any, names: Sequence[str]) -> list[Any]:
-    """Add one sub-message for each name and return them."""
+    """Add one sub-message for each name to a repeated field, and return the sub-messages."""
     for name in names:
         repeated.add(name=name)
     return list(repeated)

@@ -140,7 +140,7 @@ class TelemetrySummary:
     published: int = 0  # messages
     recorded: int = 0  # messages
     frames_logged: int = 0
-    can_log_complete: bool = True  # False if a CAN log was requested, but is not one closed file with every frame
+    can_log_complete: bool = True  # False if a requested CAN log lacks frames, has several files or was not closed
     lost: int = 0  # cycles that telemetry lost
     frames_lost: int = 0  # lost records of the CAN frame ring; a cycle adds about one record
     restarts: int = 0  # restarts of the subprocess after it ended or hung
@@ -229,7 +229,7 @@ class TelemetryProcess(Closing):
                 self.notices = self._launch(self.config, timeout)
             else:
                 self._start_in_background(timeout)
-        except BaseException:  # includes KeyboardInterrupt during the wait
+        except BaseException:  # BaseException includes a KeyboardInterrupt during the wait
             self.close(0.0)
             raise
 
@@ -322,7 +322,7 @@ class TelemetryProcess(Closing):
         self._faults.append(text)
         self.event(cycle, "TELEMETRY_DOWN", text, "error", "TELEMETRY", self._restarts)
         if restart:
-            # In a thread, because a restart takes longer than a cycle.
+            # The restart runs in a thread, because it takes longer than a cycle.
             self._restarting = threading.Thread(target=self._restart, daemon=True)
             self._restarting.start()
 

@@ -110,7 +110,7 @@ class Recorder(Closing):
         self.saved, self.finished = self.messages, True
 
     def _failed(self, error: OSError) -> SinkError:
-        with contextlib.suppress(OSError):  # writing the buffered data fails, too
+        with contextlib.suppress(OSError):  # `close` writes the buffered data, which can fail again
             self._file.close()
         return SinkError(f"the recording {self.path} stopped: {error.strerror}", "RECORD_STOPPED")
 

@@ -41,7 +41,7 @@ _READ, _LOST, _READER_PID, _KEPT = range(16, 20)
 _HEADER_BYTES = 256
 
 _WRITER_BYTE, _READER_BYTE = 0, 1  # offsets of the bytes that writer and reader lock
-_LOCK_TRIES = 50  # attempts to lock a byte, because the other end may lock it for some microseconds in `_held`
+_LOCK_TRIES = 50  # attempts to lock a byte; the other end may lock the same byte for some microseconds in `_held`
 
 _WAIT = 0.0002  # s, polling period
 NOTES_BYTES = 1 << 16
@@ -261,7 +261,7 @@ class RingWriter(_Ring, Closing):
         self._header[_CLOSED] = 1
 
     def close(self) -> None:
-        """Mark the ring as closed and release the memory. The kernel frees it when the reader has also released it."""
+        """Mark the ring as closed and release the memory. The kernel frees the memory when the reader has also released it."""
         if not self._map.closed:
             self.finish()
             self._release()

@@ -76,7 +76,7 @@ class Service:
         self._lost, self._lost_reported = 0, -math.inf
         self._recorder, self._saved = recorder, 0  # recorder, and its number of saved messages at the last check
         self._handled = 0  # number of records whose messages have been passed to all sinks
-        self._kept = 0  # number of records that the ring counts as saved
+        self._kept = 0  # number of records reported as saved so far in the header of the ring
         self.notices: list[str] = []  # faults, one sentence each
 
     def run(self, stop: Sequence[object]) -> None:
@@ -104,8 +104,8 @@ class Service:
             self._mark_saved()
 
     def step(self) -> bool:
-        """Process the contents of the rings and return whether there were any."""
-        # Read the events before the notes. They are written in the opposite order, so the run of each event is known here.
+        """Process the new contents of the rings, and return whether a ring had any."""
+        # Read the events before the notes. The note of a run is written before its events, so the run of each event is known.
         events = [unpack(bytes(event)) for event in self._events.read()]
         records = self._records.read()
         first = self._records.position - len(records)
@@ -168,7 +168,7 @@ class Service:
         self._timestamp = self._run_of(first + len(records) - 1).start_ns + round(records[-1, encoder.time_at] * 1e9)
 
     def _handle_frames(self, records: npt.NDArray[np.uint8]) -> bool:
-        """Write records of the frame ring to the CAN log and return whether there were any."""
+        """Write records of the frame ring to the CAN log, and return whether any record was given."""
         if self._can_log is None or not len(records):
             return False
         try:
@@ -192,7 +192,7 @@ class Service:
             self._mark_saved()
 
     def _mark_saved(self) -> None:
-        """Count the records processed so far as saved, in the header of the ring."""
+        """Report in the header of the ring that all records processed so far are saved."""
         self._records.keep(self._handled - self._kept)
         self._kept = self._handled
 
