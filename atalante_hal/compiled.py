@@ -81,7 +81,7 @@ def _compiled(function: FunctionType) -> Any:
 
 
 def _twin(function: FunctionType) -> FunctionType:
-    """Return a copy of the function in which each called function is compiled."""
+    """Return a copy of the function that calls the compiled form of each called function."""
     names = {name: value for name, value in function.__globals__.items() if name != function.__name__}
     for name, callee in _callees(function):
         names[name] = _callee(callee)
@@ -92,7 +92,7 @@ def _twin(function: FunctionType) -> FunctionType:
 
 @cache
 def _callee(function: FunctionType) -> Any:
-    """Compile a called function once for all its callers."""
+    """Return the compiled form of a called function. It is compiled once for all its callers."""
     import numba
 
     return numba.njit(boundscheck=True)(_twin(function))

@@ -86,14 +86,14 @@ class Hal:
             self._plausibility,
             self._limiter,
         )
-        #: Events so far. Each diagnostic and each state change is logged once, when it begins.
+        #: Log of events: one event at the beginning of each diagnostic and at each change of the supervisor state.
         self.events = self._safety_monitor.memory.events
 
     # -- construction ------------------------------------------------------------------------------------------------
 
     def _build_images(self, controller_fields: Sequence[tuple[str, int]], assistance_factor: float) -> None:
         received = self.network.received_by("HAL")
-        # The rows have the order in which the buses deliver the messages, see `ReceiveImage.accept`.
+        # The rows are in the order in which the buses deliver the messages. The fast path of `ReceiveImage.accept` requires it.
         fast = [m for bus in self.network.buses for m in received if m.bus == bus and m.cycle_ms == 1]
         #: Message of each entry of `State.valid` and `State.age`.
         self.messages = tuple(m.name for m in fast)
@@ -244,7 +244,7 @@ class Hal:
         return self._commands.send_prepared_hold(self.state.cycle)
 
     def report(self, dtc: Dtc, text: str, *, confirmed: bool = True, value: float = 0.0) -> None:
-        """Report a timing fault at the start of a cycle; the following `read` evaluates it.
+        """Report a timing fault that the loop found at the start of a cycle. The following `read` evaluates the fault.
 
         Args:
             dtc: Diagnostic to raise.

@@ -25,7 +25,7 @@ class Reaction(IntEnum):
 
 
 class Severity(StrEnum):
-    """Severity of a confirmed diagnostic; the values are the names in `events.SEVERITIES`."""
+    """Severity of a confirmed diagnostic. The values are the strings in `events.SEVERITIES`."""
 
     INFO = "info"
     WARNING = "warning"
@@ -53,7 +53,7 @@ class Dtc(StrEnum):
         member.bit = 1 << len(cls.__members__)
         return member
 
-    # Faults of messages. Most of them are raised by `message_monitor`.
+    # Faults of received messages, most of them raised by `message_monitor`.
     E2E_SOME_LOST = "E2E_SOME_LOST", _R.INFO, _S.INFO, "1 to 4 frames before this frame are missing"
     E2E_REPEATED = "E2E_REPEATED", _R.INFO, _S.INFO, "a frame was received twice"
     E2E_SEQUENCE = "E2E_SEQUENCE", _R.HOLD, _S.ERROR, "the counter jumped: an old frame, or more than 4 frames lost"
@@ -129,7 +129,7 @@ class Finding:
     node: str  # DBC name of the affected node
     value: float  # measured value; quantity and unit depend on the code
     confirmed: bool  # True: confirmed, its reaction follows; False: pending, no reaction yet
-    text: str  # one sentence for the operator; if empty, node name and meaning of the code are used
+    text: str  # one sentence for the operator; empty: node name and meaning of the code
 
 
 def number_of(bits: int) -> int:
@@ -168,7 +168,7 @@ def dtcs_of(bits: int) -> tuple[Dtc, ...]:
     return tuple(dtc for dtc in Dtc if bits & dtc.bit)
 
 
-#: Emergency error codes (CiA 301, CiA 402-1) that map to a specific diagnostic.
+#: Emergency error code (CiA 301, CiA 402-1) -> diagnostic, for the codes that have a specific diagnostic.
 _EMERGENCIES = {
     0x3120: Dtc.UNDER_VOLTAGE,  # mains too low
     0x3220: Dtc.UNDER_VOLTAGE,  # DC link too low
@@ -179,7 +179,7 @@ _EMERGENCIES = {
     0x8250: Dtc.CMD_TIMEOUT,  # RPDO timeout
     0x8700: Dtc.SYNC_LOST,  # SYNC controller
 }
-#: Diagnostics of all other emergency error codes, by the highest hexadecimal digit.
+#: Highest hexadecimal digit of any other emergency error code -> its diagnostic.
 _EMERGENCY_CLASSES = {
     0x2: Dtc.EMCY_CURRENT,
     0x3: Dtc.EMCY_VOLTAGE,

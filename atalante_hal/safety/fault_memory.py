@@ -42,7 +42,7 @@ class EventLog:
         self.count += 1
 
     def since(self, number: int) -> list[Event]:
-        """Return the logged events from a given event number on, oldest first.
+        """Return the logged events whose number is at least the given number, oldest first.
 
         Args:
             number: number of the first event to return, such as an earlier `count`.
@@ -89,7 +89,7 @@ class FaultMemory:
         #: Logged events, in order of time.
         self.events = EventLog()
         self.active: dict[tuple[Dtc, str], Entry] = {}
-        #: Bit set of the pending and confirmed codes, at the last `close_cycle`, see `diagnostics.dtcs_of`.
+        #: Bit set of all pending and confirmed codes, as updated by the last `close_cycle`, see `diagnostics.dtcs_of`.
         self.bits = 0
         self.confirmed: frozenset[Dtc] = frozenset()
         self._logged_at: dict[tuple[Dtc, str, bool], int] = {}

@@ -21,7 +21,7 @@ from atalante_hal.wire.e2e import FULL, Check, suspect
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: NMT states (CiA 301) of a node that has just started, and of a node in normal operation.
+#: Values of NodeState (NMT states, CiA 301): the node has just started; the node is in normal operation.
 BOOT_UP, OPERATIONAL = 0, 5
 #: Largest `Check` result of a frame with new data. It is a plain integer, because numpy compares integers ten times faster.
 _FRESH = int(Check.SOME_LOST)
@@ -29,12 +29,12 @@ _FRESH = int(Check.SOME_LOST)
 
 class _Status(NamedTuple):
     node: str
-    drive: bool  # True if the node is powered by the motor supply
+    drive: bool  # True if the node is a drive, which the motor supply powers
     row: int  # row of the status message in the process image
     timeout: int  # timeout of the status message [cycles]
     state: int  # index of NodeState in the values of the process image
-    dbc_hash: int  # index of DbcHash in the same values
-    supply: int  # index of SupplyVoltage in the same values
+    dbc_hash: int  # index of DbcHash in the values of the process image
+    supply: int  # index of SupplyVoltage in the values of the process image
 
 
 class Heartbeats:
@@ -145,7 +145,7 @@ class Heartbeats:
             self._judge_status(cycle, memory, status)
 
     def overdue(self, cycle: int) -> bool:
-        """Return whether a status message timed out. Call this periodically: without a fault `judge` is not called."""
+        """Return whether a status message timed out. Call this periodically, because a lost message causes no call of `judge`."""
         self._age(cycle)
         ages = self.image.age[self._status_rows]
         return bool(((ages >= self._timeouts) & (ages < NEVER)).any())
@@ -208,7 +208,7 @@ class Heartbeats:
             self._heard.add(status.node)
             self.known = self._heard.issuperset(self._needed)
             if self.known:
-                self.quiet = False  # the robot may become READY now
+                self.quiet = False  # all required nodes are known, so the safety monitor must evaluate this cycle
         elif values[status.state] != OPERATIONAL:
             self._reset.add(status.node)
 

@@ -44,7 +44,7 @@ from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import Vector
 
 _COUNT = len(JOINTS)
-#: Results of `limit`: torque unchanged, torque of at least one joint cut, input not finite.
+#: Results of `limit`: all torques unchanged, torque of at least one joint reduced, an input not finite.
 _AS_ASKED, _CUT, _NOT_FINITE = range(3)
 
 
@@ -188,7 +188,7 @@ def limit(
 
 
 def share(beyond: float) -> float:
-    """Return S(x), the fraction of the torque limit that remains outside a position or velocity limit.
+    """Return S(x), the allowed fraction of the torque limit when a joint is outside a position or velocity limit.
 
     Args:
         beyond: distance outside the limit as a fraction of the margin; negative inside the limit.

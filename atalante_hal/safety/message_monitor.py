@@ -53,7 +53,7 @@ _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
 #: Check results of rejected frames that have the correct format and CRC.
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)
 _FRESH = int(Check.SOME_LOST)
-#: The robot goes to HOLD when the data of a swing leg joint is this many timeouts old.
+#: The robot goes to HOLD when the age of the data of a swing leg joint reaches this multiple of the message timeout.
 SWING_TIMEOUTS = 2
 
 
@@ -83,7 +83,7 @@ class MessageMonitor:
         #: True for each row with new, intact, trusted and plausible data, shape (rows,).
         self.valid: npt.NDArray[np.bool_] = np.zeros(len(messages), np.bool_)
         self.joints_valid = False
-        #: True if all rows are trusted and all buckets are empty. A cycle with new data in all rows then changes nothing here.
+        #: True if all rows are trusted and all leaky buckets are empty. Then a cycle with new data in all rows changes no result.
         self.settled = False
 
     @property
@@ -100,7 +100,7 @@ class MessageMonitor:
         return bool(self._image.age[row] < self._timeouts[row])
 
     def judge(self, cycle: int, memory: FaultMemory, swing: int | None = None) -> None:
-        """Check all rows in one cycle. A cycle with new data in all rows need not be checked while `settled` is True.
+        """Check all rows in one cycle. While `settled` is True, the call may be omitted in a cycle with new data in all rows.
 
         Args:
             cycle: number of the current cycle.

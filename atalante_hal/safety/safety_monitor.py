@@ -100,7 +100,7 @@ class SafetyMonitor:
         self.start_wanted = 0
         self.enabling = False
         self.lowered: set[str] = set()
-        #: True if `judge` may skip a cycle with fresh data, no fault, and the same pendant and drive values as before.
+        #: True if `judge` may skip cycles with new data and no fault in which the pendant and drive values have not changed.
         self._steady = False
         self._reports: list[Finding] = []  # faults that loop and controller reported since the last `judge`
         self._acknowledged = False  # True if START was pressed in this cycle
@@ -171,7 +171,7 @@ class SafetyMonitor:
         self._ending, self._steady = True, False
 
     def look_for_heartbeats(self) -> None:
-        """Check for status messages that timed out. Call this periodically, because cycles without a fault are not evaluated."""
+        """Check whether a status message timed out. Call this periodically, because cycles without a fault are not evaluated."""
         if self._heartbeats.overdue(self._state.cycle):
             self._steady = False
 
@@ -315,7 +315,7 @@ class SafetyMonitor:
     def _enter(self, before: SupervisorState, after: SupervisorState, reasons: frozenset[Dtc]) -> None:
         state, memory = self._state, self.memory
         state.supervisor = after
-        # One START changes the state only once.
+        # Clear the START request, because one START may change the state only once.
         self.start_wanted = 0
         self._pendant.forget_press()
         self.moving = after in MOVING
@@ -324,7 +324,7 @@ class SafetyMonitor:
             memory.raise_dtc(state.cycle, Dtc.OPERATOR_STOP, "PENDANT", text=text)
         if reasons:
             self.reason = memory.text_of(reasons) or self.reason
-        elif before is not _S.FINISH_STEP:  # HOLD keeps the reason of FINISH_STEP
+        elif before is not _S.FINISH_STEP:  # after FINISH_STEP, HOLD has the same reason
             self.reason = entry_text(after, self.missing())
         if after is _S.ACTIVE and before not in MOVING and not self.enabling:
             self._limiter.restart(state.torque)

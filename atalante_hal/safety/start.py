@@ -20,7 +20,7 @@ from atalante_hal.wire.cia402 import DriveState
 
 #: Time from START within which all drives must reach OPERATION ENABLED [cycles].
 ENABLE_CYCLES = 200
-#: Prefix of the text of a refused START.
+#: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
 _S = SupervisorState
 #: States in which START only acknowledges faults. An acknowledged fault may take some cycles to clear.
@@ -55,7 +55,7 @@ class StartRequest(NamedTuple):
     dead_man: bool  # True if the dead-man is pressed and the pendant has not timed out
     diagnostic: str  # text of the worst confirmed diagnostic that demands a reaction; empty: none
     nodes_well: bool  # True if every required node is trusted and has sent its status
-    missing: Collection[str]  # DBC names of the nodes that are not well
+    missing: Collection[str]  # DBC names of the nodes that prevent `nodes_well`
     drive_state: Vector  # (12,) values of `DriveState`
     torque: Vector  # (12,) Nm, torque reported by each drive
 

@@ -23,7 +23,7 @@ class Conditions:
     dead_man: bool = False  # the pendant has not timed out and its dead-man is pressed
     stop_requested: bool = False  # the operator requested STOP or HOLD, or the program is ending
     start_wanted: bool = False  # START was pressed and the drives are being enabled
-    step_finished: bool = False  # the walking step has ended, there is none, or the time limit is over
+    step_finished: bool = False  # the walking step has ended, the robot does not walk, or FINISH_STEP took too long
 
 
 _OFF, _READY, _ACTIVE = SupervisorState.OFF, SupervisorState.READY, SupervisorState.ACTIVE
@@ -32,7 +32,7 @@ _HOLD, _LOWER, _FAULT = SupervisorState.HOLD, SupervisorState.LOWER, SupervisorS
 
 #: States in which the HAL sends the controller's torques to the drives.
 MOVING = frozenset({_ACTIVE, _FULL_ASSIST, _FINISH_STEP})
-#: Reaction -> state that it demands of a moving robot. `_move` ignores it if it is better than the present state.
+#: Reaction -> state that it demands of a moving robot. A reaction alone never changes the state to a better one.
 _STATE_OF = {
     Reaction.INFO: _ACTIVE,
     Reaction.NOT_READY: _ACTIVE,
@@ -90,4 +90,4 @@ def _move(state: SupervisorState, reaction: Reaction, facts: Conditions) -> Supe
         return _LOWER if state is not _FAULT or acknowledged else _FAULT
     if state is _HOLD:
         return _ACTIVE if may_start else _HOLD
-    return _HOLD if acknowledged else state  # the state is LOWER or FAULT, and its cause has cleared
+    return _HOLD if acknowledged else state  # here the state is LOWER or FAULT, and no diagnostic demands it any longer

@@ -19,11 +19,11 @@ from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, WORDS, Frames, new_frame
 
 Words = npt.NDArray[np.int64]
 
-#: Rows of the decoding plan: word, shift, mask, largest code, lowest and highest code of the range, invalid code.
+#: Row indices of the decoding plan: word, shift, mask, largest code, lowest and highest code of the range, invalid code.
 WORD, SHIFT, MASK, LARGEST, LOW, HIGH, INVALID = range(7)
-#: Rows of the scales, as in the equation: value = (code + base) * factor + offset.
+#: Row indices of the scales. They are used as in: value = (code + base) * factor + offset.
 BASE, FACTOR, OFFSET = range(3)
-#: Entry of the plan for a signal without an invalid code; also the result of `encode` without an error.
+#: Value in the row INVALID of the plan for a signal without an invalid code; also the result of `encode` if there was no error.
 NO_CODE = -1
 #: Results of `read_row`: all signals in range, a signal out of range, a signal with its invalid code.
 INSIDE, OUTSIDE, SAYS_INVALID = range(3)
@@ -44,7 +44,7 @@ class SignalTable(NamedTuple):
     codes: Words  # (size,) raw codes of the last decoding or encoding
     words: Words  # (n,) indices of the 64-bit words that contain a signal
     by_row: Words  # (size,) signal indices, sorted by row
-    row_begins: Words  # (rows + 1,) begin of each row in `by_row`
+    row_begins: Words  # (rows + 1,) index in `by_row` of the first signal of each row, then size
 
 
 def group_of(signal: str) -> str:
@@ -88,7 +88,7 @@ class Codec:
             mask, largest = (1 << s.length) - 1, (1 << s.length - s.signed) - 1
             invalid = NO_CODE if s.invalid_raw is None else s.invalid_raw
             plan.append((row * WORDS + 1 + s.start // 64, s.start % 64, mask, largest, low, high, invalid))
-            # If the offset is a whole number of codes, it is added to the code, because integer addition is exact.
+            # If the offset is a multiple of the factor, it is added to the code as an integer, because integer addition is exact.
             code = s.offset / s.factor
             exact = code == round(code) and round(code) * s.factor == s.offset
             scales.append((code, s.factor, 0.0) if exact else (0.0, s.factor, s.offset))
@@ -193,7 +193,7 @@ class Codec:
 
 
 def decode(words: Words, table: SignalTable, values: Vector) -> bool:
-    """Decode raw codes and physical values of all signals.
+    """Decode all signals to raw codes and to physical values.
 
     Args:
         words: frames as a flat array of 64-bit words, shape (rows * 9,).

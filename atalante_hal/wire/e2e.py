@@ -87,7 +87,7 @@ def protected_spans(messages: Sequence[Message]) -> Words:
 
 
 def checksum(octets: Octets, begin: int, end: int, data_id: int) -> int:
-    """Return the CRC of a payload. This variant of `crc` can be compiled.
+    """Return the CRC of a payload. This is the variant of `crc` for compiled code.
 
     Args:
         octets: frames as a flat array of bytes.
@@ -145,7 +145,7 @@ _OK, _SOME_LOST, _REPEATED, _WRONG_SEQUENCE = map(
 
 
 def judge_counter(expected: int, received: int) -> int:
-    """Check an alive counter. This variant of `check_counter` can be compiled.
+    """Check an alive counter. This is the variant of `check_counter` for compiled code.
 
     Args:
         expected: last accepted counter plus 1, modulo 256, or `NOTHING`.
@@ -192,7 +192,7 @@ class Qualification(NamedTuple):
     trusted: bool = False
 
 
-#: Qualification that further good cycles do not change.
+#: Qualification of a trusted message with an empty leaky bucket. Further good cycles do not change it.
 SETTLED = Qualification(0, REQUALIFY, True)
 
 

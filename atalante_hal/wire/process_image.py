@@ -42,9 +42,9 @@ from atalante_hal.wire.e2e import (
 )
 from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES, WORDS, Frames, as_words, new_frames
 
-#: Marker instead of a cycle tag: each sender uses its own counter.
+#: Value of the argument `tag` if each sender uses its own counter, so that no frame carries a cycle number.
 _NO_TAG = -1
-#: Values of `Check` as plain integers. A result <= `_FRESH` means new, usable data.
+#: Values of `Check` as plain integers. A check result of at most `_FRESH` means new, usable data.
 _FRESH = _SOME_LOST = int(Check.SOME_LOST)
 _REPEATED, _CONFLICT, _WRONG_SEQUENCE = int(Check.REPEATED), int(Check.CONFLICT), int(Check.WRONG_SEQUENCE)
 _CRC, _LENGTH, _RANGE, _INVALID = int(Check.CRC), int(Check.LENGTH), int(Check.RANGE), int(Check.INVALID)
@@ -127,11 +127,11 @@ class ReceiveImage:
         self._age_before: npt.NDArray[np.int64] = self.age.copy()
         #: True if the last cycle was perfect: every row was committed with the expected frame.
         self.all_fresh = self._was_fresh = False
-        #: Frames of the last `accept_each`, with the row and `Check` of each frame.
+        #: Frames given to the last `accept_each`, with the row and `Check` of each frame.
         self._offered: tuple[Frames, Words] | None = None
         self._ordered = _Received(new_frames(count), count)
         self._received = self._ordered
-        # These first calls have no received frames, so they change nothing.
+        # Compile both functions for the types of these arguments. No frames have been received, so the calls change nothing.
         words, table = self._ordered.words, self.codec.table
         self._accept_exact = specialised(
             accept_exact, words, self._e2e, _NO_TAG, table, self.values, self.values_before
@@ -176,7 +176,7 @@ class ReceiveImage:
             found = [row_of.get(can_id, -1) for can_id in frames["can_id"][:count].tolist()]
             foreign = [place for place, row in enumerate(found) if row < 0]
             if len(foreign) == count - rows and len(set(found) - {-1}) == rows:
-                # Every message arrived once, but with other frames or in another order, due to several buses or arbitration.
+                # Every message arrived once, but not in the order of the rows, or mixed with other frames. Sort the messages.
                 self._ordered.words[:] = as_words(frames)[np.argsort(found)[count - rows :]].view(np.int64).ravel()
                 if self._accept(self._ordered, tag):
                     return foreign
@@ -272,7 +272,7 @@ class ReceiveImage:
         return foreign
 
     def beside(self, row: int) -> list[Vector]:
-        """Decode the other intact frames of a row in this cycle, except the frame committed last.
+        """Decode the intact frames of a row in this cycle, except the frame committed last.
 
         Repetitions of an accepted frame are left out. Call this method before the receive buffer is used again.
 
@@ -484,7 +484,7 @@ class TransmitImage:
         rows = len(self.codec.messages)
         self._counters: Words = np.zeros(rows, np.int64)
         self._singles = [self.frames[row : row + 1] for row in range(rows)]
-        # These first calls set every counter to 0xFF, so the first frame to be sent has counter 0.
+        # `specialised` calls both functions once. These calls leave every counter at 0xFF, so the first sent frame has counter 0.
         self._protect = specialised(protect, self._octets, self._spans, self._counters)
         self._seal = specialised(seal, self.values, self.codec.table, self._words, self._spans, self._counters, 0xFF)
 

@@ -57,7 +57,7 @@ class EncoderChecks:
         self._travel = robot.velocity_max * robot.gear * period
         self._noise = 3.0 * robot.encoder_noise * robot.gear
         self.jumps = [0] * len(JOINTS)
-        self._jump_of: dict[int, float] = {}  # size of the last jump of a joint [rad]
+        self._jump_of: dict[int, float] = {}  # joint index -> size of the last jump of its encoder [rad]
         self._lost: dict[int, Lost] = {}
         #: Joint index -> position [rad] of each joint outside its range.
         self.outside: dict[int, float] = {}
@@ -69,7 +69,7 @@ class EncoderChecks:
         )
         self._polarity = robot.polarity.tolist()
         self._period, self._every = period, every
-        # Twice the deviation of the velocity is a linear function of two consecutive samples. These are its coefficients.
+        # Coefficients of twice the velocity deviation, which is a linear function of two consecutive samples.
         time = every * period
         self._of_later, self._of_earlier = np.array([[-2.0 / time, 1.0], [2.0 / time, 1.0]])
         self._earlier = np.zeros((2, len(JOINTS)))  # position [rad] and velocity [rad/s] of the last sample
@@ -79,7 +79,7 @@ class EncoderChecks:
         self._wrong = [0] * len(JOINTS)
         self._wrong_findings: tuple[Finding, ...] = ()
         self._gear = robot.gear.tolist()
-        #: Arguments of `within_reach`: the same arrays in every call.
+        #: Arguments of the function `within_reach`. The array objects are the same in every call.
         self._positions = now.position, before.position, self._travel + self._noise, self._low, self._high
         self._within_reach = specialised(within_reach, *self._positions)
 
@@ -153,7 +153,7 @@ class EncoderChecks:
         return bool(self._wrong_findings)
 
     def _error_between(self, age: Cycles) -> tuple[Vector, list[bool]]:
-        """Return twice the deviation of each velocity from the encoder motion, and whether each joint is compared.
+        """Return twice the deviation of each velocity from the encoder motion, and for each joint whether it is compared.
 
         Args:
             age: age of the values of each joint [cycles], shape (12,).

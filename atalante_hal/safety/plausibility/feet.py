@@ -36,7 +36,7 @@ class FootChecks:
         self._force, self._forces = now.force, now.forces
         self._free, self._loaded = robot.sensors.cell_free, robot.sensors.cell_loaded
         self._every = every
-        # No cell carries load if the sum of all squared force components is at most this value [N^2].
+        # No cell carries load if the sum of the squares of all force components is at most this value [N^2].
         self._surely_free = self._free**2
         #: Index of the swing leg in FEET; None unless exactly one foot is on the ground.
         self.swing: int | None = None

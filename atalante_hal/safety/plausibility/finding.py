@@ -40,7 +40,7 @@ class Signals(NamedTuple):
 
 
 class Ages(NamedTuple):
-    """Ages of the sensor values [cycles]. An age of `NEVER` or more is too old for any check."""
+    """Ages of the sensor values [cycles]. A value with an age of at least `NEVER` is too old for any check."""
 
     joint: Cycles  # (12,)
     imu: Cycles  # (4,)

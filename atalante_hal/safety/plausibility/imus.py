@@ -36,7 +36,7 @@ class Imus:
         #: IMU index -> largest reading [rad/s or m/s2], for each saturated IMU.
         self.saturated: dict[int, float] = {}
         self._confirmed: dict[int, bool] = {}
-        #: Arguments of `usable`: the same arrays in every call.
+        #: Arguments of the function `usable`. The array objects are the same in every call.
         self._readings = now.quaternion, now.gyro, now.accel, self._norm_error, self._gyro_end, self._accel_end
         self._usable = specialised(usable, *self._readings)
 

@@ -43,7 +43,7 @@ _IMU_DRIFT = 2e-5
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 _AXES = (("FH",), ("TH",), ("SH", "SK"))
-#: Axis of the first four joints of a leg, as indices in `_AXES`.
+#: For each of the first four joints of a leg: index of its axis in `_AXES`.
 _AXIS_OF = (0, 1, 2, 2)
 _HIPS = tuple(JOINTS.index(f"{side}_FH") for side in SIDES)
 
@@ -74,7 +74,7 @@ class Legs:
         self._attitude_change, self._misalignment = robot.sensors.attitude_change, robot.sensors.misalignment
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
         self._constant_samples = [constant_samples[hip : hip + len(_AXIS_OF)] for hip in _HIPS]
-        #: For each joint: comparison of its leg at the last change of its encoder reading.
+        #: For each joint: comparison of its leg that was made when the encoder reading of the joint last changed.
         self._moved: list[_Comparison | None] = [None] * len(JOINTS)
         #: Joint index -> number of consecutive samples in which the leg turned but the encoder reading was constant.
         self._turned: dict[int, int] = {}
@@ -155,7 +155,7 @@ class Legs:
                 continue
             change = comparison.errors[axis] - moved.errors[axis]
             turned = max(abs(angle - moved.angles[i]) for i, angle in enumerate(comparison.angles))
-            # If the leg has not turned, the error changed because of a jump or drift, and not because the encoder is stuck.
+            # If the leg has not turned, its encoder is not stuck: the deviation changed because of a jump or a drift.
             allowed = self._attitude_change + self._misalignment * turned + comparison.doubt + moved.doubt
             if min(abs(change), turned) <= allowed:
                 self._turned[joint] = 0
@@ -193,7 +193,7 @@ def hip_angles(pelvis: list[float], tibia: list[float]) -> tuple[float, float, f
 
 
 def extrapolated(quaternion: list[float], gyro: list[float], time: float) -> list[float]:
-    """Extrapolate an attitude with a constant angular velocity, to first order.
+    """Extrapolate an attitude in time to first order, at constant angular velocity.
 
     Args:
         quaternion: present attitude, wxyz, sensor to world.
@@ -214,7 +214,7 @@ def extrapolated(quaternion: list[float], gyro: list[float], time: float) -> lis
 
 
 def _follow_imu_drift(moved: _Comparison, axis: int, change: float) -> _Comparison:
-    """Return a copy of `moved` in which the error of one axis is adjusted by `change`, limited to +-`_IMU_DRIFT`."""
+    """Return a copy of `moved` with `change`, limited to +-`_IMU_DRIFT`, added to the deviation of one axis."""
     errors = list(moved.errors)
     errors[axis] += max(-_IMU_DRIFT, min(_IMU_DRIFT, change))
     return moved._replace(errors=(errors[0], errors[1], errors[2]))

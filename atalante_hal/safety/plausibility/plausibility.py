@@ -62,18 +62,18 @@ class Plausibility:
         self._foot_ages = [NEVER] * len(self._rows.foot)  # age of the values of each foot at its last check [cycles]
         #: Row -> cycle in which its last good values were measured. It is updated only while `_settled` is False.
         self._measured = dict.fromkeys((*self._joint_rows, *self._imu_rows), -NEVER)
-        #: (foot, cell) -> measured force, shape (3,) [N], of each faulty cell. Its force in the process image is set to zero.
+        #: (foot, cell) -> measured force of each faulty cell, shape (3,) [N]. Its force in the process image is replaced by 0.
         self._measured_forces: dict[tuple[int, int], Vector] = {}
         self._settled = False  # True if the last values of all rows were good and new
         self._turns = self._build_turns()
         self._cycle = 0
         self.findings: tuple[Finding, ...]
-        #: Findings at the last check of all rows. All rows are checked again if the findings change.
+        #: Findings when all rows were last checked. If `findings` differs, all rows are checked again.
         self._judged: tuple[Finding, ...]
         self.findings = self._judged = ()
 
     def _build_turns(self) -> list[Callable[[Ages | None], bool] | None]:
-        """Return the slow check of each cycle in a period; None in a cycle without a slow check.
+        """Return the slow check for each cycle of the schedule period; None for a cycle without a slow check.
 
         Each check is called with the ages of the sensor values, or with None if all values are of this cycle. It returns whether
         it has findings.

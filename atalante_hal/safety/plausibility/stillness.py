@@ -1,4 +1,4 @@
-"""Standstill checks, which detect stuck encoders, and gyros or force cells without noise.
+"""Standstill checks, which detect stuck encoders, frozen gyros and frozen force cells: their readings stay exactly constant.
 
 All signals are sampled every few cycles, and consecutive samples with exactly the same value are counted. A signal is
 skipped if it was not measured again since its last sample.
@@ -27,9 +27,9 @@ from atalante_hal.safety.plausibility.finding import (
 from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Longest time to detect a stuck encoder, from the first repeated sample [cycles].
+#: Longest time from the first repeated reading of an encoder to its detection as stuck [cycles].
 STUCK_CYCLES = 50
-#: Longest time to detect a frozen gyro or force cell, from the first repeated sample [cycles].
+#: Longest time from the first repeated reading of a gyro or force cell to its detection as frozen [cycles].
 FROZEN_CYCLES = 100
 #: A joint counts as being at its end stop if it is closer than this distance to a position limit [rad].
 _AT_STOP = 0.005
@@ -51,7 +51,7 @@ class Stillness:
         where = measured(codec)
         self._values, self._now, self._age = image.values[where], now, image.age
         self._every = every
-        #: Age of the last sample of each row [cycles], shape (rows,).
+        #: Age of the values that were last sampled, for each row [cycles], shape (rows,).
         self._sampled_age: Cycles = np.full(len(image.age), 2 * NEVER)
         self._row_of = codec.row_of[where]
         size = len(self._values)
@@ -84,7 +84,7 @@ class Stillness:
         self.cells: list[tuple[int, int]] = []
 
     def sample(self, whole: bool) -> bool:
-        """Take a sample of all signals and compare it with the last sample.
+        """Take a sample of all signals and compare it with the previous sample.
 
         Args:
             whole: True if the values of all rows are of this cycle. If False, the ages in the process image are used.
@@ -113,7 +113,7 @@ class Stillness:
         return over
 
     def _newer(self) -> npt.NDArray[np.bool_]:
-        """Update the ages of the last samples, and return for each value whether it was measured after its last sample."""
+        """Return for each signal whether its value is newer than the sampled value, and update the ages of the sampled values."""
         self._sampled_age += self._every
         newer = self._age < self._sampled_age
         np.copyto(self._sampled_age, self._age, where=newer)

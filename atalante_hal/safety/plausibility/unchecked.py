@@ -20,7 +20,7 @@ from atalante_hal.safety.plausibility.finding import FOOT_NODES, JOINT_NODES, Cy
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER
 
-#: Time after which a check that cannot run counts as failed [cycles]. It is the detection time of the slowest check.
+#: Time without a check after which its diagnostic is confirmed [cycles]. It is the detection time of the slowest check.
 UNCHECKED_CYCLES = 128
 #: Number of encoders per leg that are compared with the IMUs.
 _COMPARED = 4
@@ -86,7 +86,7 @@ class Unchecked:
 
 
 def _checks(rows: Rows) -> Iterator[_SensorCheck]:
-    """Yield the checks that compare several values."""
+    """Yield the checks: velocity of each joint, encoders against IMUs of each leg, force cells of each foot."""
     joints, imus, feet = rows.joint.tolist(), rows.imu.tolist(), rows.foot.tolist()
     for joint, row in enumerate(joints):
         yield _SensorCheck(Dtc.ENC_VELOCITY, JOINT_NODES[joint], [row], f"the velocity of {JOINTS[joint]}")
