@@ -21,7 +21,7 @@ _RAW = re.compile(r"(0[xX][0-9a-fA-F]{1,16}|\d{1,20})?")
 
 
 def wrong_values(text: str) -> Iterator[tuple[int, str]]:
-    """Yield each attribute that has no definition or an invalid value, as (line number, message)."""
+    """Yield (line number, message) for each value that is invalid or whose attribute has no definition above it."""
     definitions: dict[str, tuple[str, str]] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         if match := _DEFINITION.match(line):
@@ -35,7 +35,7 @@ def wrong_values(text: str) -> Iterator[tuple[int, str]]:
 
 
 def missing(text: str) -> Iterator[tuple[int, str]]:
-    """Yield each required attribute without definition or default, as (1, message)."""
+    """Yield (line number 1, message) for each missing definition and each missing default of a required attribute."""
     for name in _REQUIRED:
         for keyword, part in (("BA_DEF_", "definition"), ("BA_DEF_DEF_", "default")):
             if not re.search(rf'^{keyword}\s+[^"]*"{name}"', text, re.MULTILINE):

@@ -30,7 +30,7 @@ _WORD = 64
 _FLOAT_BITS = (16, 32, 64)
 #: E2E Profile 5 header: name -> (start bit, number of bits), as in `loader`.
 _E2E_HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
-#: GenMsgSendType of a cyclic message, in lower case. An empty text is a message without GenMsgSendType.
+#: Values of GenMsgSendType for cyclic messages, in lower case. The empty text stands for a missing GenMsgSendType.
 _CYCLIC = ("", "cyclic", "cyclicx", "periodic", "fixedperiodic", "fixed_periodic")
 #: J1939: masks of the identifier bits that identify a parameter group, with and without destination address. If the PDU format
 #: is below 240, the identifier contains the destination address, which is not part of the group.

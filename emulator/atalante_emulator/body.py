@@ -23,7 +23,7 @@ Vector3 = tuple[float, float, float]
 GRAVITY = 9.81  # m/s2
 #: Number of PyBullet solver iterations in each time step. Another number changes the computed motion.
 SOLVER_ITERATIONS = 50
-#: Length of a link state in world axes: quaternion xyzw (4), velocity [m/s] (3), angular velocity [rad/s] (3).
+#: Number of elements of a link state in world axes: quaternion xyzw (4), velocity [m/s] (3), angular velocity [rad/s] (3).
 LINK_STATE: Final = 10
 #: Indices of attitude, velocity and angular velocity in the link state tuple of PyBullet.
 _ATTITUDE, _LINEAR, _ANGULAR = 5, 6, 7

@@ -41,7 +41,7 @@ _FAULTY: Final = (DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT)
 
 @dataclass(frozen=True)
 class DriveParameters:
-    """True parameters of the emulated drives. The HAL does not know them."""
+    """True parameters of the emulated drives. The HAL cannot read them."""
 
     motor: MotorParameters = field(default_factory=MotorParameters)
     velocity_bandwidth: float = 80.0  # cut-off frequency of the velocity low-pass [Hz]
@@ -218,7 +218,7 @@ class Drives:
         self._unsynced[leg] = 0
 
     def warn(self, leg: int, code: int) -> None:
-        """Report an error in the command of a leg. The drives of the leg do not react to it.
+        """Report an error in the command of a leg as a warning, to which the drives do not react.
 
         Args:
             leg: index of the leg, 0 is left.

@@ -12,8 +12,8 @@ from typing import Final, NamedTuple
 
 ERROR_RESET: Final = 0x0000
 CURRENT: Final = 0x2310  # continuous over-current
-UNDER_VOLTAGE: Final = 0x3220  # DC link too low for normal operation
-NO_VOLTAGE: Final = 0x3222  # DC link too low for the power stage
+UNDER_VOLTAGE: Final = 0x3220  # DC link voltage too low for normal operation
+NO_VOLTAGE: Final = 0x3222  # DC link voltage too low for the power stage
 OVER_TEMPERATURE: Final = 0x4310  # drive too hot
 ENCODER: Final = 0x7305  # incremental sensor 1
 COMMAND_LOST: Final = 0x8110  # CAN overrun: objects lost
@@ -26,7 +26,7 @@ COMMAND_TIMEOUT: Final = 0x8250  # command timed out
 _REGISTER: Final = {0x2: 0x03, 0x3: 0x05, 0x4: 0x09, 0x7: 0x21, 0x8: 0x11}
 _GENERIC: Final = 0x01
 
-#: Ages of a warning, in calls of `Errors.advance`: the age at its end, and the age at the end of its inhibit time.
+#: Two ages of a warning [calls of `Errors.advance`]: at the end of the warning, and at the end of its inhibit time.
 _ENDED, _REPEATABLE = 2, 3
 
 
@@ -107,7 +107,7 @@ class Errors:
             self._active[node][code] = False
 
     def acknowledge(self, node: int) -> None:
-        """Remove all errors without a persisting cause. Report code 0 if no error is left.
+        """Remove all errors whose cause is gone. Report code 0 if no error is left.
 
         Args:
             node: index of the node.
@@ -143,7 +143,7 @@ class Errors:
         self._active[node] = {}
 
     def warn(self, node: int, code: int) -> None:
-        """Report a warning, which is an error without a reaction. Repeat it only after the inhibit time.
+        """Report a warning, which is an error without a reaction. Report it again only after the inhibit time.
 
         Args:
             node: index of the node.

@@ -52,7 +52,7 @@ _SYNC_SKEW = 200e-6
 
 @dataclass(frozen=True)
 class EmulatorParameters:
-    """True parameters of the emulated nodes. The HAL does not know them."""
+    """True parameters of the emulated nodes. The HAL cannot read them."""
 
     drive: DriveParameters = field(default_factory=DriveParameters)
     imu: ImuParameters = field(default_factory=ImuParameters)
@@ -154,7 +154,7 @@ class Emulator:
         self._whole = [self._tx.frames]
         #: Index of each leg's SYNC in the list of SYNCs.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        self._answered = self._shares  # answer to each SYNC in the last cycle with missing or rejected frames
+        self._answered = self._shares  # answers in the last cycle with missing or rejected frames, one for each SYNC
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data
         self._batch_up_to = [batch[:count] for count in range(_BATCH + 1)]
@@ -350,7 +350,7 @@ class Emulator:
         self._sealed = True
 
     def _complete_answer(self, number: int) -> None:
-        """Add counter and CRC to the answer, unless they were added in advance and still fit this SYNC.
+        """Add counter and CRC to the answer, unless they were added in advance and are valid for this SYNC.
 
         Args:
             number: cycle number received in SYNC.

@@ -271,7 +271,7 @@ class FaultyBus(WrappedBus):
         self.synced = not self._syncs.isdisjoint(frames["can_id"][:count].tolist())
         if self.synced:
             self._begin_cycle()
-        # Commands of this cycle may arrive before its SYNC.
+        # Faults also apply to frames received without SYNC, because the commands of a cycle may arrive before its SYNC.
         if self._now() or not self.wire.idle:
             self._for_nodes += self._passed(frames[:count], from_hal=True)
         elif self._for_nodes:

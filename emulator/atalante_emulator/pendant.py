@@ -39,7 +39,7 @@ class Operator:
     A robot in HOLD stays in HOLD until `start()` is called, because only the operator may end HOLD.
     """
 
-    #: Time in READY before the operator presses START, and before every further press [cycles].
+    #: Time in READY until the operator presses START, and period of further presses [cycles].
     REACTION = 200
 
     def __init__(self, assistance_factor: float | None = None, *, starts: bool = True) -> None:

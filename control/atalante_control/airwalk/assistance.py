@@ -26,7 +26,7 @@ class Assistance:
     def __init__(
         self, inertia: AssistedInertia, gait: Gait, friction: Friction, *, decoupled: bool, feedforward: bool
     ) -> None:
-        """Compute the parameters of the idealization and u_f of every cycle.
+        """Compute the parameters of the idealization, and sample u_f at every cycle.
 
         Args:
             inertia: mass matrix and separate inertias of SH and SK.

@@ -17,7 +17,7 @@ from atalante_hal.types import Vector
 
 
 class Carry:
-    """Torques of one carry-over."""
+    """State of the carry-over: torque before the step change, and torque jump to compensate."""
 
     pending: bool  # true until the first torque after the change is computed
     before: Annotated[Vector, len(JOINTS)]  # Nm, torque before the change
@@ -44,7 +44,7 @@ class CarryOver:
 
     @property
     def pending(self) -> bool:
-        """Return whether the first torque after the change is still to be computed."""
+        """Return whether a carry-over has started, but the first torque after the change is not computed yet."""
         return bool(self.records[0].pending)
 
     def start(self, before: Vector) -> None:
@@ -57,12 +57,12 @@ class CarryOver:
         carry.before[:], carry.pending = before, True
 
     def cancel(self) -> None:
-        """Cancel a carry-over that is pending."""
+        """Cancel a carry-over whose torque jump is not computed yet."""
         self.records[0].pending = False
 
 
 def add_carried(carries: Records[Carry], blend: Vector, cycle: int, torque: Vector) -> None:
-    """Add the carried torque to the torque command. The first call after a change computes the carried torque.
+    """Add the fading compensation of the torque jump to the torque command. The first call after a change computes the jump.
 
     Args:
         carries: `CarryOver.records`; `pending` is cleared.

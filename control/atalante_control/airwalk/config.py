@@ -24,13 +24,13 @@ class AirwalkConfig:
     gains: PidGains = AIR_GAINS
     friction: Friction = field(default_factory=Friction)
     alpha: float = 0.4  # end of the re-centring, as a fraction of the step duration
-    guide_rate: Pair = (28.0, 44.0)  # rad/s, natural frequencies of the stiffest guide on SH and SK
-    gentler: tuple[float, ...] = (0.5, 0.7)  # natural frequency of each softer guide / guide_rate, ascending
-    guide_margin: float = 0.25  # smallest certificate margin with which a softer guide is used, fraction of the width
+    guide_rate: Pair = (28.0, 44.0)  # rad/s, natural frequencies of SH and SK under the stiffest backup policy
+    gentler: tuple[float, ...] = (0.5, 0.7)  # natural frequencies of the softer guides as fractions of guide_rate
+    guide_margin: float = 0.25  # a softer guide needs at least this certificate margin, as a fraction of its width
     guide_damping: float = 1.05  # damping ratio of the backup policy; with a ratio of at least 1 the loop is monotone
-    # Nm, bounds of the disturbance u_ext of SH and SK, as torques on the separate inertias (see `certificate`).
+    # Nm, bounds of the disturbance u_ext of SH and SK, as torques u in J q'' = u (see `guide.certificate`).
     # In PyBullet, the disturbance from coupling, delay and friction is below 14 Nm (SH) and 20 Nm (SK) in 95 % of the cycles.
-    # If the friction parameters are wrong by 20 %, these values are 43 Nm (SH) and 26 Nm (SK).
+    # If the friction parameters are wrong by 20 %, the 95 % values are 43 Nm (SH) and 26 Nm (SK).
     disturbance: tuple[Pair, Pair] = ((-30.0, 30.0), (-20.0, 20.0))
     points: int = 100  # number of intervals of the prediction grid over one step
     overlap: float = 0.1  # s, length of the prediction beyond the end of the step
@@ -40,7 +40,7 @@ class AirwalkConfig:
     decoupled: bool = True
     feedforward: bool = False  # True: u_f of the gait is applied to the assisted joints
     flat_foot: bool = True  # True: the sole of the swing foot is held level
-    ankle_offset: float = math.radians(1.0)  # rad, added to both sagittal ankles
+    ankle_offset: float = math.radians(1.0)  # rad, offset added to the desired SA angles of both legs
     fade: float = 0.9  # assistance factor Xi above which the baseline torque is blended in
     startup: float = 2.0  # s, duration of the motion from the measured pose to the first pose of the gait
     blend: float = 0.03  # s, time in which the compensation of a torque jump fades out (see `carry_over`)

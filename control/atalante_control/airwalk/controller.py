@@ -154,11 +154,11 @@ class AirwalkController:
 
     @property
     def desired(self) -> Vector:
-        """Return q_des [rad], then q_des' [rad/s] of the last cycle, shape (24,). The start motion does not change it."""
+        """Return q_des [rad], then q_des' [rad/s] of the last cycle of a step, shape (24,). The start motion is not included."""
         return self._outputs.desired
 
     def guide_at(self, xi: float) -> GuideFilter:
-        """Return the guide that is used at an assistance factor, see `StepGuides.at`.
+        """Return the guide filter that is used at an assistance factor, see `StepGuides.at`.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -201,7 +201,7 @@ class AirwalkController:
     # -- one cycle ---------------------------------------------------------------------------------------------------
 
     def update(self, state: State) -> Command:
-        """Compute the command of one cycle: change the step if it is over, then run the compiled kernel (`kernel.run`).
+        """Compute the command of one cycle. If the present step is over, start the next step first.
 
         Args:
             state: measured state of the robot.
@@ -269,7 +269,7 @@ class AirwalkController:
         step.xi, step.share, step.intensity = xi, share, intensity(xi)
 
     def _start_guide(self, xi: float, deviation: Deviation, joints: tuple[int, int]) -> None:
-        """Start the guide of a step. Count the step change if a deviation is larger than the certificate assumes."""
+        """Start the guide of a step. Count step changes with a deviation larger than the certificate assumes."""
         hip, knee = joints
         angles = float(deviation.angle[hip]), float(deviation.angle[knee])
         rates = float(deviation.rate[hip]), float(deviation.rate[knee])

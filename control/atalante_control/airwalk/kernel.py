@@ -1,4 +1,4 @@
-"""Compiled control cycle within a step: `row (q_nom + s), state -> u, vibration, telemetry`.
+"""Compiled control cycle within a step: `q_des, measurements -> torque command u, vibration levels, telemetry`.
 
     flat foot -> PID, gravity -> u_t, virtual guide -> u_v, merge with u_i and u_f -> carry-over -> u, haptics, telemetry
 
@@ -37,7 +37,7 @@ class Measured(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """Arrays of the parts of the controller. Each part allocates its own arrays."""
+    """Arrays of the controller parts, which `run` reads and updates. Each part allocates its own arrays."""
 
     steps: Records[Step]  # (1,) values of the step
     links: Records[LinkRecord]  # (n,) `Gravity.links`

@@ -19,7 +19,7 @@ _N, _LEG, _SA = len(JOINTS), len(LEG_JOINTS), LEG_JOINTS.index("SA")
 
 
 class Deviation(NamedTuple):
-    """Deviation of the measured motion from the nominal start of a step."""
+    """Deviation of the measured angles and speeds from their nominal values at the start of a step."""
 
     angle: Vector  # (12,) rad, s(0) = q - q_nom
     rate: Vector  # (12,) rad/s, s'(0) = q' - q_nom'
@@ -50,14 +50,14 @@ class GaitReference:
         time: Vector = np.arange(gait.cycles + 1, dtype=np.float64) * PERIOD
         (c0, c1), (c0d, c1d), _ = deadbeat.basis(time)
         end = self._end = int(np.searchsorted(time, deadbeat.end))
-        self._basis = np.zeros((2, end, 2 * _N))  # rows (s, s') for s(0) = 1 rad, then for s'(0) = 1 rad/s
+        self._basis = np.zeros((2, end, 2 * _N))  # (s, s') of each cycle for s(0) = 1 rad, then for s'(0) = 1 rad/s
         self._basis[0, :, :_N], self._basis[0, :, _N:] = c0[:end, None], c0d[:end, None]
         self._basis[1, :, :_N], self._basis[1, :, _N:] = c1[:end, None], c1d[:end, None]
         self._added = np.zeros_like(self._basis)
         self._angles, self._rates = (
             np.zeros(2 * _N),
             np.zeros(2 * _N),
-        )  # s(0) and s'(0), each stored twice, because a row has angles and speeds
+        )  # s(0) and s'(0), each stored twice, because both the added angles and the added speeds depend on them
 
     def start_step(self, stance: int, position: Vector, velocity: Vector) -> Deviation:
         """Re-centre the step on the measured motion.

@@ -66,7 +66,7 @@ class StepGuides:
         ]
 
     def at(self, xi: float) -> GuideFilter:
-        """Return the softest filter that is certified at Xi with `guide_margin`; if there is none, the stiffest filter.
+        """Return the softest filter with a certificate margin of at least `guide_margin` at Xi, else the stiffest filter.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -114,11 +114,13 @@ def backup_torque_limits(robot: Robot, config: AirwalkConfig, gravity: Gravity, 
 
 
 def guide_configs(config: AirwalkConfig, inertia: AssistedInertia, torque_limits: Vector) -> Iterator[GuideConfig]:
-    """Yield the configuration of each guide filter, lowest gains first. The gains follow from the separate inertias.
+    """Yield the configuration of each guide filter, lowest gains first. Each joint has the gains Kp = J w^2 and Kd = 2 d J w.
+
+    J is the inertia of the joint without coupling to the other joint, w the natural frequency and d the damping ratio.
 
     Args:
         config: natural frequencies, damping ratio, disturbance bounds and horizon.
-        inertia: separate inertias of SH and SK.
+        inertia: inertias J of SH and SK.
         torque_limits: largest backup torque of SH and SK, shape (2,) [Nm].
     """
     for part in (*config.gentler, 1.0):

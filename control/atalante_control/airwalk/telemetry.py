@@ -14,11 +14,11 @@ Pair = tuple[float, float]
 
 
 class Telemetry:
-    """Telemetry of one cycle. A pair has the values of SH and SK of the swing leg, except `guide`."""
+    """Telemetry of one cycle. Each pair except `guide` has a value for SH and a value for SK of the swing leg."""
 
     q_des: Annotated[Vector, len(JOINTS)]  # rad
     error: Annotated[Vector, 2]  # rad, q - q_des
-    q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the bound of the guide on the side of the error
+    q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the upper bound for error > 0, else to the lower bound
     guide: Annotated[Vector, 2]  # rad, distances from q_des to the upper and to the lower bound of the guide
     h: Annotated[Vector, 2]  # safe backward image function
     gate: Annotated[Vector, 2]  # weight of the backup torque, lambda + (1 - lambda) lambda_d; published as `lambda`
@@ -50,14 +50,14 @@ class Step:
 
 @dataclass
 class AirwalkStatistics:
-    """Statistics of the guide, counted after the first completed right-stance step."""
+    """Statistics of the guide. Counting starts after the first completed right-stance step."""
 
     steps: int = 0  # completed right-stance steps
     cycles: int = 0  # counted cycles
     inside: int = 0  # number of counted cycles with both assisted joints inside the guide
     active: int = 0  # number of counted cycles with the filter active on at least one joint
     max_ratio: float = 0.0  # largest |e| / q_bound
-    min_h_at_start: float = 1.0  # smallest safe backward image function h in the first cycle of a step
+    min_h_at_start: float = 1.0  # smallest value of the safe backward image function h in the first cycle of a step
     hand_overs_exceeded: int = 0  # number of step changes with a deviation larger than the certificate assumes
     factors: set[float] = field(default_factory=set)  # assistance factors of the steps
 

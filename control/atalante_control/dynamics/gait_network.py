@@ -31,10 +31,10 @@ INPUTS = {"mass": "kg", "height": "m", "step_length": "m", "step_duration": "s"}
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # largest number of neurons of a layer
-#: Largest jump of a joint angle at the step change that the last layer may cause, which allows for rounding [rad].
+#: Largest accepted angle jump at the step change [rad]. It allows for rounding errors in the weights of the last layer.
 _PERIODICITY_DEFECT = 1e-9
 _ANGLE_MAX = 2.0 * np.pi  # rad, largest accepted absolute value of a control point
-#: Largest accepted difference between thigh or shank and Winter's table [m]. The network was fitted with Winter's lengths.
+#: Largest accepted deviation of thigh and shank length from Winter's table [m]. The network was fitted with Winter's lengths.
 _LEG_TOLERANCE = 1e-3
 
 
@@ -135,7 +135,7 @@ def periodicity() -> Vector:
     points = np.arange(OUTPUTS).reshape(len(JOINTS), DEGREE + 1)
     rows = np.zeros((2, len(JOINTS), OUTPUTS))
     for joint, (other, sign) in enumerate(zip(SWAP, SIGN, strict=True)):
-        # The angles must satisfy q(T) = S q(0), where S swaps and mirrors the legs. The same applies to the slopes.
+        # The angles must satisfy q(T) = S q(0), where S swaps and mirrors the legs. The slopes must satisfy q'(T) = S q'(0).
         rows[0, joint, points[joint, DEGREE]] = 1.0
         rows[0, joint, points[other, 0]] = -sign
         rows[1, joint, points[joint, DEGREE]] = 1.0
@@ -192,7 +192,7 @@ def _names(depth: int) -> list[str]:
 
 
 def _size_max() -> int:
-    """Return the largest valid size of a network file [byte]. It includes 512 bytes for header and text of each array."""
+    """Return the largest valid size of a network file [byte]: 8 bytes per number, and 512 bytes per array for header and text."""
     widths = [len(INPUTS), *(LAYERS_MAX - 1) * [WIDTH_MAX], OUTPUTS]
     numbers = 2 * len(INPUTS) + sum((rows + 1) * columns for rows, columns in pairwise(widths))
     return np.dtype(np.float64).itemsize * numbers + 512 * len(_names(LAYERS_MAX))

@@ -78,7 +78,7 @@ class StanceDynamics:
         pinocchio.computeJointJacobians(fixed.model, on_pelvis, q)
         pinocchio.forwardKinematics(fixed.model, on_pelvis, q, v, a)
         foot = pinocchio.updateFramePlacement(fixed.model, on_pelvis, self._foot)
-        frame = pinocchio.ReferenceFrame.WORLD  # this world frame is the pelvis frame, because the pelvis is fixed
+        frame = pinocchio.ReferenceFrame.WORLD  # the pelvis is fixed in this model, so WORLD is the pelvis frame
         twist = pinocchio.getFrameVelocity(fixed.model, on_pelvis, self._foot, frame).vector
         change = pinocchio.getFrameAcceleration(fixed.model, on_pelvis, self._foot, frame).vector
         jacobian = pinocchio.getFrameJacobian(fixed.model, on_pelvis, self._foot, frame)

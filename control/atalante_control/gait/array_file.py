@@ -131,7 +131,7 @@ def _array(name: str, content: bytes) -> Array:
     if len(data) != size:
         raise ArrayFileError(f"{name} must have the {size} bytes of its shape {shape}, got {len(data)}")
     if dtype.kind == "U":
-        data.decode("utf-32")  # raises an exception for invalid text, which numpy would raise only on use
+        data.decode("utf-32")  # invalid text raises an exception here; NumPy would raise it only on use of the text
     array = np.frombuffer(data, dtype).reshape(shape).copy()
     array.setflags(write=False)
     return array

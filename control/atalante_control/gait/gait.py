@@ -370,7 +370,7 @@ def _control_points(path: Path, key: str, table: Any) -> Vector:
 
 
 def _is_number(value: Any) -> bool:
-    # The comparison is false for NaN, and it cannot overflow for large integers.
+    # math.isfinite raises an exception for very large integers. This comparison is false for them, for NaN and for infinity.
     return type(value) in (int, float) and abs(value) <= sys.float_info.max
 
 

@@ -39,14 +39,14 @@ END_WEIGHT = 20.0  # weight of the samples at start and end of a step; the other
 ACCELERATION_WEIGHT = 5e-2  # s2, weight of an acceleration error [rad/s2] relative to an angle error [rad]
 ALPHA = 1e-7  # penalty on the squared weights of the network; it smooths the gaits between the grid points
 SEED = 1  # seed of the initial weights
-_SAMPLES = 41  # number of samples of a step for the distance between two gaits
+_SAMPLES = 41  # number of samples of a step at which two gaits are compared
 
 
 class Fit(NamedTuple):
     """Fitted network with its errors on the gaits of the library."""
 
     network: GaitNetwork
-    directions: int  # number of principal directions, the outputs of the perceptron
+    directions: int  # number of principal directions; the perceptron has one output per direction
     rms: float  # rad, rms error of the joint angles along the steps
     worst: float  # rad, largest error of the joint angles
 
@@ -71,7 +71,7 @@ def fit(gaits: Sequence[Gait], grid: Grid, *, hidden: Sequence[int] = HIDDEN, it
     root = np.linalg.cholesky(measure)
     deviations = (points - mean) @ root
     _, spread, directions = np.linalg.svd(deviations, full_matrices=False)
-    # Element k is the rms error if only the first k directions are used.
+    # Element k of `outside` is the rms error if only the first k directions are used.
     outside = np.sqrt(np.cumsum(spread[::-1] ** 2)[::-1] / len(gaits))
     directions = directions[: int((outside > RESOLUTION).sum())]
     scores = deviations @ directions.T

@@ -25,7 +25,7 @@ from atalante_control.model import Patient
 from atalante_hal.robot import Robot, load_robot
 
 FORMAT = "atalante-library/1"
-LEVELS_MIN = 3  # smallest number of levels of a parameter; between only 2 levels the network error is 10 degrees
+LEVELS_MIN = 3  # smallest number of levels of a parameter; with 2 levels, the network error between them is 10 degrees
 
 Index = tuple[int, ...]
 #: Function that solves one gait. It must be defined at module level, because other processes import it.

@@ -132,7 +132,7 @@ class NonlinearProgram:
         self._blocks.append(_Block(cost, x, np.array(indices), weights))
 
     def functions(self) -> Functions:
-        """Build the five functions for the solver."""
+        """Build the functions of x and p that the solver calls."""
         x, p = casadi.MX.sym("x", self.unknowns), casadi.MX.sym("p", self._p.shape[0])
         lam_f, lam_g = casadi.MX.sym("lam_f"), casadi.MX.sym("lam_g", len(self.lower))
         gradient = _Sparse(self.unknowns, 1)

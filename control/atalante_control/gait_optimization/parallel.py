@@ -68,7 +68,7 @@ def fan_out(
         try:
             for result in results:  # noqa: UP028 - `yield from` would close `results` without suppressing its warnings
                 yield result
-        except multiprocessing.TimeoutError as error:  # this class is not a subclass of the built-in TimeoutError
+        except multiprocessing.TimeoutError as error:  # joblib does not raise the built-in TimeoutError
             raise TimeoutError(f"no parallel call finished within {patience:g} s") from error
         finally:
             with warnings.catch_warnings(), _without_loky_errors():

@@ -10,7 +10,7 @@ import numpy as np
 
 from atalante_hal.types import Vector
 
-#: Function of the iteration number and the largest constraint violation (scaled as in the program).
+#: Progress function. Arguments: iteration number, and largest constraint violation divided by the scale of its group.
 Progress = Callable[[int, float], None]
 
 
@@ -42,7 +42,7 @@ class Watch(casadi.Callback):
         return str(casadi.nlpsol_out(index))
 
     def get_sparsity_in(self, index: int) -> Any:
-        """Return the sparsity of an input of the callback. Multipliers of the parameters are not computed, so theirs is empty."""
+        """Return the sparsity of an input of the callback. Parameter multipliers are not computed, so their vector is empty."""
         name, rows = self.get_name_in(index), len(self._bounds[0])
         length = {"f": 1, "x": self._unknowns, "lam_x": self._unknowns, "g": rows, "lam_g": rows}.get(name, 0)
         return casadi.Sparsity.dense(length, 1 if length else 0)

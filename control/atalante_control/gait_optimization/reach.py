@@ -16,7 +16,7 @@ from atalante_control.gait_optimization.step_problem import StepProblem
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
 
-_TOLERANCE = math.radians(0.5)  # rad, accepted violation of a joint range, because the optimiser can find a better pose
+_TOLERANCE = math.radians(0.5)  # rad, accepted violation of a joint range; the optimiser may still find a valid pose
 _CENTRE_WEIGHT = 1e-6  # weight of the distance from the middle of the joint ranges; a violation has weight 1
 _OPTIONS: dict[str, Any] = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "error_on_fail": False}
 

@@ -32,7 +32,7 @@ class Requirements:
     landing_speed: tuple[float, float] = (-0.03, -0.003)  # m/s, vertical speed of the landing foot, upwards positive
     landing_slide: float = 0.035  # m/s, largest forward speed and largest lateral speed of the landing foot
     landing_turn: float = 0.2  # rad/s, largest angular velocity of the landing foot about each axis
-    #: Largest jump of a joint speed at the impact [rad/s]; the other 40 % of the limit are for errors of the network.
+    #: Largest jump of a joint speed at the impact [rad/s]. The rest of VELOCITY_JUMP is a reserve for errors of the gait network.
     impact_jump: float = 0.6 * VELOCITY_JUMP
     sinking: float = 0.01  # m/s, largest downward speed of the rear foot after the impact
     # The cost is the sum of squared torques [(100 Nm)^2] and of the terms with the weights below.

@@ -32,7 +32,7 @@ from atalante_hal.robot import ROBOT_FILE, load_robot
 
 RESIDUAL = 1e-6  # largest accepted violation of each constraint in a solved gait, in the SI unit of this constraint
 _OPTIONS: dict[str, Any] = {
-    "ipopt.nlp_scaling_method": "none",  # the program itself scales constraints and unknowns
+    "ipopt.nlp_scaling_method": "none",  # IPOPT does not scale, because the program scales constraints and unknowns
     "ipopt.max_iter": 150,
     "ipopt.tol": 1e-8,
     "ipopt.constr_viol_tol": 1e-10,

@@ -76,7 +76,7 @@ class StepProblem:
         self._yaw = casadi.DM(_about_z(self.chain.stance_yaw))  # rotation from stance foot to walking frame
         self.program = NonlinearProgram(_POINTS + requirements.nodes * _NODE, self.symbols)
         self._build()
-        #: Unit and scale of each group of constraints, by the name of the group.
+        #: Name of each group of constraints -> (unit, scale).
         self.units = {group.name: (group.unit, group.size) for group in self.program.groups} | _BOUND_UNITS
 
     def parameters(self, patient: Patient, duration: float, step_length: float) -> Vector:
@@ -230,7 +230,7 @@ class StepProblem:
         return casadi.Function("reach", [q, target, self.symbols], [error, casadi.jacobian(error, q)])
 
     def _trajectory_rows(self) -> Vector:
-        """Return the linear constraints that compute q, dq/ds and d2q/ds2 of every node from the control points."""
+        """Return A of the constraints A x = 0, by which the control points determine q, dq/ds and d2q/ds2 at the nodes."""
         rows = np.zeros((self.requirements.nodes, 3, _N, self.program.unknowns))
         for node in range(self.requirements.nodes):
             for order, basis in enumerate(self._bases):
@@ -269,7 +269,7 @@ class StepProblem:
         if around is not None:
             end, next_one = (-1, -2) if self.kind == "start" else (0, 1)
             pose, other = around.coefficients[:, end], around.coefficients[:, next_one]
-            # Both steps have the same joint speeds at their common pose, so their phase derivatives scale with the durations.
+            # At their common pose both steps have the same q', so dq/ds = q' T is proportional to the duration T of a step.
             points = {"gait pose": pose, "gait speed": pose + (other - pose) * TRANSITION / around.duration}
             for group in self.program.groups:
                 if group.name in points:

@@ -126,7 +126,7 @@ class Chain:
         width = numbers.shape[1]
         self._rows = [casadi.vertcat(*flat[i * width : (i + 1) * width]) for i in range(len(self.bodies))]
         by_name = {named.name: i for i, named in enumerate(self.bodies)}
-        self._route: list[tuple[int, int, bool]] = []  # (body, next body, True if the next body is the parent)
+        self._route: list[tuple[int, int, bool]] = []  # (body, next body, True if the next body is its parent)
         body = by_name[STANCE_FOOT]
         while self.bodies[body].parent:
             parent = by_name[self.bodies[body].parent]

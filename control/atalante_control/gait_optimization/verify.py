@@ -23,7 +23,7 @@ _LEFT, _RIGHT = (f"{side}_{LEG_LINKS['HA']}" for side in SIDES)
 _SAMPLES = 201  # number of samples of a step
 _LOCAL = pinocchio.ReferenceFrame.LOCAL
 _EXACT = 1e-6  # tolerance of the equality constraints of the optimiser, in SI units
-_SLIDING = 1.0  # Ns, accepted impact impulse above the friction limit; it changes the speed of the robot by some mm/s
+_SLIDING = 1.0  # Ns, accepted impact impulse above the friction limit; 1 Ns changes the robot speed by some mm/s
 _SINKING = 1e-3  # m, accepted depth of the swing sole below the ground at the start of the swing
 
 

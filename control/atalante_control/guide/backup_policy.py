@@ -58,7 +58,7 @@ class BackupPolicy:
         return self.kd**2 >= 4.0 * self.kp * self.inertia * (1.0 - 1e-12)
 
     def transition(self, tau: Vector) -> Vector:
-        """Return the state transition Phi(tau) in closed form.
+        """Return the state transition matrix Phi(tau) of the undisturbed loop in closed form.
 
         Args:
             tau: times from the start, shape (n,) [s].
@@ -166,7 +166,7 @@ class BackupPolicy:
 
 
 class ForcedResponse(NamedTuple):
-    """Solution P of the undisturbed loop and its sensitivity to the re-centring: rows (e, e'), each of shape (n, 2)."""
+    """Solution P of the undisturbed loop and its sensitivity to the re-centring. Each array has rows (e, e'), shape (n, 2)."""
 
     nominal: Vector  # P without re-centring [rad, rad/s]
     deviation: Vector  # response added to P per rad of s(0)

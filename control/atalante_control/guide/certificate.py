@@ -60,14 +60,14 @@ Pair = tuple[float, float]
 
 _JOINTS = ("SH", "SK")
 _STATES = 41  # number of errors e across the guide at which the safe backward image is evaluated
-#: Ratio of the real torques of hip and knee in the pair that `joint_torque` returns.
+#: Ratio of hip torque to knee torque in the result of `joint_torque`.
 _DIRECTION = np.array([5.0, 3.0])
 _KNEE_SPACING = math.radians(0.05)  # rad, largest spacing of the knee angles at which the mass matrix is evaluated
 
 
 @dataclass(frozen=True)
 class HandOver:
-    """Hand-over box: largest deviations from the nominal start of a step that the certificate assumes.
+    """Hand-over box: limits of the angle and speed deviations at a step change, for which the certificate holds.
 
     Raises:
         ValueError: If a value is negative or not finite.
@@ -84,29 +84,29 @@ class HandOver:
 
 @dataclass(frozen=True)
 class JointTorque:
-    """Largest real torques at hip and knee that the disturbance bounds cover, acting together and in any direction."""
+    """Largest disturbance torques that may act on hip and knee together, in any direction, within the disturbance bounds."""
 
     hip: float  # Nm, at SH
     knee: float  # Nm, at SK
-    worst_knee: float  # rad, angle of SK at which the pair reaches a bound
+    worst_knee: float  # rad, angle of SK at which these two torques reach a disturbance bound
 
 
 @dataclass(frozen=True)
 class JointCertificate:
-    """Certificate of one joint."""
+    """Certificate of one joint. Its torques are those on the separate inertia J of the joint (see module docstring)."""
 
     joint: str  # SH or SK
     margin: float  # 1 - largest |e| / q_bound after a start in the re-centred state; negative: the joint may leave the guide
-    tightest_phase: float  # phase of the smallest margin, t / T
-    side: str  # side of the smallest margin, upper or lower
-    u_ext: tuple[float, float]  # Nm on the separate inertia, disturbance bounds of the filter
-    #: Largest admissible disturbance bounds, Nm on the separate inertia; (0, 0): no disturbance is admissible.
-    #: They hold only for a filter that is configured with them.
+    tightest_phase: float  # phase t / T at which the margin is smallest
+    side: str  # bound of the guide with the smallest margin, upper or lower
+    u_ext: tuple[float, float]  # Nm, disturbance bounds of the filter
+    #: Largest admissible disturbance bounds [Nm]; (0, 0): no disturbance is admissible.
+    #: These bounds are admissible only for a filter that is configured with them.
     u_ext_max: tuple[float, float]
-    #: Largest backup torque |u_b| over the step, with disturbance, Nm on the separate inertia (see module docstring).
+    #: Largest backup torque |u_b| over the step under the worst disturbance [Nm].
     torque: float
-    torque_limit: float  # Nm on the separate inertia, torque limit minus the reserve of the filter
-    image_empty_at: float  # first phase without a safe state; infinity if every phase has one
+    torque_limit: float  # Nm, torque limit minus the reserve of the filter
+    image_empty_at: float  # first phase at which no state is safe; infinity if there is no such phase
     hand_over_max: float  # factor by which the hand-over box can grow until the margin is zero
 
 
@@ -161,7 +161,7 @@ def certify(
 
 
 def joint_torque(guide: GuideFilter, xi: float, hand_over: HandOver, inertia: AssistedInertia) -> JointTorque:
-    """Return the largest real torques of hip and knee, in the ratio 5 to 3, within the disturbance bounds of the filter.
+    """Return the largest disturbance torques of hip and knee, in the ratio 5 to 3, within the bounds of the filter.
 
     With A = J M(q_SK)^-1 it is the largest pair for which no element of |A| (hip, knee) exceeds its bound. This holds at every
     knee angle that the guide and the re-centring allow along the step. The pair is rounded down to 0.01 Nm.
@@ -194,7 +194,7 @@ def _knee_range(guide: GuideFilter, xi: float, hand_over: HandOver) -> Pair:
 
 
 def largest_assistance(guide: GuideFilter, margin: float, hand_over: HandOver | None = None) -> float:
-    """Return the largest assistance factor at which a guide is certified with a margin; -1 if it is not certified at 0.
+    """Return the largest assistance factor at which a guide is certified with a margin; -1 if it is not certified at Xi = 0.
 
     Guides become narrower as Xi grows, so the factor is found by bisection. It is at most 0.01 too small and never too large.
 
@@ -286,7 +286,7 @@ def _reason(joint: JointCertificate) -> str:
 
 
 def _from_rest(policy: BackupPolicy, forced: ForcedResponse, time: Vector) -> ForcedResponse:
-    """Return the forced responses that start at e = 0, e' = 0."""
+    """Return the forced responses from the start state e = 0, e' = 0."""
     phi = policy.transition(time)
     return ForcedResponse(*(part - phi @ part[0] for part in forced))
 

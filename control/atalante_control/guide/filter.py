@@ -62,7 +62,7 @@ class GuideConfig:
 
 
 class GuideFilter:
-    """Guide filter of both joints, for one gait and one shape; by symmetry it serves either swing leg.
+    """Guide filter of SH and SK for one gait and one shape. By symmetry, the same filter serves both swing legs.
 
     Call `start_step` at each step change, then `tick` once a cycle.
 
@@ -115,7 +115,7 @@ class GuideFilter:
             curve = Curve(deadbeat, nominal[joint], following[joint], self.time, uf)
             self.forced.append(forced_response(policy, curve))
             tables.append(np.concatenate([self.forced[joint], free_drift(policy, curve)], axis=2))
-        #: Terms of P and DRIFT in `step`, shape (3, 2, horizon + 1, 4): nominal, per rad of s(0), per rad/s of s'(0).
+        #: Terms of the columns P and DRIFT of `step`: nominal, per rad of s(0), per rad/s of s'(0). Shape (3, 2, horizon + 1, 4).
         self._parts = np.stack(tables, axis=1)
         first = int(self.grid[0])
         flow = np.array([_flow(config, joint, self.time) for joint in (0, 1)])
@@ -171,7 +171,7 @@ class GuideFilter:
 
     @property
     def stepped(self) -> int:
-        """Return the number of rollouts computed cycle by cycle, because the backup policy saturates along them."""
+        """Return the number of rollouts that were computed cycle by cycle because of torque saturation."""
         return sum(int(self.tables.joints[i].stepped) for i in (0, 1))
 
     def rollouts(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Vector:
@@ -202,7 +202,7 @@ class GuideFilter:
 
 
 def _joints(config: GuideConfig, first: int, stride: int) -> Records[Joint]:
-    """Return the records of SH and SK before the first step."""
+    """Return the initial records of SH and SK: gains, limits and grid, without the values of a step."""
     one = np.array([PERIOD])
     joints: Records[Joint] = zeros(Joint, 2)
     for i, policy in enumerate(config.policies):

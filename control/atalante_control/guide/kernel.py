@@ -67,11 +67,12 @@ P = 0  # columns 0 and 1 of `step`: solution P of the undisturbed loop and its r
 DRIFT = 2  # columns 2 and 3 of `step`: error without backup torque and its rate [rad, rad/s]
 BOUND = 4  # columns 4 and 5 of `step`: distance from q_des to the guide, upper and lower [rad]
 
+#: Any limit above 1 gives the same lambda. With 2.0, h = 1 - (|e| / q_bound)^2 is still exact down to -3.
 _HOPELESS = 2.0  # a prediction ends early at this |e| / q_bound, because lambda is 1 for every value above 1
 
 
 def tick(guide: GuideTables, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Pair:
-    """Compute u_v of SH and SK of one cycle.
+    """Compute the guide torques u_v of SH and SK for one cycle.
 
     Args:
         guide: tables of the guide filter; the results of the tick are written to `joints`.
@@ -150,7 +151,7 @@ def _largest_ratio(joint: Joint, flow: Vector, step: Vector, cycle: int, e: floa
 
 
 def _linear(joint: Joint, flow: Vector, step: Vector, cycle: int, e: float, ed: float) -> tuple[Pair, Pair]:
-    """Return the largest |e| / q_bound and the largest torque / `counted` of the linear rollouts.
+    """Return the largest |e| / q_bound and the largest torque / `Joint.counted` of the linear rollouts.
 
     Each result is a pair: the value under the upper extreme disturbance, then the value under the lower one.
     """
@@ -215,7 +216,7 @@ def limited(joint: Joint, flow: Vector, step: Vector, side: int, cycle: int, e: 
             e = then[DRIFT] + y + (yd + 0.5 * gained) * PERIOD
             ed = then[DRIFT + 1] + yd + gained
         cycle += 1
-        # Error under the worst disturbance minus error under the constant extreme disturbance; zero in a monotone loop.
+        # `allowance` is the error under the worst disturbance minus the error under the constant one; zero in a monotone loop.
         ahead = flow[cycle - start]
         allowance = ahead[ERROR_ADDED + side] - sign * external * ahead[STEADY]
         worst = max(worst, (sign * e + allowance) / then[BOUND + side])

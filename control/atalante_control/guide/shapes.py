@@ -24,7 +24,7 @@ _CHECKED_FACTORS = np.linspace(0.0, 1.0, 21).tolist()
 
 
 def half_width(xi: float) -> float:
-    """Return the full half-width of the guide for an assistance factor, 0.5 + 7 (1 - Xi) degrees, in rad.
+    """Return the half-width of the guide before its shape narrows it: 0.5 + 7 (1 - Xi) degrees, in rad.
 
     Args:
         xi: assistance factor in [0, 1].
@@ -148,5 +148,5 @@ PINCHED = GuideShape("pinched", "full width until 0.4 T, closing to 1 degree by 
 ASYMMETRIC = GuideShape("asymmetric", "full width above, 0.6 of it below", _asymmetric)
 SNAP = GuideShape("snap", "closes to 0.1 degrees within 0.02 T, too fast for any backup policy", _snap)
 
-#: Shapes of this package, by name. `snap` cannot be certified; it shows how such a guide is reported.
+#: Shapes of this package, by name. `snap` is an example of a guide that cannot be certified.
 SHAPES = {shape.name: shape for shape in (CONSTANT, WIDENING, NARROWING, PINCHED, ASYMMETRIC, SNAP)}

@@ -31,14 +31,14 @@ Vector3 = tuple[float, float, float]
 
 _SA, _HA = LEG_JOINTS.index("SA"), LEG_JOINTS.index("HA")
 _STOP_MARGIN = math.radians(1.0)  # rad, smallest distance between a target and the joint limit
-_STOP_FADE = math.radians(3.0)  # rad, below this distance to the end of the target range, the target rate is reduced
+_STOP_FADE = math.radians(3.0)  # rad, the target rate is reduced within this distance of a limit of the target
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
-_IMU_AGE = 10  # cycles, largest age of a valid IMU message, equal to its timeout in the DBC
+_IMU_AGE = 10  # cycles, largest valid age of an IMU message; the same as its timeout in the DBC
 
 
 class Ankle:
-    """Data of one ankle: constants, then the deviations at the step change for the re-centring."""
+    """Data of one ankle: constants, and the deviations at the step change, from which the re-centring starts."""
 
     geometry: Annotated[Vector, 4]  # `FlatFoot.geometry`
     offset: float  # rad, added to SA
@@ -172,7 +172,7 @@ class LevelFeet:
         ankle.rate[:] = state.velocity[ankle.joints] - rates
 
     def imu_valid(self, state: State, side: int) -> bool:
-        """Return whether the IMU of a tibia is valid, so that `write_level_ankle` can use it.
+        """Return whether the last message of a tibia IMU is recent enough for `write_level_ankle`.
 
         Args:
             state: measured state of the robot.
@@ -234,7 +234,7 @@ def _write_targets(ankle: Ankle, cubics: Vector, cycle: int, target: tuple[Pair,
 
 
 def _target(ankle: Ankle, tibia: Sequence[float] | Vector, gyro: Sequence[float] | Vector) -> tuple[Pair, Pair]:
-    """Return angles and rates of SA and HA that hold the sole level, plus the offset of SA, limited to the target range."""
+    """Return angles and rates of SA and HA that hold the sole level. SA has its offset; both are limited to the target range."""
     (sagittal, henke), rates = level(ankle.geometry, tibia, gyro)
     low, high = ankle.low, ankle.high
     sa, sa_rate = _within(sagittal + ankle.offset, rates[0], low[0], high[0])
@@ -243,13 +243,13 @@ def _target(ankle: Ankle, tibia: Sequence[float] | Vector, gyro: Sequence[float]
 
 
 def _within(angle: float, rate: float, low: float, high: float) -> Pair:
-    """Return the angle limited to [low, high], and the rate, which is reduced near these limits and zero at them."""
+    """Return the angle limited to [low, high], and the rate. The rate is reduced near the limits, and zero at a limit."""
     room = max(0.0, min(angle - low, high - angle) / _STOP_FADE)
     return min(high, max(low, angle)), rate * min(1.0, room)
 
 
 def level(geometry: Vector, tibia: Sequence[float] | Vector, gyro: Sequence[float] | Vector) -> tuple[Pair, Pair]:
-    """Return the angles of SA and HA that level the sole. If the tibia leans too far sideways, HA is the nearest angle.
+    """Return the angles of SA and HA that level the sole. If the tibia leans too far sideways, HA is the nearest possible angle.
 
     Args:
         geometry: `FlatFoot.geometry`.

@@ -19,7 +19,7 @@ _FRONT = tuple(
 
 
 def intensity(xi: float) -> float:
-    """Return 1 - exp(30 (Xi - 1)), which is close to 1 below Xi = 0.9 and exactly 0 at Xi = 1.
+    """Return the factor of the vibration levels, 1 - exp(30 (Xi - 1)): close to 1 below Xi = 0.9, exactly 0 at Xi = 1.
 
     Args:
         xi: assistance factor in [0, 1].

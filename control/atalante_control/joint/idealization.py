@@ -34,8 +34,8 @@ class Law:
     """Parameters of `merge` for the assisted joints, SH and SK."""
 
     fit: Annotated[Vector, (3, 3)]  # kg m2, `AssistedInertia.fit`
-    inertias: Annotated[Vector, 2]  # kg m2, separate inertias, see `AssistedInertia.inertias`
-    decoupled: bool  # true: torques are converted with the mass matrix
+    inertias: Annotated[Vector, 2]  # kg m2, inertias J of SH and SK without their coupling, see `AssistedInertia`
+    decoupled: bool  # true: u_f + u_v are converted with the mass matrix of SH and SK
     coulomb: Annotated[Vector, 2]  # Nm
     viscous: Annotated[Vector, 2]  # Nm s/rad
     smoothing: float  # rad/s
@@ -110,7 +110,7 @@ class AssistedInertia:
         self.inertias: Pair = (float(blocks[:, 0].max()), float(blocks[:, 2].max()))
 
     def block(self, knee: float) -> tuple[float, float, float]:
-        """Return M11, M12, M22 at a knee angle [kg m2]; index 1 is SH, index 2 is SK.
+        """Return the mass matrix at a knee angle [kg m2]: M11 (SH), M12 (coupling of SH and SK), M22 (SK).
 
         Args:
             knee: angle of SK [rad].
@@ -119,7 +119,7 @@ class AssistedInertia:
         return m11, m12, m22
 
     def torques(self, knee: float, hip_rate: float, knee_rate: float, u: Pair) -> Pair:
-        """Return the torques of SH and SK under which each joint moves as J q'' = u, while the other joints rest [Nm].
+        """Return the torques [Nm] that accelerate SH and SK as J q'' = u. The other joints are assumed at rest.
 
         tau = M J^-1 u + c, with c the velocity torques of M(q_SK): c1 = M11' q1' q2' + M12' q2'^2, c2 = -M11' q1'^2 / 2.
 
@@ -132,7 +132,7 @@ class AssistedInertia:
         return coupled(self.fit, self.inertias, knee, hip_rate, knee_rate, u)
 
     def ideal(self, knee: float, hip_rate: float, knee_rate: float, tau: Pair) -> Pair:
-        """Return the torques on the separate inertias that are equivalent to real torques; inverse of `torques` [Nm].
+        """Return the torques u [Nm] in J q'' = u that are equivalent to real torques of SH and SK. Inverse of `torques`.
 
         Args:
             knee: angle of SK [rad].
@@ -145,7 +145,7 @@ class AssistedInertia:
         return on_hip, on_knee
 
     def ideal_of(self, knee: float) -> Vector:
-        """Return A = J M^-1, shape (2, 2). It converts real torques minus velocity torques to the separate inertias.
+        """Return A = J M^-1, shape (2, 2). It converts real torques minus velocity torques to torques u in J q'' = u.
 
         Args:
             knee: angle of SK [rad].
@@ -209,7 +209,7 @@ def friction(velocity: float, coulomb: float, viscous: float, smoothing: float) 
 
 
 def coupled(fit: Vector, inertias: Vector | Pair, knee: float, hip_rate: float, knee_rate: float, u: Pair) -> Pair:
-    """Convert torques on the separate inertias to real torques, see `AssistedInertia.torques`. Kernels can call it.
+    """Convert torques u in J q'' = u to real torques, as `AssistedInertia.torques` does. Compiled kernels can call it.
 
     Args:
         fit: `AssistedInertia.fit`.

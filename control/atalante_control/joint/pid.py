@@ -63,7 +63,7 @@ class PidGains:
     integral_limit: float = 10.0  # Nm
 
 
-#: Gains in the air. The stance leg carries no load, so its TH, SK, SA and HA get the gains of the swing leg.
+#: Gains for the suspended robot. The stance leg carries no load, so its TH, SK, SA and HA get the gains of the swing leg.
 #: With the gains for the ground, knee and ankle would oscillate, because their inertia is small (0.16 and 0.04 kg m2).
 AIR_GAINS = PidGains(
     stance=LegGains(

@@ -31,7 +31,7 @@ class ExoskeletonParameters:
     shank_length: float = 0.408  # m, from SK to SA
 
     pelvis_mass: float = 16.5  # kg, pelvis and back
-    frontal_hip_mass: float = 3.7  # kg, mass per leg, as all masses below
+    frontal_hip_mass: float = 3.7  # kg, mass in one leg; all masses below are also per leg
     transverse_hip_mass: float = 4.4
     thigh_mass: float = 9.0
     shank_mass: float = 11.0
