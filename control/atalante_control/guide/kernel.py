@@ -216,7 +216,7 @@ def limited(joint: Joint, flow: Vector, step: Vector, side: int, cycle: int, e: 
             e = then[DRIFT] + y + (yd + 0.5 * gained) * PERIOD
             ed = then[DRIFT + 1] + yd + gained
         cycle += 1
-        # `allowance` is the error under the worst disturbance minus the error under the constant one; zero in a monotone loop.
+        # `allowance` is the error under the worst disturbance minus the error under the constant extreme; zero if monotone.
         ahead = flow[cycle - start]
         allowance = ahead[ERROR_ADDED + side] - sign * external * ahead[STEADY]
         worst = max(worst, (sign * e + allowance) / then[BOUND + side])
