@@ -47,7 +47,7 @@ def compiled(function: Function) -> Function:
 
 
 def specialised(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> Callable[P, R]:
-    """Call a function once, and return its machine code for the types of these arguments.
+    """Call a function once, and return its machine code for the types of the given arguments.
 
     A call of this machine code skips the type dispatch of numba, which takes about 0.7 us for each `NamedTuple`. So the types are
     not checked: every later call needs arrays of the same dtype, number of dimensions and memory layout. Pass only arrays that
@@ -114,7 +114,7 @@ def _callees(function: FunctionType) -> Iterator[tuple[str, FunctionType]]:
 
 
 def _compile_inputs(function: FunctionType) -> Iterator[bytes]:
-    """Yield the bytes that determine the machine code: code, constants, records, globals and called functions."""
+    """Yield the bytes that determine the machine code: code, constants, record types, globals and called functions."""
     yield function.__qualname__.encode()
     for name, annotation in function.__annotations__.items():
         record = function.__globals__.get(annotation, annotation) if isinstance(annotation, str) else annotation

@@ -28,7 +28,7 @@ from atalante_hal.types import PERIOD, Command, State, SupervisorState, Vector
 from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_towards_operation
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Consecutive cycles with a limited torque after which TORQUE_SATURATED is confirmed.
+#: Number of consecutive cycles with a limited torque after which TORQUE_SATURATED is confirmed.
 SATURATED_CYCLES = 200
 #: Longest total wait for the nodes' answers while `Hal.stop` puts the robot into HOLD [s].
 STOP_PATIENCE = 1.0
@@ -95,7 +95,7 @@ class Hal:
         received = self.network.received_by("HAL")
         # The rows are in the order in which the buses deliver the messages. The fast path of `ReceiveImage.accept` requires it.
         fast = [m for bus in self.network.buses for m in received if m.bus == bus and m.cycle_ms == 1]
-        #: Message of each entry of `State.valid` and `State.age`.
+        #: Name of the message to which each entry of `State.valid` and `State.age` belongs.
         self.messages = tuple(m.name for m in fast)
         parts = self._parts = Record(ReceiveImage(fast).codec, controller_fields)
         #: All values of this cycle in one contiguous vector. `layout` gives the name and the slice of each field.
@@ -156,7 +156,7 @@ class Hal:
         return state
 
     def _apply(self, verdict: Verdict) -> None:
-        """Act on a verdict of the safety monitor: set the commands and the header of the record.
+        """Apply a verdict of the safety monitor: set the commands and the header of the record.
 
         Args:
             verdict: Verdict of the present cycle.

@@ -1,4 +1,4 @@
-"""Record of one cycle: a contiguous vector of all its values. The controller's `State` consists of views of it.
+"""Record of one cycle: a contiguous vector of all its values. The controller's `State` consists of views of this vector.
 
 The process image of the 1 ms messages decodes directly into the record. The whole record is copied to a telemetry ring at once.
 """

@@ -128,7 +128,7 @@ class Robot:
 
 
 class _Key(NamedTuple):
-    """Count, range and unit of the numbers of a key. The range is wide: it only detects wrong units and decimal points."""
+    """Count, range and unit of the numbers of a key. The wide range rejects only wrong units and misplaced decimal points."""
 
     size: int
     low: float

@@ -19,7 +19,7 @@ from atalante_hal.wire.process_image import ReceiveImage
 
 #: Largest number of frames received in one cycle. About 20 of them are cyclic.
 RECEIVE_BUDGET = 128
-#: Consecutive cycles after which a flood or a full transmit queue is confirmed.
+#: Number of consecutive cycles with a flood or a full transmit queue after which the fault is confirmed.
 PERSISTENT = 5
 #: Time to listen for another HAL before the first SYNC [s].
 LISTEN = 0.2

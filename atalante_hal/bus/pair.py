@@ -95,7 +95,7 @@ class PairBus:
         peer._tail = end
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Move queued frames to `frames[:n]` and return n; call `step` first if the queue is empty.
+        """Move queued frames to `frames[:n]` and return n. If the queue is empty, call `step` first, if it is set.
 
         Args:
             frames: Receive buffer, shape (m,) with m >= n.

@@ -184,7 +184,7 @@ class Heartbeats:
             self._seen = cycle
 
     def _suspect(self, row: int, *, rival: bool) -> None:
-        """Update the evidence that a message has two senders, after each of its frames.
+        """Update the evidence that a message has two senders. Call this for each frame of the message.
 
         A restarted sender can repeat the last counter once. Two senders repeat it often.
 

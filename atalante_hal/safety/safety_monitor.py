@@ -113,7 +113,7 @@ class SafetyMonitor:
         self._drives_judged = b""  # drive states and temperatures of the last evaluation
 
     def judge(self, bus_faults: Sequence[Finding] = ()) -> Verdict | None:
-        """Evaluate this cycle unless all inputs are unchanged; call it after the plausibility checks.
+        """Evaluate this cycle, unless all inputs are unchanged. Call this method after the plausibility checks.
 
         Args:
             bus_faults: faults of the bus in this cycle.

@@ -48,7 +48,7 @@ class StartRequest(NamedTuple):
     """Conditions of a START in one cycle, as the safety monitor has evaluated them."""
 
     supervisor: SupervisorState  # state of the state machine
-    pressed: bool  # True in the cycle in which START is pressed, False while the drives are being enabled
+    pressed: bool  # True in the cycle in which START is pressed, False in the later cycles of this start
     cycles_left: int  # remaining cycles until all drives must be enabled
     ending: bool  # True if the program is ending
     stop_requested: bool  # True if the operator requests STOP or HOLD

@@ -22,7 +22,7 @@ class Conditions:
     drives_enabled: bool = False  # all twelve drives are in OPERATION ENABLED
     dead_man: bool = False  # the pendant has not timed out and its dead-man is pressed
     stop_requested: bool = False  # the operator requested STOP or HOLD, or the program is ending
-    start_wanted: bool = False  # START was pressed and the drives are being enabled
+    start_wanted: bool = False  # START was pressed, and this start has not ended yet
     step_finished: bool = False  # the walking step has ended, the robot does not walk, or FINISH_STEP took too long
 
 

@@ -56,12 +56,12 @@ _FOREIGN = -1
 NEVER = 1 << 30
 #: Age from which an answer to a SYNC counts as replayed; a younger answer counts as late [cycles].
 LATEST = 16
-#: Half the counter period. A larger increase counts as a decrease, unless the message was missing for as many cycles.
+#: Half the counter period. A larger increase counts as a decrease, unless the message was missing for this many cycles.
 _HALF_TURN = 128
 
 
 class E2EState(NamedTuple):
-    """E2E check of the rows of a process image: the expected format of each row, and the state of its frame sequence.
+    """State of the E2E check: for each row of a process image its expected format, expected counter and last frame.
 
     The `ReceiveImage` owns the arrays. `headers` and `spans` are constant; the others change with every accepted frame.
     """
@@ -304,7 +304,7 @@ class ReceiveImage:
 
 
 class _Received:
-    """Views of the first rows of a receive buffer, created once and read by the fast path in every cycle.
+    """Views of the first frames of a receive buffer. They are created once; the fast path reads them in every cycle.
 
     Args:
         frames: receive buffer.

@@ -1,7 +1,7 @@
 """Standstill checks, which detect stuck encoders, frozen gyros and frozen force cells: their readings stay exactly constant.
 
 All signals are sampled every few cycles, and consecutive samples with exactly the same value are counted. A signal is
-skipped if it was not measured again since its last sample.
+skipped if its value is not newer than its value in the last sample.
 
 The reading of an encoder may be constant because the joint is at rest. An encoder is stuck only under two conditions. First, the
 torque of the drive has varied by at least `breakaway` since the reading last changed; this is more than twice the dry friction of
