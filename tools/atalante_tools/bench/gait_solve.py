@@ -39,7 +39,7 @@ def gait_solve_warm(effort: Effort) -> Measurement:
 
 @cache
 def _centre() -> Gait:
-    """Return the initial guess of the warm benchmark, a neighbouring gait. The first call also builds the nonlinear program."""
+    """Return the neighbouring gait that serves as initial guess. The first call also builds the nonlinear program."""
     from atalante_control.gait_optimization.solve import solve
 
     return solve(_CENTRE).gait

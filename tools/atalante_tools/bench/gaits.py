@@ -37,7 +37,7 @@ def model_build(effort: Effort) -> Measurement:
 
 
 def inverse_dynamics(effort: Effort) -> Measurement:
-    """Measure the inverse dynamics on the stance foot, which compute joint torques and ground wrench from a motion."""
+    """Measure the time to compute joint torques and ground wrench from a motion of the robot on its stance foot."""
     robot = load_robot()
     dynamics = stance_dynamics(robot, _PATIENT)
     model = pinocchio_model(urdf(ExoskeletonParameters(), robot, _PATIENT), fixed_base=False).model

@@ -27,9 +27,9 @@ from atalante_tools.session.rig import Rig, open_hal
 AGREEMENT: Final = 1e-6
 #: Largest accepted deviation of a joint from the gait while the robot walks [rad].
 POSE: Final = 0.15
-#: Number of cycles from power-on until the robot walks and the measurement begins.
+#: Number of cycles from power-on to the start of the measurement, when the robot already walks.
 _BEFORE_WALKING: Final = 3000
-#: Number of cycles of a block.
+#: Number of cycles that are timed together as one block.
 _BLOCK: Final = 50
 _TICKS: Final = 40
 _INTEGRATIONS: Final = 4
@@ -91,7 +91,7 @@ def emulator_tick(effort: Effort) -> Measurement:
         body.exchange = timed_exchange  # type: ignore[attr-defined]
         bus.step = tick  # type: ignore[attr-defined]
         cycles = stack.walk(effort)
-        # Select the ticks in which the robot walks.
+        # Omit the ticks before the robot walks.
         walked = slice(_BEFORE_WALKING, _BEFORE_WALKING + cycles)
         require(
             len(tick_times[walked]) == len(engine_times[walked]) == cycles,
@@ -106,7 +106,7 @@ def lockstep(effort: Effort) -> Measurement:
         stack.walk(effort)
     ordered = [block / (_BLOCK * PERIOD) for block in sorted(stack.blocks)]
     seconds, undisturbed = statistics.median(ordered), ordered[len(ordered) // 10]
-    # A process on the other hyperthread of a core slows the core by almost half, so the fastest blocks are reported, too.
+    # A process on the other hyperthread of a core slows the core by almost half, so the remark reports the fastest blocks.
     remark = f"{1.0 / seconds:.1f} times real time; {1.0 / undisturbed:.1f} times in the fastest tenth of the blocks"
     return Measurement(seconds, 1.0, (remark,))
 
@@ -121,7 +121,7 @@ class _Stack:
     blocks: list[float] = field(default_factory=list)  # wall time of each block of `_BLOCK` cycles [s]
 
     def walk(self, effort: Effort) -> int:
-        """Run until the robot has walked for all rounds; return the number of cycles of these rounds.
+        """Run the stack until the robot has walked for all rounds of the measurement; return the number of cycles of the rounds.
 
         Args:
             effort: number of rounds of `_BLOCK` cycles, and progress display.

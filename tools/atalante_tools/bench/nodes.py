@@ -1,6 +1,6 @@
-"""Recorded nodes: prepared frames with valid counters and CRCs, which a HAL receives in lock-step.
+"""Recorded nodes, which replace the emulator in benchmarks of the HAL. They answer each SYNC with frames prepared in advance.
 
-They replace the emulator in benchmarks of the HAL. The answer to a SYNC is only copied, which takes little time. The joints
+The frames have valid counters and CRCs. To answer a SYNC, they are only copied, which takes little time. The joints
 oscillate about the first pose of a swing with a small tracking error, so the guide filter gets realistic values and no
 plausibility check fails.
 """
@@ -33,7 +33,8 @@ from atalante_tools.bench.measure import require
 
 #: Number of cycles after which an alive counter wraps to 0.
 TURN = 256
-#: Number of poses of the recording. It is odd, so that a check in every 16th cycle gets a different pose each time.
+#: Number of poses of the recording. It is odd, because the HAL makes slow checks in every 16th cycle only, and each of these
+#: must get a new pose.
 POSES = 15
 #: Tracking error of the recorded joints [rad], too small to saturate the guide filter.
 ERROR = 0.01
@@ -183,7 +184,7 @@ def _e2e_fields(frames: Frames) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.u
 
 
 def _walking(walk: Walk, image: TransmitImage) -> Vector:
-    """Return constant values of all signals, within their ranges and without errors, shape (signals,)."""
+    """Return plausible constant values of all signals, which report no fault. Shape (signals,)."""
     codec, rng = image.codec, np.random.default_rng(1)
     values = np.zeros(codec.size)
     for name, low, high in (
@@ -214,7 +215,7 @@ class RecordedBus:
         self._into, self._into_memory = recording.frames, self._memory
         self._syncs = len(syncs(walk().network))
         self._synced = False
-        self._prepared: list[bytes] = []  # frames of each prepared cycle, the next cycle last
+        self._prepared: list[bytes] = []  # frames of each prepared cycle, in reverse order
 
     def prepare(self, cycles: int) -> None:
         """Prepare the frames of the next cycles, so that `receive` only copies them."""
@@ -222,7 +223,7 @@ class RecordedBus:
         self._prepared = [memory[: self._recording.play() * FRAME_BYTES].tobytes() for _ in range(cycles)][::-1]
 
     def send(self, frames: Frames) -> None:
-        """Count the frames. A batch with one frame per bus is the SYNC of all buses."""
+        """Count the frames that the HAL sends. A batch with one frame per bus contains the SYNCs of all buses."""
         count = len(frames)
         self.sent += count
         if count == self._syncs:

@@ -30,7 +30,7 @@ class VirtualNodes:
         self._bus = can.Bus(interface="virtual", channel="bench")
 
     def answer(self, cycles: int) -> list[int]:
-        """Send the frames of the next cycles, and return the number of frames of each cycle.
+        """Send the recorded frames of the next cycles to the HAL, and return the number of frames of each cycle.
 
         Frames from the HAL are discarded.
 

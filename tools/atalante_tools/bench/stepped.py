@@ -15,7 +15,7 @@ from atalante_hal.types import Vector
 
 
 class SteppedRollouts:
-    """Step-by-step integration of the rollouts of a guide filter. Its backup policies must be monotone and not saturated."""
+    """Step-by-step integration of the rollouts of a guide filter. The backup policies must be monotone and not saturated."""
 
     def __init__(self, guide: GuideFilter) -> None:
         """Copy grid, gains and disturbance bounds of the guide filter.
@@ -37,7 +37,7 @@ class SteppedRollouts:
         self.start_step()
 
     def start_step(self) -> None:
-        """Update the particular solution P for a new walking step. It must be called after `GuideFilter.start_step`."""
+        """Update the particular solution P for a new walking step. Call it after `GuideFilter.start_step`."""
         guide = self._guide
         self._p = guide.solution()[:, [[0, 0, 2, 2], [1, 1, 3, 3]]]
         interval = self._p[guide.grid]

@@ -17,7 +17,7 @@ from atalante_tools.bench.generated_c import COMPILER, GeneratedC, available
 from atalante_tools.bench.measure import Effort, Measurement, require, timed
 from atalante_tools.bench.nodes import FilterOnly, RecordedHal, Recording, active_hal, walk
 
-#: Number of cycles of a block. The schedule of the slow messages repeats after ten cycles.
+#: Number of cycles that are timed together as one block. The schedule of the slow messages repeats after ten cycles.
 _BLOCK: Final = 10
 #: Number of repetitions of a short Python function in a block.
 _MANY: Final = 100
@@ -209,7 +209,7 @@ def _no_compiler() -> Measurement | None:
 
 
 def _frame_checker() -> tuple[Callable[[bytes, int], bool], tuple[str, ...]]:
-    """Return a function that checks the CRC of one payload, and remarks about the baseline."""
+    """Return a function that checks the CRC of one payload, for the baseline. Also return remarks about the baseline."""
     try:
         import e2e
     except ModuleNotFoundError:

@@ -100,7 +100,7 @@ class Plan:
                 continue
             extended[frame_id] = row
             if mask != _ALL_BITS:
-                # With two messages in one parameter group, the masked identifier is ambiguous.
+                # With two messages in one parameter group, the masked identifier is ambiguous, so it counts as unknown.
                 known = groups.setdefault(mask, {})
                 known[frame_id & mask] = UNKNOWN if frame_id & mask in known else row
         self._standard = standard

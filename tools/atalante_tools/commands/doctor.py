@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from atalante_tools.commands.bus_timing import BusTiming
     from atalante_tools.commands.machine import Interface, Machine
 
-#: Recommended length of a transmit queue [frames]. One cycle of all four buses sends 22 frames.
+#: Recommended length of a transmit queue [frames]. In one cycle, the four buses together carry 22 frames.
 QUEUE: Final = 1000
 #: MTU of a CAN FD interface [bytes].
 FD_MTU: Final = 72
@@ -36,7 +36,7 @@ PRIORITY: Final = 50
 POLL_TIMEOUT: Final = 0.02
 #: Linux file with the real-time limits of each user.
 LIMITS: Final = "/etc/security/limits.conf"
-#: Python package -> what it is needed for, and the extra of `atalante-hal` that installs it.
+#: Name of a Python package -> its purpose, and the extra of `atalante-hal` that installs it.
 PACKAGES: Final = {
     "pinocchio": ("the model of the controller", ""),
     "pybullet": ("the emulated robot", "[emulator]"),
@@ -44,7 +44,7 @@ PACKAGES: Final = {
     "mcap": ("recordings", "[telemetry]"),
     "matplotlib": ("figures", "[plot]"),
 }
-#: Program -> what it is needed for, and the Debian package that contains it.
+#: Name of a program -> its purpose, and the Debian package that contains it.
 PROGRAMS: Final = {
     "candump": ("an independent log of a bus", "can-utils"),
     "gcc": ("the C baseline of `atalante bench`", "gcc"),

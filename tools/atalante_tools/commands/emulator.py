@@ -110,7 +110,7 @@ def run(emulator: Emulator, target: Target, is_over: Callable[[], bool]) -> None
 
 
 def end_condition(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[[], bool]:
-    """Return the end condition of the emulator. Each call prints the status line if it is due.
+    """Return a function that returns whether the emulator must end. The function also prints the status line when it is due.
 
     Args:
         stop: Stop request of the process.

@@ -60,7 +60,7 @@ class Line(ResilientBus):
         return self._takeover.lost
 
     def listen(self, seconds: float) -> str:
-        """Check that no other robot sends, before the first frame is sent. Drop all received frames.
+        """Listen for another robot before the emulated nodes send their first frame. Discard all received frames.
 
         Args:
             seconds: Longest time to listen [s].
@@ -76,7 +76,7 @@ class Line(ResilientBus):
         return ""
 
     def send(self, frames: Frames) -> None:
-        """Send frames as `ResilientBus.send`, without those of the emulated pendant if another pendant sends.
+        """Send frames as `ResilientBus.send`. Omit the frames of the emulated pendant if the takeover rule forbids them.
 
         Args:
             frames: Frames to send.

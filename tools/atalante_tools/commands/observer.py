@@ -153,7 +153,7 @@ class Observer:
     def _fast(self, node: Node) -> list[Message]:
         cyclic = [m for m in self._network.sent_by(node.name) if m.cycle_ms]
         fastest = min(m.cycle_ms for m in cyclic)
-        if node.kind == "master":  # the HAL always sends SYNC, but it does not always send commands
+        if node.kind == "master":  # only SYNC counts for the HAL, because the HAL does not always send commands
             return [m for m in cyclic if m.name.startswith("SYNC_")]
         return [m for m in cyclic if m.cycle_ms == fastest]
 

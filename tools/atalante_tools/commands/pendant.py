@@ -1,4 +1,4 @@
-"""Command `atalante pendant`: acts as the operator's pendant on the bus, in a process of its own.
+"""Command `atalante pendant`: acts as the operator's pendant on the bus of a HAL that runs in another process.
 
 keyboard -> Session -> PendantNode -> bus -> HAL
 """
@@ -190,5 +190,5 @@ def open_pendant_bus(target: Target) -> tuple[Network, Bus]:
 def _standard_input() -> int | None:
     try:
         return sys.stdin.fileno()
-    except (AttributeError, ValueError, OSError):  # stdin is closed or not a file
+    except (AttributeError, ValueError, OSError):  # stdin is closed, or has no file descriptor
         return None

@@ -109,7 +109,7 @@ class Axis:
         length: int | None = None,
         flip: int | None = None,
     ) -> Frames:
-        """Return a defective command frame with the largest torque of the examination. Shape (1,).
+        """Return a defective command frame, shape (1,). It commands the torque limit of the examination.
 
         Args:
             counter: alive counter in place of the next one.

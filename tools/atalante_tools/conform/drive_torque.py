@@ -20,7 +20,7 @@ def makes_no_torque_disabled(tester: NodeTester) -> Outcome:
     }
     for state, controlword in stay.items():
         axis.go(state)
-        axis.run(3, controlword)  # time for the torque of a previous hold to decay
+        axis.run(3, controlword)  # wait until the torque of a previous hold has decayed
         most = max(most, torque_of(axis.run(10, controlword, tester.limits.torque)), key=abs)
     return Outcome(abs(most) <= NOISE, f"at most {most:.2f} Nm")
 

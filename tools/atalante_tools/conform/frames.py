@@ -17,7 +17,7 @@ _FD: Final = FLAG_FDF | FLAG_BRS
 
 
 class MessageSender:
-    """Sender of one message. A frame has only the defects that the arguments request."""
+    """Sender of test frames of one message. Frames are valid, unless the caller of `frame` requests a defect."""
 
     def __init__(self, message: Message) -> None:
         self.message = message
@@ -37,7 +37,7 @@ class MessageSender:
         classic: bool = False,
         flip: int | None = None,
     ) -> Frames:
-        """Return the next frame, optionally defective. Shape (1,).
+        """Return the next frame to send, shape (1,). The keyword arguments can give it defects.
 
         Args:
             values: physical value of each signal, in DBC units; signals that are missing are 0.
@@ -76,13 +76,13 @@ class MessageSender:
 
     @property
     def counter(self) -> int:
-        """Return the alive counter of the last frame that was sent in sequence."""
+        """Return the alive counter of the last frame whose counter was not chosen by the caller."""
         return self._counter
 
 
 @dataclass(frozen=True)
 class ReceivedFrame:
-    """Frame received from the node under test, with its defects. A defective frame is not rejected."""
+    """Frame received from the node under test, with its defects. Defective frames are also recorded."""
 
     message: Message
     cycle: int  # number of the cycle in which the frame was received

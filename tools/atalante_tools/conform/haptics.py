@@ -14,15 +14,15 @@ from atalante_tools.conform.node_tester import NodeTester, NotTested
 from atalante_tools.conform.requirement import Outcome, Requirement
 
 E2E: Final = "AUTOSAR E2E Profile 5"
-#: Largest time constant of a motor [s].
+#: Largest accepted time constant of a motor [s].
 TIME_CONSTANT = 0.06
-#: Largest deviation of the amplitude from a first-order lag, as a fraction of full amplitude.
+#: Largest accepted deviation of the amplitude from a first-order lag, as a fraction of full amplitude.
 LAG = 0.05
-#: Largest number of cycles for a motor to reach its level or to stop.
+#: Number of cycles within which a motor must reach its commanded level, and longest wait for it.
 _SETTLED: Final = 250
-#: Largest amplitude of a motor at rest, as a fraction of full amplitude.
+#: Largest deviation of a measured amplitude from its expected value that counts as noise, as a fraction of full amplitude.
 _STILL: Final = 0.02
-#: Number of cycles with defective commands.
+#: Number of cycles in which a test of defective commands sends them.
 _BAD: Final = 40
 
 
@@ -213,7 +213,7 @@ def _run(tester: NodeTester, cycles: int, level: float, only: str | None = None)
 
 
 def _settle(tester: NodeTester, level: float, only: str | None = None) -> Vector:
-    """Command a level until every motor reaches it, for at most `_SETTLED` cycles; return the amplitudes.
+    """Command a level until the motors reach it, but for at most `_SETTLED` cycles; return the last amplitudes.
 
     Args:
         tester: tester of the haptics node.

@@ -49,7 +49,7 @@ class Clock(Protocol):
         """
 
     def time_of(self, stamp_ns: int, cycle: int) -> float:
-        """Return the time of a frame [s].
+        """Return the receive time of a frame [s].
 
         Args:
             stamp_ns: time stamp of the bus [ns].
@@ -72,13 +72,13 @@ class LockStep:
         self._silent = 0
 
     def next_cycle(self, *, sync: bool, listen: Callable[[float], None]) -> None:
-        """Start the next cycle immediately. Advance the emulated node if SYNC has been missing for several cycles."""
+        """Start the next cycle without a wait. Advance the emulated node if the tester has not sent SYNC for several cycles."""
         self._silent = 0 if sync else self._silent + 1
         if self._silent >= self._watchdog:
             self._emulator.idle()
 
     def time_of(self, stamp_ns: int, cycle: int) -> float:
-        """Return the start time of the cycle [s]."""
+        """Return the start time of the cycle in which the frame was received [s]."""
         return cycle * PERIOD
 
 
@@ -101,7 +101,7 @@ class WallClock:
             self._deadline = time.monotonic()
 
     def time_of(self, stamp_ns: int, cycle: int) -> float:
-        """Return the time stamp of the bus in seconds."""
+        """Return the time stamp that the bus gave the frame [s]."""
         return stamp_ns * 1e-9
 
 

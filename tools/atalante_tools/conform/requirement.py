@@ -69,7 +69,7 @@ def _result(tester: NodeTester, requirement: Requirement) -> Result:
         silence = _silence(tester, frames, cycle)
         measured = silence + outcome.measured
         if outcome.passed:
-            # An absent node meets a requirement that forbids frames or torque, so this is no pass.
+            # Without a frame of the node, the requirement was not tested: an absent node also sends no forbidden frame.
             return Result(requirement, Verdict.NOT_TESTED if silence else Verdict.PASSED, measured)
         if tester.clock.delay < LATE:
             return Result(requirement, Verdict.FAILED, measured)

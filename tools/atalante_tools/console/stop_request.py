@@ -64,7 +64,7 @@ _request: StopRequest | None = None
 
 
 def check_stop() -> None:
-    """Raise `Stopped` if a stop signal arrived. Call it after long work that may have discarded the exception.
+    """Raise `Stopped` if a stop signal arrived. Call it after library code that may have discarded the exception.
 
     Raises:
         Stopped: If a signal arrived, with its exit code.

@@ -1,4 +1,4 @@
-"""Test vectors of a network: random payloads and their values by the Python codec, as a binary stream and as JSON.
+"""Test vectors of a network: payloads, and the signal values that the Python codec gives for them, as binary stream or JSON.
 
 An image is one payload of every message. The generated host test reads the stream, which is little endian: 8 bytes magic,
 u32 network hash, u32 number of images, then the images. Each image has the messages of the build in DBC order:
@@ -32,7 +32,7 @@ HEADER: Final = Struct("<8sII")
 
 
 class Vectors:
-    """Generator of random images for the messages of a `Build`. Equal seeds give equal images."""
+    """Generator of test vectors for the messages of a `Build`. Equal seeds give equal vectors."""
 
     def __init__(self, build: Build, seed: int) -> None:
         self._build = build
@@ -57,7 +57,7 @@ class Vectors:
         self._order = self._stream_order()
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return the position of each byte of an image in the concatenated arrays of `images`, in the order of the stream."""
+        """Return, for each byte of an image in the stream, its index in the concatenated arrays of `images`."""
         build, codec = self._build, self._codec
         rows = len(build.messages)
         parts = (FRAME_BYTES * rows, FRAME_BYTES * rows, 8 * codec.size, 8 * codec.size, rows)

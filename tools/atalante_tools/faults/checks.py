@@ -13,7 +13,7 @@ from atalante_tools.faults.observation import Observation
 
 _KNEE: Final = JOINTS.index("left_SK")
 #: Number of cycles without a command after which a drive must start its local hold.
-#: This check must be independent, so the number is not imported from the emulated drive.
+#: It is not imported from the emulated drive, so that an error in the emulator does not change the check.
 _WATCHDOG: Final = 5
 _LEFT_LEG: Final = slice(0, len(LEG_JOINTS))
 
@@ -74,7 +74,7 @@ def drives_report_two_senders(run: Observation) -> str | None:
 
 
 def full_queue_is_confirmed(run: Observation) -> str | None:
-    """Check that the HAL confirms the diagnostic of a full transmit queue. The resulting timeouts are not sufficient.
+    """Check that the HAL confirms the diagnostic of a full transmit queue. Diagnostics of the resulting timeouts do not suffice.
 
     Args:
         run: observation of the run.

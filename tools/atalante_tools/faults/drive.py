@@ -79,7 +79,7 @@ SCENARIOS: Final = (
         ),
         permanent=Case("one leg", (Fault("drop", "SYNC_LEFT_LEG"),)),
     ),
-    # A drive detects the loss by the counter of the next frame, so the detection takes one more cycle.
+    # A drive detects lost commands by the counter of the next command, so the detection takes one more cycle.
     Scenario("F24", tuple(Case(f"{n} frames", (Fault("drop", _COMMAND, 0, n),), detected=n + 1) for n in range(1, 5))),
     Scenario(
         "F25",
@@ -130,7 +130,7 @@ SCENARIOS: Final = (
                 checks=(limit_follows_temperature,),
             ),
             Case(
-                "up to 105 degC, 1 K per cycle",  # derating of the torque limit begins at 90 degC, in cycle 65
+                "up to 105 degC, 1 K per cycle",  # the drive reduces its torque limit above 90 degC, from cycle 65
                 (Fault("heat_ramp", _KNEE, 0, 400, rate=1000.0, up_to=105.0),),
                 node=_KNEE,
                 detected=70,

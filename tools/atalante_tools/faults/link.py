@@ -95,7 +95,7 @@ SCENARIOS: Final = (
                     node=_KNEE,
                     reacted=reacted,
                     recovers=False,
-                    observed=40,  # short, because the constant forces would be detected as a fault in cycle 100
+                    observed=40,  # short, because the HAL reports the constant forces as a fault after 100 cycles
                 )
                 for frames, state, dtc, reacted in (
                     (5, SupervisorState.FINISH_STEP, "SWING_TIMEOUT", 5),
@@ -114,7 +114,7 @@ SCENARIOS: Final = (
         "F06",
         (
             Case("0 cycles", (), dtc="", state=_ACTIVE, observed=200),
-            # The HAL detects the delay when the first late frame arrives, `k` cycles after the fault begins.
+            # The HAL detects the delay when the first delayed frame arrives, which is `k` cycles after the fault begins.
             *(
                 Case(f"{k} cycles", (Fault("delay", _STATE, 0, 200, by=k),), node=_KNEE, detected=k + 1, state=_ACTIVE)
                 for k in range(1, 5)
@@ -123,7 +123,7 @@ SCENARIOS: Final = (
         ),
         permanent=Case("by 4 cycles, permanent", (Fault("delay", _STATE, 0, None, by=4),)),
     ),
-    # The first frozen frame still has the expected counter, so the first faulty frame comes one cycle later.
+    # The first frame with the frozen counter still has the expected counter. Only the second frame is faulty.
     Scenario(
         "F07",
         (

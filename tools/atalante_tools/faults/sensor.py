@@ -20,7 +20,7 @@ _FEET: Final = tuple(f"FOOT_{name.upper()}" for name in FEET)
 #: Vertical forces of the cells of a foot on the ground [N].
 _ON_GROUND: Final = {f"{cell}_ForceZ": 150.0 for cell in CELLS}
 #: Permanent communication faults that must not prevent the detection of a sensor fault.
-#: The last two affect messages that the sensor checks use.
+#: The last two faults delay messages that the sensor checks use.
 _TOLERATED: Final = {
     "FOOT_LEFT doubled": Fault("duplicate", "FOOT_LEFT_STATE"),
     "FOOT_LEFT a cycle late": Fault("delay", "FOOT_LEFT_STATE"),
@@ -42,7 +42,7 @@ def _imu(kind: str, cycles: int, *, tolerated: int) -> tuple[Case, ...]:
 
 
 def _stuck(node: str, cycles: int) -> tuple[Fault, ...]:
-    """Return a stuck encoder and a later restart of its drive. The restart references the encoder again."""
+    """Return two faults: a stuck encoder, and a later restart of its drive, which initialises the encoder again."""
     return Fault("encoder_stuck", node, 0, cycles), Fault("reset", node, cycles + 30, 3)
 
 
@@ -89,7 +89,7 @@ SCENARIOS: Final = (
             ),
             *(
                 Case(f"{1e3 * by:g} mrad for 100 cycles", (Fault("encoder_jump", _STILL, 0, 100, by=by),), node=_STILL)
-                for by in (0.025, -0.025, 0.1, -1.0)  # larger than 20 mrad, the motion possible in five cycles
+                for by in (0.025, -0.025, 0.1, -1.0)  # larger than 20 mrad, the largest possible motion in five cycles
             ),
             Case(
                 "25 mrad, permanent",

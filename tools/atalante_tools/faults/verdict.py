@@ -208,7 +208,7 @@ def _reported(run: Observation, expected: Expectation) -> list[Event]:
 def _recovery(run: Observation, case: Case, expected: Expectation) -> list[str]:
     found = (
         [] if case.phase is None else automatic_improvements(run, run.last_before_start)
-    )  # after power-on, the state improves without the operator
+    )  # a case that starts at power-on is exempt, because the start-up improves the state
     if run.pressed is None:
         return found
     restarted = _S.ACTIVE in (run.state(cycle) for cycle in range(run.pressed, run.last + 1))

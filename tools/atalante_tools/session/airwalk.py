@@ -205,7 +205,7 @@ def _walk_all(
     with ExitStack() as stack:
         robot_process = _start_robot(
             target, stack
-        )  # the subprocess imports its modules while the controllers are created
+        )  # start it early: it imports its modules while this process creates the controllers
         network, robot = atalante_dbc.load(), load_robot()
         exoskeleton, gait, controllers = _controllers(options.subject, robot, shapes)
         certificates: dict[str, Certificate] = {}
@@ -295,7 +295,7 @@ class _Walk:
 
     def _describe(self, state: State) -> str:
         statistics = self._controller.statistics
-        # The statistics start after the first completed step. Before, they contain no ratio.
+        # The statistics contain no ratio before the first step is completed.
         largest = f"   largest |e|/q_bound {statistics.max_ratio:.2f}" if statistics.cycles else ""
         return (
             f"{self._name:<11} step {statistics.steps:3d}/{self._steps}   t {state.time:6.1f} s   "
@@ -455,7 +455,7 @@ def _close(telemetry: TelemetryProcess, walked: Walked) -> None:
     summary = telemetry.close()
     walked.recording, walked.can_log_complete = summary.recording, summary.can_log_complete
     for notice in summary.notices:
-        if notice not in telemetry.notices:  # messages from the start of the telemetry are already printed
+        if notice not in telemetry.notices:  # the messages in `telemetry.notices` are already printed
             say(notice)
     if not summary.complete and not summary.notices:
         say("the telemetry process ended unexpectedly: the recording may be truncated")
@@ -463,7 +463,7 @@ def _close(telemetry: TelemetryProcess, walked: Walked) -> None:
 
 def _result(certificate: Certificate, controller: AirwalkController, hal: Hal, statistics: Statistics) -> Result:
     walking = controller.statistics
-    # The statistics omit the first step, so a run of one step leaves only its last cycle, which is too little.
+    # The statistics start after the first step, so after a run of one step they contain only a single cycle.
     counted = walking.steps >= 2
     return Result(
         shape=certificate.shape,

@@ -30,7 +30,7 @@ POLL_TIMEOUT: Final = 0.02
 #: Number of SYNCs that a new pendant answers with the signals of the older pendant. In this time the older pendant stops sending.
 #: If the signals of the two pendants differed, the HAL would hold the robot after four cycles.
 COPY_SYNCS: Final = 20
-#: Number of SYNCs that `pendant stop` and `pendant hold` answer.
+#: Number of SYNCs that `atalante pendant stop` and `atalante pendant hold` answer, 0.5 s.
 PRESS_SYNCS: Final = 500
 #: Number of SYNCs answered with STOP at the end of `pendant start` and `pendant xi`.
 STOP_SYNCS: Final = 20
@@ -146,7 +146,7 @@ class Session:
         self.press_stop()
 
     def _release_after_loss(self) -> None:
-        """Release the dead-man switch after a lost link: the operator must press it again."""
+        """Release the dead-man switch after the link to the bus was lost, so that the operator must press it again."""
         self._lost_before = self._losses()
         self.node.dead_man = False
         self.start_wanted = self._start_typed = False

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 #: Timeout of the answers to a SYNC on the wall clock: half a cycle [s].
 PATIENCE: Final = 0.5e-3
-#: Timeout of the answers to a SYNC in lock-step, for slow computers [s].
+#: Timeout of the answers to a SYNC in lock-step [s]. It is long, because the other process may run on a slow computer.
 LOCKSTEP_PATIENCE: Final = 2.0
 
 
@@ -131,7 +131,7 @@ def open_hal(
         Failed: If the embedded robot needs PyBullet and it is not installed.
         Stopped: If a signal arrived before or during the start.
     """
-    check_stop()  # an import may have discarded the exception of a stop signal
+    check_stop()  # imports before this call may have discarded the exception that a stop signal raised
     network = network or atalante_dbc.load()
     robot = robot or load_robot()
     with ExitStack() as stack:

@@ -20,11 +20,11 @@ from atalante_hal.wire.e2e import COUNTER_BYTE, MAX_DELTA, Check
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Shortest time in which a new pendant sends before it may stop [cycles]. In this time the older pendant stops sending.
+#: Shortest time for which a new pendant sends before it may stop [cycles]. In this time the older pendant stops sending.
 TAKEOVER_CYCLES: Final = 50
-#: Shortest time in which a pendant sends again after a silence before it may stop again [cycles].
+#: Shortest time for which a pendant sends after a silence before it may stop sending again [cycles].
 RETRY_CYCLES: Final = 8
-#: Range of the random time that is added to `TAKEOVER_CYCLES` and `RETRY_CYCLES` [cycles].
+#: Upper limit of the random time that is added to `TAKEOVER_CYCLES` or `RETRY_CYCLES` [cycles].
 DRAW_CYCLES: Final = 50
 #: Number of consecutive frames of another pendant after which a pendant stops sending. The HAL tolerates two senders for three
 #: cycles.
@@ -33,7 +33,7 @@ PRESENT_FRAMES: Final = 2
 LOST_FRAMES: Final = 3
 #: Time without a frame of another pendant after which a silent pendant sends again [cycles]. The HAL times out after 5.
 QUIET_CYCLES: Final = 3
-#: Values of `Check` for a frame with a valid CRC.
+#: E2E check results of a frame with a valid CRC, whether or not its counter is as expected.
 _INTACT: Final = (Check.OK, Check.SOME_LOST, Check.REPEATED, Check.CONFLICT, Check.WRONG_SEQUENCE)
 
 
@@ -52,7 +52,7 @@ class Takeover:
         Args:
             established: Whether this pendant sends from the beginning, and stops for each new pendant.
             quiet: Time without a frame of another pendant after which this pendant sends again [cycles].
-            seed: Seed of the random cycles. None: random seed of the operating system.
+            seed: Seed of the random times. None: random seed of the operating system.
         """
         self._quiet, self._random = quiet, Random(seed)
         self._sending = self.established = established
@@ -60,13 +60,13 @@ class Takeover:
         self._tag = -1  # counter of the answers to the present SYNC; -1 before the first SYNC
         self._cycle = 0  # number of SYNCs
         self._free_from = 0  # cycle from which this pendant may stop sending
-        self._quiet_from = 0  # first cycle without a frame of another pendant
+        self._quiet_from = 0  # cycle from which the silence of other pendants is counted
         self._heard_at = -MAX_DELTA - 1  # cycle of the last frame of another pendant
         self._heard = 0  # consecutive frames of another pendant
 
     @property
     def present(self) -> bool:
-        """Return whether another pendant sends."""
+        """Return whether frames of another pendant are being received."""
         return self._heard >= PRESENT_FRAMES and self._cycle - self._heard_at <= MAX_DELTA
 
     @property
@@ -80,7 +80,7 @@ class Takeover:
         self._free_from = self._cycle + 1 + TAKEOVER_CYCLES + self._random.randrange(DRAW_CYCLES)
 
     def sync(self, tag: int) -> None:
-        """Begin a cycle with a SYNC.
+        """Process a SYNC received from the HAL: decide whether this pendant answers it.
 
         Args:
             tag: Counter of the answers to this SYNC, 0 to 255.

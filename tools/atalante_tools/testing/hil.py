@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 #: Longest time for which the emulated robot waits for the frames of a cycle on a CAN interface [s].
 _POLL: Final = 0.01
-#: Time without a frame after which a CAN interface counts as free for an emulated robot [s].
+#: Time to listen on a CAN interface before the emulated robot uses it [s]. Without a frame in this time, it counts as free.
 _QUIET: Final = 0.15
 #: Largest number of frames in a recording, about 30 s.
 KEPT: Final = 600_000
@@ -83,7 +83,7 @@ def emulated_robot(network: Network, robot: Robot, robot_bus: Bus) -> Iterator[E
         robot: joint properties.
         robot_bus: bus of the robot.
     """
-    with open_body(robot) as body:  # if PyBullet is missing, the error names the package to install
+    with open_body(robot) as body:  # called before the imports, because its error names the missing package
         from atalante_emulator.emulator import Emulator
         from atalante_emulator.pendant import Operator
 
@@ -107,7 +107,7 @@ def connect(hal_bus: Bus, emulator: Emulator) -> Callable[[], object] | None:
 
 
 class Stepper:
-    """HAL loop that runs cycle by cycle. The default `controller` holds the pose in which the robot became ACTIVE."""
+    """HAL loop whose cycles are run by the test. The default `controller` holds the pose in which the robot became ACTIVE."""
 
     def __init__(self, hal: Hal, clock: Clock) -> None:
         self.hal = hal
@@ -117,7 +117,7 @@ class Stepper:
 
     @property
     def state(self) -> State:
-        """Return the state of the last cycle."""
+        """Return the state that the HAL read in the last cycle."""
         return self.hal.state
 
     @property
@@ -126,7 +126,7 @@ class Stepper:
         return [event.code for event in self.hal.events]
 
     def cycle(self) -> State:
-        """Run one cycle and return the state of the HAL."""
+        """Run one cycle and return the state that the HAL read in it."""
         self._clock.wait()
         state = self.hal.read()
         if self.hal.moving:

@@ -222,7 +222,7 @@ def hal(
     _atalante_robot: Robot,
     recorded_run: Recording,
 ) -> Iterator[Hal]:
-    """Return a HAL on the bus. After the test it changes to HOLD."""
+    """Return a HAL on the bus. After the test, the HAL is stopped in HOLD."""
     from atalante_hal.hal import Hal
     from atalante_tools.session.rig import LOCKSTEP_PATIENCE, PATIENCE
 

@@ -228,7 +228,7 @@ def _number(
     changes = np.flatnonzero(word[1:] != word[:-1]) + 1
     if len(changes) * 4 > len(word):
         return _parse_digits(word)
-    runs = np.concatenate([[0], changes])  # equal words of consecutive lines (their seconds) are parsed once
+    runs = np.concatenate([[0], changes])  # consecutive lines with equal words, such as the seconds, are parsed once
     number, valid = _parse_digits(word[runs])
     lengths = np.diff(runs, append=len(word))
     return number.repeat(lengths), valid.repeat(lengths)

@@ -72,7 +72,7 @@ def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
         except (*UNREADABLE, _mdf_error()) as error:
             broken = " ".join(str(error).split()) or type(error).__name__
         if broken and log.suffix == ".mf4":
-            gc.collect()  # deletes the half-opened file while `_quiet_asammdf` suppresses its error
+            gc.collect()  # destroys the half-opened MDF object now, while `_quiet_asammdf` suppresses its error
     if batch.count:
         yield batch.take()
     _remark(log, count, broken, ends_within, warnings)

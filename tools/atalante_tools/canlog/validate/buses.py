@@ -23,7 +23,7 @@ class ChannelMap:
     """
 
     def __init__(self, plan: Plan, named: Mapping[str, str]) -> None:
-        """Create a map without channels.
+        """Create a map for a log of which no frames have been read yet.
 
         Args:
             plan: compiled DBC.

@@ -28,7 +28,7 @@ _SPONTANEOUS = {(s, f) for s in DriveState for f in (_S.FAULT_REACTION_ACTIVE, _
 LEGAL = {(int(state), int(after)) for (state, _), after in TRANSITIONS.items()} | {
     (int(a), int(b)) for a, b in _SPONTANEOUS
 }
-#: Pairs (state, controlword) that need no response: a quick stop without acknowledgement, and a fault that is still present.
+#: Pairs (state, controlword) that need no response: the quick stop may lack its acknowledgement, the fault may still be present.
 EXEMPT = {(int(_S.QUICK_STOP_ACTIVE), int(_C.ENABLE_OPERATION)), (int(_S.FAULT), int(_C.FAULT_RESET))}
 _NOTHING = -1
 

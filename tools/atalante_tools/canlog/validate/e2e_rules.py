@@ -14,7 +14,7 @@ from atalante_tools.canlog.validate.findings import Findings
 
 Steps = npt.NDArray[np.int64]
 
-#: Increment of the alive counter in a repeated frame, and code for a frame without a counter or without a previous frame.
+#: Increment of the alive counter in a repeated frame; value for a frame without a counter or without a previous frame.
 REPEATED, NO_STEP = 0, -1
 
 

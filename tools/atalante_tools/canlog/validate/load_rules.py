@@ -54,8 +54,8 @@ class LoadRules:
         self._over, self._limit = project.number("bus-load", "over_nominal"), project.number("bus-load", "limit")
         self._of_row = np.array([self._layout_time(row) for row in range(len(plan.layouts))] + [0.0])
         self._bus_of_row = np.append(plan.bus_of_row, 0)
-        self._numbers: list[npt.NDArray[np.int64]] = []  # window numbers of each chunk, shape (windows,)
-        self._busy: list[npt.NDArray[np.float64]] = []  # wire time in each chunk [s], shape (windows, buses)
+        self._numbers: list[npt.NDArray[np.int64]] = []  # per chunk: numbers of its windows, shape (windows,)
+        self._busy: list[npt.NDArray[np.float64]] = []  # per chunk: wire times [s], shape (windows, buses)
         #: Start time of each window with a frame [s], set by `finish`. Shape (windows,).
         self.begins: npt.NDArray[np.float64] = np.zeros(0)
         #: Bus load in each window, 1 at full load, set by `finish`. Shape (windows, buses).

@@ -1,4 +1,4 @@
-"""Time base of a lock-step bus: time stamps that follow the cycle of SYNC instead of the wall clock.
+"""Time base of a lock-step bus: time stamps computed from the cycle number in SYNC instead of the wall clock.
 
     chunk with wall-clock stamps -> lock-step clock -> chunk with stamps in robot time -> rules
 
@@ -22,19 +22,19 @@ Stamps = npt.NDArray[np.int64]
 
 #: Signal of SYNC that contains the cycle number.
 CYCLE: Final = "Cycle"
-#: Time after a SYNC from which the wall clock counts, because the loop has stopped [ns].
+#: Time without a SYNC after which the loop of the HAL counts as stopped and the stamps follow the wall clock [ns].
 PAUSE_NS: Final = 200_000_000
-#: Largest step of the cycle number between two SYNCs. A larger step (restarted HAL, damaged frame) counts as one cycle.
+#: Largest accepted increment of the cycle number between two SYNCs. A larger one (restarted HAL, damaged frame) counts as 1.
 MOST_STEPS: Final = 1000
-#: Distance of the stamps of two frames in a cycle, and largest distance of a frame from its SYNC, as a share of the cycle.
+#: Time between the stamps of two consecutive frames in a cycle [ns]; latest stamp in a cycle, as a share of the cycle time.
 _SPACING_NS, _LAST = 1000, 0.7
 
 
 @dataclass
 class _Channel:
-    """Robot time of one channel after its last frame."""
+    """State of the clock for one channel, after the last frame of the channel."""
 
-    sync: int = -1  # row of the SYNC that counts the cycles: the first one received; -1: none yet
+    sync: int = -1  # row of the SYNC message that was received first, whose cycle number is used; -1: none yet
     cycle: int = 0  # cycle number of the last SYNC
     begin: int = 0  # robot time of the last SYNC [ns]
     wall: int = 0  # wall clock of the last SYNC [ns]
@@ -100,7 +100,7 @@ class LockStepClock:
         limit = int(_LAST * self._plan.cycle_ns[channel.sync])
         since = wall - np.array(walls)[number]
         stamps = np.array(begins)[number] + np.where(since > PAUSE_NS, since, np.minimum(_SPACING_NS * place, limit))
-        if not walls[0]:  # no SYNC before the first one of this chunk
+        if not walls[0]:  # no earlier chunk had a SYNC
             stamps[: syncs[0]] = np.minimum(wall[: syncs[0]], begins[1])
         stamps = np.maximum.accumulate(np.maximum(stamps, channel.last))
         channel.last, channel.count = int(stamps[-1]), int(place[-1]) + 1

@@ -169,7 +169,7 @@ class _Quaternion:
 
 
 class _Columns:
-    """Store of the last raw codes of some fields of a family. It pairs each frame with the previous frame of its message."""
+    """Pairing of each frame with the previous frame of its message, for some fields of a family. It stores the last raw codes."""
 
     def __init__(self, family: Family, indices: Sequence[int]) -> None:
         self._indices = np.array(indices, np.intp)

@@ -1,4 +1,4 @@
-"""Rules for the order within a cycle: SYNC first, then every state of its bus before the deadline."""
+"""Rules for the order of frames in a cycle: first SYNC, then the states of all nodes of the bus before a deadline."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ class _Bus:
     cycle_ns: float
     count: int = 0  # SYNC frames so far
     stamp: int = 0  # time stamp of the last SYNC frame [ns]
-    cycle_of: dict[int, int] = field(default_factory=dict)  # cycle of the last state frame, by row
-    jump_of: dict[int, int] = field(default_factory=dict)  # cycles between the last two state frames, by row
+    cycle_of: dict[int, int] = field(default_factory=dict)  # SYNC cycle of the last state frame, by row
+    jump_of: dict[int, int] = field(default_factory=dict)  # SYNC cycles between the last two states, by row
     doubtful: dict[int, int] = field(
         default_factory=dict
-    )  # time stamp of a second state frame in one cycle [ns], by row
+    )  # time stamp of a second state frame in one cycle, if the next cycle is not known yet [ns], by row
 
 
 class OrderRules:
-    """Rules for the cycle of each state frame and for its delay after the SYNC frame."""
+    """Rules that check whether each state frame comes in the right SYNC cycle, and soon enough after its SYNC frame."""
 
     def __init__(self, plan: Plan, findings: Findings, project: Project) -> None:
         self._findings = findings

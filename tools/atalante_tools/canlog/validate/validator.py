@@ -1,4 +1,4 @@
-"""Validator of one log: applies all rules to each chunk, then the rules about the whole log.
+"""Validator of one log. It checks each chunk of frames, and at the end of the log applies the rules about the whole log.
 
 chunk -> headers (frame_rules) -> sort by message (stream) -> CRC, counters, time -> payloads by family -> values, motion, drives
 """
@@ -35,7 +35,7 @@ class Validator:
     def __init__(
         self, plan: Plan, project: Project | None = None, *, node: str | None = None, keeps_flags: bool = True
     ) -> None:
-        """Create a validator without frames.
+        """Create a validator that has not received any frames yet.
 
         Args:
             plan: compiled DBC; several validators may share it.
@@ -59,7 +59,7 @@ class Validator:
         self.motion = MotionRules(self.plan, self.findings, self.project)
         self.drives = DriveRules(self.plan, self.findings, self.project)
         self._family_of = {row: family for family in self.plan.families for row in family.rows}
-        #: Number of rejected frames since the last valid frame, by row.
+        #: Number of rejected frames of each message since its last valid frame.
         self._pending = np.zeros(len(self.plan.layouts), np.int64)
         self._groups = [row for row, m in enumerate(self.plan.layouts) if m.pgn_mask != _ALL_BITS]
         self._address: dict[int, int] = {}

@@ -31,7 +31,7 @@ from atalante_tools.session.body import require_engine
 if TYPE_CHECKING:
     from atalante_emulator.faults import Fault
 
-#: Timeouts of the answer to a SYNC, of the start of the robot, and of the end of the child [s].
+#: Longest waits for the answer to a SYNC, for the creation of the robot, and for the end of the child [s].
 _PATIENCE, _START, _END = 2.0, 60.0, 5.0
 
 
@@ -48,7 +48,7 @@ class SpawnConfig:
 
 
 class EmbeddedRobot(Closing):
-    """Subprocess with the embedded robot. Used as a context manager, it is closed after the block.
+    """Subprocess with the embedded robot. As a context manager, it closes itself after the block.
 
     Create it early: the child imports its modules while the parent prepares the run.
 
@@ -96,7 +96,7 @@ class EmbeddedRobot(Closing):
         return self._child.pid
 
     def begin(self, config: SpawnConfig) -> None:
-        """Send the description of the robot to the child, and wait until the child created the robot.
+        """Send the description of the robot to the child, and wait until the child has created the robot.
 
         Args:
             config: Description of the robot to create.
@@ -107,7 +107,7 @@ class EmbeddedRobot(Closing):
         pipe = self._child.stdin
         assert pipe is not None
         self._begun = True
-        # The pipe is broken if the child already ended. `meet` then raises `BusDown` with the reason.
+        # The pipe is broken if the child has already ended. Then `wait_until_served` raises `BusDown` with the reason.
         with suppress(BrokenPipeError), pipe:
             pickle.dump(config, pipe)
         try:
@@ -126,7 +126,7 @@ class EmbeddedRobot(Closing):
             if not self._open:
                 os.sched_setaffinity(0, self._cores)
         if not self._begun:
-            self._child.kill()  # the child did not create a robot yet, so it can be killed
+            self._child.kill()  # the child still imports its modules or waits for its `SpawnConfig`, so nothing is lost
         try:
             self._child.wait(_END)
         except subprocess.TimeoutExpired:

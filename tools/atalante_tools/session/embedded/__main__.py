@@ -15,7 +15,7 @@ from atalante_hal.bus.shared import SharedBus
 from atalante_tools.session.body import no_banner, open_described
 from atalante_tools.session.embedded import SpawnConfig
 
-with no_banner():  # these imports are slow and run while the parent prepares its part
+with no_banner():  # these imports are slow; they run while the parent prepares the run
     from atalante_emulator.emulator import Emulator
     from atalante_emulator.pendant import Operator
 
@@ -38,7 +38,7 @@ def emulate(bus: SharedBus, config: SpawnConfig) -> None:
 
 
 def main(memory: str, bell: str) -> None:
-    """Read the description of the robot from stdin, and emulate the robot. Report an error to the parent on the bus.
+    """Read the description of the robot from stdin, and emulate the robot. Send the reason of a failure to the parent.
 
     Args:
         memory: File descriptor of the shared memory, as text.
