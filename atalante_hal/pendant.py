@@ -40,7 +40,7 @@ def demand_of(signals: Sequence[float]) -> Demand:
 
 
 def safest(demands: Iterable[Demand]) -> Demand:
-    """Combine the demands of several frames into the safest demand.
+    """Combine the dead-man switch and the stop request of several frames into the safest `Demand`.
 
     The dead-man switch counts as pressed only if it is pressed in every frame. One frame with STOP is sufficient for STOP.
 

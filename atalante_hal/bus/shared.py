@@ -91,12 +91,12 @@ class SharedBus:
 
     @property
     def stamps(self) -> Stamps:
-        """Return the time of the last `receive()` with frames, repeated for each frame. Shape (capacity,), int64 [ns]."""
+        """Return the time of the last `receive()` that returned frames, once for each frame. Shape (capacity,), int64 [ns]."""
         self._stamps.fill(self._received_at)
         return self._stamps
 
     def send(self, frames: Frames) -> None:
-        """Queue a copy of the frames for the other end; drop them if it is closed.
+        """Queue a copy of the frames for the other end; drop the frames if the other end is closed.
 
         Args:
             frames: Frames to send, shape (n,).

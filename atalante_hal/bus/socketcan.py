@@ -31,7 +31,7 @@ SO_RXQ_OVFL: Final = 40
 SIOCGIFFLAGS: Final = 0x8913
 SIOCGIFMTU: Final = 0x8921
 IFF_UP: Final = 1
-#: Error frames to receive (linux/can/error.h): transmit timeout, controller problem, bus-off, controller restarted.
+#: Classes of error frames to receive (linux/can/error.h): transmit timeout, controller problem, bus-off, controller restarted.
 ERROR_FRAMES = 0x0001 | 0x0004 | 0x0040 | 0x0100
 LINK_DOWN: Final = errno.ENETDOWN
 #: Error codes of a removed interface. The socket stays unbound, even if an interface of the same name is created later.
@@ -263,7 +263,7 @@ class SocketCanBus:
                 frame["data"][8:] = 0
 
     def _read_control(self, count: int) -> None:
-        """Read time stamps and drop counter of the received frames, then reset the control buffers."""
+        """Read the time stamps and the drop counter of the received frames, then reset the control buffers."""
         stamps = self.stamps[:count]
         np.multiply(self._seconds[:count], 1_000_000_000, out=stamps)
         np.add(stamps, self._nanoseconds[:count], out=stamps)

@@ -42,7 +42,7 @@ class Dtc(StrEnum):
     severity: Severity
     #: Short description for the operator.
     meaning: str
-    #: Integer with one bit set, which represents this code in a bit set.
+    #: Bit of this code in a bit set, as an integer with only this bit set.
     bit: int
 
     def __new__(cls, code: str, reaction: Reaction, severity: Severity, meaning: str) -> Dtc:

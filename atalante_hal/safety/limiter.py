@@ -177,7 +177,7 @@ def limit(
         too_fast_down = (-velocity - limits.velocity_max[joint]) / limits.velocity_margin
         up = torque_limit[joint] * share(max(too_high, too_fast_up))
         down = torque_limit[joint] * share(max(too_low, too_fast_down))
-        # If the torque limit falls below the torque of the last cycle, its magnitude decreases at the rate limit.
+        # If the torque limit falls below the torque of the last cycle, the torque decreases at the rate limit.
         lowest, highest = last[joint] - limits.step[joint], last[joint] + limits.step[joint]
         sent = min(max(asked[joint], within(-down, lowest, highest)), within(up, lowest, highest))
         cut[joint] = sent != asked[joint]

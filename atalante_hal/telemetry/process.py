@@ -201,7 +201,7 @@ class TelemetryProcess(Closing):
             patience=config.patience,
             meta=meta,
         )
-        #: Function that copies the record of a cycle, shape (layout.size,), to the ring. A memoryview is faster than an array.
+        #: Function that copies the record of a cycle, shape (layout.size,), to the ring. A memoryview is fastest.
         self.write = self.records.write
         self.events = RingWriter(EVENT_BYTES, EVENT_SLOTS)
         self.frames: RingWriter | None = None

@@ -76,7 +76,7 @@ class Service:
         self._lost, self._lost_reported = 0, -math.inf
         self._recorder, self._saved = recorder, 0  # recorder, and its number of saved messages at the last check
         self._handled = 0  # number of records whose messages have been passed to all sinks
-        self._kept = 0  # number of records reported as saved so far in the header of the ring
+        self._kept = 0  # number of records that the header of the ring reports as saved
         self.notices: list[str] = []  # faults, one sentence each
 
     def run(self, stop: Sequence[object]) -> None:

@@ -215,7 +215,7 @@ class ReceiveImage:
         return self._received
 
     def _accept(self, received: _Received, tag: int | None) -> bool:
-        """Commit a perfect cycle in one pass, as a fast path instead of `new_cycle` and `accept_each`.
+        """Commit a perfect cycle in one pass. This fast path replaces `new_cycle` and `accept_each`.
 
         Args:
             received: frames of the cycle.
@@ -443,8 +443,8 @@ def judge_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int, re
         return _CRC
     counter = int(octets[begin + COUNTER_BYTE])
     in_time = tag == _NO_TAG or tag - counter & 0xFF < LATEST
-    # If a message was missing for half the counter period, its counter no longer gives the order of the frames. Then a frame
-    # is new if it answers one of the last `LATEST` SYNCs.
+    # After a gap of half the counter period, the counter of a message no longer gives the order of its frames.
+    # Then a frame is new if it answers one of the last `LATEST` SYNCs.
     back = tag != _NO_TAG and in_time and expected[row] != NOTHING and silent[row] >= _HALF_TURN
     result = judge_counter(expected[row], counter)
     if back and result == _REPEATED:
@@ -456,8 +456,8 @@ def judge_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int, re
             return _CONFLICT
         result = _CONFLICT
     elif tag != _NO_TAG and not back:
-        # A frame that answers no recent SYNC, or an earlier SYNC than the last accepted frame, must not change the expected
-        # counter.
+        # The expected counter must not change if a frame answers no recent SYNC.
+        # It must not change either if the frame answers an earlier SYNC than the last accepted frame.
         backwards = expected[row] != NOTHING and counter - expected[row] + 1 & 0xFF >= _HALF_TURN
         if not in_time or backwards:
             return _WRONG_SEQUENCE

@@ -155,7 +155,7 @@ class Legs:
                 continue
             change = comparison.errors[axis] - moved.errors[axis]
             turned = max(abs(angle - moved.angles[i]) for i, angle in enumerate(comparison.angles))
-            # If the leg has not turned, its encoder is not stuck: the deviation changed because of a jump or a drift.
+            # If the leg has not turned, a changed deviation is no evidence of a stuck encoder. It results from a jump or a drift.
             allowed = self._attitude_change + self._misalignment * turned + comparison.doubt + moved.doubt
             if min(abs(change), turned) <= allowed:
                 self._turned[joint] = 0
