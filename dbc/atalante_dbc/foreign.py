@@ -352,7 +352,7 @@ def _definitions(database: Database) -> Mapping[str, Any]:
 
 
 def _of(item: Any, name: str) -> object:
-    """Return the value of an attribute of a database, node, message or signal, else its default; None if it is undefined."""
+    """Return the value of an attribute, or its default if the value is not set; None if the attribute is not defined."""
     if item.dbc is None:
         return None
     attributes, definitions = item.dbc.attributes or {}, item.dbc.attribute_definitions or {}

@@ -266,7 +266,7 @@ def _invalid_raw(signal: RawSignal) -> int | None:
 
 
 def _attribute(item: Any, name: str) -> int | str:
-    """Return the value of an attribute of a node, message or signal, else its default; for an enumeration, the name."""
+    """Return the value of an attribute, or its default if the value is not set. An enumeration value is returned by name."""
     attributes = item.dbc.attributes if item.dbc is not None else {}
     if name in attributes:
         definition, value = attributes[name].definition, attributes[name].value

@@ -362,7 +362,7 @@ class Drives:
     def _check_temperature(self) -> None:
         """Reduce the torque limit of hot drives and switch off drives above the trip temperature."""
         temperature, parameters = self.motors.temperature, self.parameters
-        # The HAL computes the same limit from the rounded temperature of the state frame.
+        # The temperature is rounded as in the state frame, from which the HAL computes the same limit.
         self._own_limit[:] = self._robot.torque_limit(np.rint(temperature))
         for drive, degrees in enumerate(temperature.tolist()):
             if degrees >= parameters.trip_temperature:

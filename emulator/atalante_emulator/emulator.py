@@ -140,7 +140,7 @@ class Emulator:
         syncs = [m for m in received if m.name.startswith("SYNC_")]
         # An embedded bus delivers the commands of the previous cycle, then SYNC. The process image has the same order.
         self._rx = ReceiveImage([m for m in received if m not in syncs] + syncs)
-        self._rx.values.fill(0.0)  # before the first command: zero torque, zero vibration, HAL state OFF
+        self._rx.values.fill(0.0)  # values until the first command: zero torque, zero vibration, HAL state OFF
         self._scratch = new_frames(_RECEIVE_BUDGET)
         self._scratch_from = [self._scratch[offset:] for offset in range(_RECEIVE_BUDGET)]
         self._waiting = 0  # number of frames in the scratch buffer whose SYNC has not arrived yet

@@ -41,7 +41,7 @@ class Kind:
     does: str  # description of the effect in one line
     targets: str  # valid targets: message, node, bus, or a type of node
     parameters: Mapping[str, Parameter] = field(default_factory=dict)  # name -> definition
-    signals: bool = False  # whether signals of the target message are parameters too
+    signals: bool = False  # whether the signals of the target message are additional parameters
 
 
 def _number(low: float, high: float, unit: str = "", *, default: float | None = None) -> Parameter:

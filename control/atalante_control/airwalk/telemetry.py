@@ -30,7 +30,7 @@ class Telemetry:
 
 
 _DTYPE = dtype_of(Telemetry)
-#: Name and width of each published field, in the order of the record.
+#: Name and number of values of each published field, in the order of the record.
 TELEMETRY_FIELDS = tuple(
     ({"gate": "lambda"}.get(name, name), _DTYPE[name].itemsize // 8) for name in _DTYPE.names or ()
 )

@@ -104,7 +104,7 @@ def _checked_directory(archive: zipfile.ZipFile, allowed: Collection[str], size_
 
 
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
-    """Return the bytes of a member after a check of their number against the declared size. zipfile checks the CRC-32."""
+    """Return the content of a member after a check that it has the declared size. zipfile checks the CRC-32."""
     with archive.open(member) as stream:
         # `read()` without a limit would decompress the whole member, even if it is larger than declared.
         content = stream.read(member.file_size + 1)

@@ -58,7 +58,7 @@ class _Block(NamedTuple):
 
     expression: Symbol  # SX
     x: Symbol  # SX symbols of the unknowns of one repetition, shape (n,)
-    at: Indices  # indices of the unknowns, shape (repetitions, n)
+    at: Indices  # indices of the unknowns of each repetition, shape (repetitions, n)
     weights: Vector | None  # weight of each repetition in the objective; None: the expression is part of g
 
 

@@ -22,8 +22,8 @@ class Requirements:
     sole_share: float = 0.6  # fraction of the sole in which the centre of pressure must be
     cell_share: float = 0.8  # fraction of the rectangle between the force cells in which the centre of pressure must be
     yaw_lever: float = 0.03  # m, largest ratio of yaw moment about the sole centre to vertical ground force
-    #: Required height of the swing sole at mid-swing [m]. Over the step it is scaled by sin(pi t / T)^2; for a start or stop step
-    #: the exponent is 4.
+    #: Required height of the swing sole at mid-swing [m]. At other times it is multiplied by sin(pi t / T)^2.
+    #: For start and stop steps this factor is sin(pi t / T)^4.
     clearance: float = 0.05
     corridor: tuple[float, float] = (0.17, 0.28)  # m, smallest and largest lateral distance of the ankles
     roll: float = math.radians(5.0)  # rad, largest roll of the pelvis

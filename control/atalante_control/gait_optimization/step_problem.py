@@ -149,7 +149,7 @@ class StepProblem:
     def residuals(
         self, unknowns: Vector, rows: Vector, bounds: tuple[Vector, Vector], duration: float
     ) -> dict[str, Residual]:
-        """Return the largest violation of each group of constraints, in its unit.
+        """Return the largest violation of each group of constraints, in the SI unit of the group.
 
         Args:
             unknowns: result of `unknowns`; its torques and ground forces follow from the motion.

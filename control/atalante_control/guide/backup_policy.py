@@ -184,7 +184,7 @@ class Curve(NamedTuple):
 
 
 def forced_response(policy: BackupPolicy, curve: Curve) -> ForcedResponse:
-    """Return P of one joint over a step and, after T, along the nominal trajectory of the next step.
+    """Return the undisturbed solution P of one joint over a step and, after T, along the nominal trajectory of the next step.
 
     P is linear in the deviations at the step change, so a step change only adds two tables: P = nominal + s(0) deviation +
     s'(0) rate.

@@ -196,7 +196,7 @@ class GuideFilter:
         return np.array(rolled).swapaxes(1, 2).reshape(4, len(points))
 
     def solution(self) -> Vector:
-        """Return P of this step at every cycle, (e, e') of SH, then of SK. Shape (horizon + 1, 4) [rad, rad/s]."""
+        """Return the solution P of this step at every cycle: (e, e') of SH, then of SK. Shape (horizon + 1, 4) [rad, rad/s]."""
         hip, knee = self.tables.step[:, :, P : P + 2]
         return np.hstack([hip, knee])
 

@@ -113,7 +113,7 @@ class Pid:
         self.records[0].integral[:] = 0.0
 
     def start_step(self, stance: int, share: Vector) -> None:
-        """Set the gains of each leg according to its role.
+        """Set the gains of each leg for its role as stance leg or swing leg.
 
         Args:
             stance: stance leg, LEFT or RIGHT.

@@ -50,7 +50,7 @@ class Inertia:
         return Inertia(self.mass, mirrored(self.centre), (xx, -xy, xz, yy, -yz, zz))
 
     def fused(self, other: Inertia) -> Inertia:
-        """Return the mass properties of this body and another body fixed to it (parallel axis theorem).
+        """Return the combined mass properties of this body and another body fixed to it (parallel axis theorem).
 
         Args:
             other: mass properties of the second body in the same link frame.

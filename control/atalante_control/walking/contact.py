@@ -1,4 +1,4 @@
-"""Step switch on the ground: `foot force, time in the step -> step change`.
+"""Detection of the step change on the ground: `foot force, time in the step -> step change`.
 
 On the ground a step ends when the swing foot has carried load for several consecutive cycles, but not before a given fraction
 of the step has passed. In the air a step ends by time (`gait.step_over`).
@@ -20,7 +20,7 @@ class ImpactConfig:
 
     impact_force: float = 80.0  # N, smallest vertical force on the swing foot that counts as an impact
     release_force: float = 30.0  # N, the force must fall below this value in a step before an impact counts
-    debounce: int = 5  # number of consecutive cycles with at least impact_force
+    debounce: int = 5  # number of consecutive cycles with at least impact_force that count as an impact
     earliest: float = 0.5  # fraction of the step duration before which no impact counts
 
     def __post_init__(self) -> None:
