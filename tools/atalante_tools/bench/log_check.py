@@ -24,7 +24,7 @@ from atalante_tools.canlog.column_codec import crc_differences, crc_of_zeros
 from atalante_tools.canlog.plan import Plan
 from atalante_tools.canlog.validate.project import Project
 
-#: Length of the recording in a normal and in a quick run [cycles]. It is a multiple of the period of every message.
+#: Length of the recording in a normal and in a quick run [cycles]. Each is a multiple of the period of every message.
 _CYCLES, _QUICK_CYCLES = 2000, 300
 #: Number of repetitions of the recording in the log, in a normal and in a quick run.
 _REPEATED, _QUICK_REPEATED = 25, 2

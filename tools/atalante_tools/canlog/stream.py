@@ -48,7 +48,7 @@ class Stream:
         return found
 
     def last(self, column: npt.NDArray[Any], carried: npt.NDArray[Any]) -> None:
-        """Store the last value of each message.
+        """Copy the last value of each message in the chunk to `carried`.
 
         Args:
             column: value of each frame, shape (n,).

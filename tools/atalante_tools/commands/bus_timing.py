@@ -49,8 +49,8 @@ class Latency:
 class BusTiming:
     """Measurement of the time from each SYNC to the states and commands on the same bus.
 
-    Both timestamps of a sample come from the same channel. Clocks of several adapters are never compared. A frame that arrives
-    after the next SYNC counts against that SYNC.
+    Both timestamps of a sample come from the same channel. Clocks of several adapters are never compared. The time of a
+    frame that arrives after the next SYNC is measured from that next SYNC.
 
     Attributes:
         skipped: Number of frames without a sample: received before the first SYNC, or with a timestamp before that of the SYNC.

@@ -32,7 +32,7 @@ QUEUE: Final = 1000
 FD_MTU: Final = 72
 #: SCHED_FIFO priority that the 1 kHz loop requests.
 PRIORITY: Final = 50
-#: Longest wait for a frame [s]. After it, clock and stop request are checked.
+#: Longest wait for a frame [s]. After this time, clock and stop request are checked.
 POLL_TIMEOUT: Final = 0.02
 #: Linux file with the real-time limits of each user.
 LIMITS: Final = "/etc/security/limits.conf"

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 #: Period of the status line [s].
 STATUS_PERIOD: Final = 1.0
-#: Longest wait for a SYNC in lock-step [s]. After it, the stop request is checked.
+#: Longest wait for a SYNC in lock-step [s]. After this time, the stop request is checked.
 POLL_TIMEOUT: Final = 0.1
 #: Time to listen for another robot before the first frame [s]. Without a HAL, each node sends its status every 0.1 s.
 LISTEN: Final = 0.25

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from atalante_hal.bus import Bus
     from atalante_tools.commands.observer import Observer, Report
 
-#: Longest wait for a frame [s]. After it, clock and stop request are checked.
+#: Longest wait for a frame [s]. After this time, clock and stop request are checked.
 POLL_TIMEOUT: Final = 0.02
 _BLANK: Final = "-"
 

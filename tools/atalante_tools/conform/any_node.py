@@ -21,9 +21,9 @@ NMT: Final = {0: "BOOTUP", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE_OPERATIONAL
 _OFF: Final = 250
 #: Number of cycles for the test of the heartbeat, and for the test of the answers to SYNC.
 _HEARTBEAT_CYCLES, _ANSWER_CYCLES = 520, 200
-#: Largest relative deviation from the heartbeat period in the DBC: of the mean period, and of a single period.
+#: Largest accepted deviation of the mean heartbeat period, and of a single one, as a fraction of the period in the DBC.
 _MEAN, _SINGLE = 0.1, 0.5
-#: Number of random frames per cycle of the flood test, and number of its cycles. The bus load stays below 100 %.
+#: Flood test: number of random frames per cycle, and number of cycles. The bus load stays below 100 %.
 _FLOOD, _FLOOD_CYCLES = 6, 100
 #: Bits of SYNC that are flipped, one in each wrong SYNC: bits of the CRC, the HAL state and the cycle number.
 _DAMAGED: Final = (0, 5, 10, 15, *range(24, 32), *range(48, 56))
@@ -335,7 +335,7 @@ def _statuses(tester: NodeTester, received: list[ReceivedFrame] | None = None) -
 
 
 def _answered(tester: NodeTester, received: list[ReceivedFrame], cycles: int) -> Outcome:
-    """Return whether the number and the spacing of the state frames in `cycles` cycles are as expected."""
+    """Return the outcome: passed if the state frames in `cycles` cycles have the expected number and spacing."""
     period = tester.state_message.cycle_ms
     at = [frame.cycle for frame in received if frame.message is tester.state_message]
     if period == 1:

@@ -100,7 +100,7 @@ def ignores(bad: Callable[[Axis, int], Frames], *, may_hold: bool = False) -> Ca
 
 
 def ignores_a_jump(tester: NodeTester) -> Outcome:
-    """Test DRIVE-20: a jump of the alive counter has no effect."""
+    """Test DRIVE-20: a command with a jump of its alive counter has no effect."""
     axis = Axis(tester)
     axis.enable()
     received = axis.send(axis.bad_command(counter=(tester.command.counter + 100) & 0xFF))

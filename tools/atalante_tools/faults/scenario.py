@@ -17,7 +17,7 @@ from atalante_hal.types import SupervisorState
 if TYPE_CHECKING:
     from atalante_tools.faults.observation import Observation
 
-#: Default start of a case, as phase of the first walking step (0 to 1). Here the left leg swings with its largest velocity.
+#: Default start of a case, as phase of the first walking step (0 to 1). At this phase, the left leg swings fastest.
 MID_SWING: Final = 0.35
 
 

@@ -23,9 +23,9 @@ from atalante_tools.session.pendant_node import PendantNode, Request
 LISTEN: Final = 0.05
 #: Smallest number of SYNCs that a new pendant must receive before it sends.
 LISTEN_CYCLES: Final = 3
-#: Timeout of SYNC [s]. After it, the HAL counts as absent.
+#: Time without a SYNC after which the HAL counts as absent [s].
 HAL_TIMEOUT: Final = 1.0
-#: Longest wait for a frame [s]. After it, stop request and keyboard are checked.
+#: Longest wait for a frame [s]. After this time, stop request and keyboard are checked.
 POLL_TIMEOUT: Final = 0.02
 #: Number of SYNCs that a new pendant answers with the signals of the older pendant. In this time the older pendant stops sending.
 #: If the signals of the two pendants differed, the HAL would hold the robot after four cycles.

@@ -3,11 +3,11 @@
     SYNC and frames of other pendants -> PendantReader -> Takeover -> answer or silence
 
 A pendant answers each SYNC with a frame whose counter is the low byte of the signal Cycle. Only an intact frame with the counter
-of the present SYNC comes from another pendant. A damaged, old or replayed frame changes nothing.
+of the present SYNC counts as a frame of another pendant. A damaged, old or replayed frame changes nothing.
 
 A pendant that receives such frames stops sending and listens. If the other pendant continues, the listening pendant gives up. If
 no frame comes, it sends again. An established pendant stops at once, and a new pendant at a random cycle of its takeover. Two
-pendants that stop together therefore draw again, until one of them hears the other.
+pendants that stop together therefore send again after a new random time, until one of them hears the other.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ def emulated_robot(network: Network, robot: Robot, robot_bus: Bus) -> Iterator[E
         robot: joint properties.
         robot_bus: bus of the robot.
     """
-    with open_body(robot) as body:  # called before the imports, because its error names the missing package
+    with open_body(robot) as body:  # opened before the imports, because its error names the missing package
         from atalante_emulator.emulator import Emulator
         from atalante_emulator.pendant import Operator
 

@@ -32,7 +32,7 @@ class Options:
 
     interface: str  # python-can interface of the live bus; empty: check log files
     channel: str  # channels of the live bus
-    lockstep: bool  # judge times of the live bus by the cycle of SYNC
+    lockstep: bool  # True: stamp the frames of the live bus by the cycle number in SYNC
     seconds: float | None  # listening time on the live bus [s]; None: until Ctrl-C
     dbc: Path | None  # None: the DBC of the robot
     node: str | None  # require only the messages of this node; None: of all nodes

@@ -45,8 +45,9 @@ class _Channel:
 class LockStepClock:
     """Clock that replaces wall-clock stamps by robot time.
 
-    A frame gets the start time of its cycle and a small offset, in the order of arrival. The cycle number of the first SYNC has
-    the same stamp in both times. Before the first SYNC of a channel, and while SYNC pauses, the wall clock continues.
+    A frame gets the start time of its cycle and a small offset, in the order of arrival. The first SYNC has the same
+    stamp in robot time and on the wall clock. Before the first SYNC of a channel, and while SYNC pauses, the stamps follow the
+    wall clock.
 
     Args:
         plan: compiled DBC.
