@@ -14,7 +14,7 @@ uml_packages=(user-mode-linux kmod iproute2 can-utils)
 qemu_packages=(qemu-system-x86 linux-image-amd64 kmod iproute2 udev busybox-static can-utils)
 apt_wait=300 # s; another program may hold the lock of dpkg
 uml_boot_limit=60
-uml_limit=${VCAN_LANE_SECONDS:-900}
+uml_limit=${VCAN_LANE_SECONDS:-1500}
 qemu_limit=${VCAN_LANE_SECONDS:-2100}
 memory_mb=4096
 
