@@ -8,7 +8,7 @@ import pytest
 from atalante_dbc import load
 from atalante_hal import transceiver
 from atalante_hal.bus import BusDown, BusError, BusFull
-from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.fault_memory import FaultMemory
 from atalante_hal.transceiver import RECEIVE_BUDGET, HalDuplicate, Transceiver, TransmitDenied
 from atalante_hal.wire.frame import FLAG_FDF, ID_ERROR, ID_EXTENDED, Frames, new_frames
@@ -330,6 +330,7 @@ def test_foreign_frames_raise_their_diagnostic(desk: Desk, can_id: int, code: st
 
 def test_bus_off_lasts_until_it_is_acknowledged(desk: Desk):
     desk.transceiver.foreign(ids(ID_ERROR | 0x40))
+    assert desk.transceiver.faults() == [Finding(Dtc.BUS_OFF, "HAL", 0x40, True, "")]
     for _ in range(3):
         assert desk.judge() == {"BUS_OFF": True}
         assert not desk.transceiver.quiet

@@ -93,7 +93,7 @@ def walking(network: Network, robot: Robot, urdf_text: str) -> Iterator[type]:
             emulator = Emulator(network, robot, body, wire, operator=operator)
 
             def answer() -> None:
-                if not emulator.poll(0.001 if wire.down else 0.05) and wire.down:
+                if not emulator.poll(0.02 if wire.down else 0.05) and wire.down:
                     emulator.idle()  # a millisecond without SYNC
 
             hal = Hal(network, robot, buses[1], patience=PATIENCE)
