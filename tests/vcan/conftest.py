@@ -81,17 +81,6 @@ def spare_vcan(vcan: str) -> Iterator[str]:
         remove(channel)
 
 
-@pytest.fixture
-def four_vcans(vcan: str) -> Iterator[list[str]]:
-    """Names of four interfaces, up, one for each bus of the robot."""
-    channels = [f"vcanbus{number}" for number in range(4)]
-    for channel in channels:
-        create(channel)
-    yield channels
-    for channel in channels:
-        remove(channel)
-
-
 @contextmanager
 def repeated(work: Callable[[], object]) -> Iterator[None]:
     """`work` again and again in a thread of its own."""

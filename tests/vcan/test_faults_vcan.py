@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,8 +17,6 @@ from atalante_dbc import Network
 from atalante_emulator.body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
-from atalante_hal.bus import Bus
-from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.resilient import ResilientBus
 from atalante_hal.bus.socketcan import SocketCanBus
 from atalante_hal.hal import Hal
@@ -31,13 +29,6 @@ from tests.vcan.conftest import PATIENCE, Loop, as_root, create, remove, repeate
 
 S = SupervisorState
 ATALANTE = str(Path(sys.executable).with_name("atalante"))
-
-
-def opened(network: Network, channels: Sequence[str]) -> Bus:
-    """Open one channel for all buses of the robot, or one for each."""
-    if len(channels) == 1:
-        return SocketCanBus(channels[0])
-    return JoinedBus(network, dict(zip(network.buses, map(SocketCanBus, channels), strict=True)))
 
 
 @dataclass
@@ -78,12 +69,12 @@ class Line:
 
 @pytest.fixture
 def walking(network: Network, robot: Robot, urdf_text: str) -> Iterator[type]:
-    """`with walking(channel, ...) as line`: ACTIVE; with four channels, each bus of the robot has its own."""
+    """`with walking(channel) as line`: ACTIVE."""
 
     @contextmanager
-    def on(*channels: str) -> Iterator[Line]:
+    def on(channel: str) -> Iterator[Line]:
         with ExitStack() as stack:
-            buses = [opened(network, channels) for _ in range(2)]
+            buses = [SocketCanBus(channel) for _ in range(2)]
             for bus in buses:
                 stack.callback(bus.close)
             body = PyBulletBody(urdf_text)
@@ -194,21 +185,4 @@ def test_f16_a_removed_interface_ends_in_hold_and_is_used_again_when_it_is_back(
             line.reconnect()
             assert line.loop.cycles(60) is S.HOLD
             line.start()
-        assert line.loop.cycles(20) is S.ACTIVE, line.hal.reason
-
-
-def test_f16_one_of_four_interfaces_is_removed_and_comes_back(four_vcans: list[str], walking) -> None:
-    with walking(*four_vcans) as line:
-        line.loop.cycles(20)
-        lost = four_vcans[1]
-        remove(lost)
-        assert line.loop.cycles(2) is S.HOLD
-        assert f"{lost} was removed" in line.hal.reason
-        line.loop.cycles(30)
-        bus = line.hal.network.buses[1]
-        assert set(line.hal.missing()) == {m.sender for m in line.hal.network.messages if m.bus == bus} - {"HAL"}
-        assert line.drives_hold
-        create(lost)
-        line.reconnect()
-        line.start()
         assert line.loop.cycles(20) is S.ACTIVE, line.hal.reason

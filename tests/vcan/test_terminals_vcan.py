@@ -25,7 +25,7 @@ ROBOT, CONTROLLER, PENDANT = "robot", "controller", "pendant"
 TERMINALS = (ROBOT, CONTROLLER, PENDANT)
 #: Most cycles from the first one in which all three send until the robot is ACTIVE: two seconds of robot time.
 ACTIVE_BY = 2000
-SEEDS = range(8)
+SEEDS = (0, 1, 2, 5, 7)  # each kind of event once
 #: Events, one for each seed. A terminal is killed and restarted, or the interface goes down and up, or it is removed and created.
 EVENTS = (*TERMINALS, "down", "removed")
 
