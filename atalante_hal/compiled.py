@@ -116,12 +116,6 @@ def _callees(function: FunctionType) -> Iterator[tuple[str, FunctionType]]:
 def _compile_inputs(function: FunctionType) -> Iterator[bytes]:
     """Yield the bytes that determine the machine code: code, constants, record types, globals and called functions."""
     yield function.__qualname__.encode()
-    for name, annotation in function.__annotations__.items():
-        record = function.__globals__.get(annotation, annotation) if isinstance(annotation, str) else annotation
-        if fields := getattr(
-            record, "_fields", None
-        ):  # a NamedTuple: the machine code depends on the order of its fields
-            yield f"{name}: {fields!r}".encode()
     yield function.__code__.co_code + repr(_constants(function.__code__)).encode()
     yield from _records(function.__annotations__, function.__globals__)
     for name in dict.fromkeys(_names(function.__code__)):
